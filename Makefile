@@ -1,0 +1,30 @@
+# Two commands: `make demo` and `make test`. Both set up first, again and again without harm.
+PYTHON ?= python3
+VENV ?= .venv
+DEMO ?= demo
+BIN = $(VENV)/bin
+
+export OMP_WAIT_POLICY = PASSIVE
+
+.PHONY: install demo test check
+
+install: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: install
+	$(BIN)/python -m apps.sample $(DEMO)/capture --size 256 --overwrite
+	$(BIN)/python -m apps.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
+	$(BIN)/python -m apps.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm
+
+test: install
+	$(BIN)/python -m pytest -q
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright

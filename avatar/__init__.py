@@ -1,0 +1,1 @@
+"""Avatar: learns one person from observations while they arrive."""

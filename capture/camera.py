@@ -1,0 +1,121 @@
+"""The pinhole camera: the only place where a pixel becomes a ray."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Camera:
+    """A pinhole camera with OpenCV axes (x right, y down, z forward) and OpenCV distortion.
+
+    A pixel is a point (x, y) of the picture plane in pixels; the pixel in row i and column j
+    covers [j, j+1) × [i, i+1) and has its centre at (j + 0.5, i + 0.5).
+
+    Attributes:
+        focal_px: Focal lengths along x and y.
+        center_px: Principal point.
+        size_px: Width and height of the picture.
+        camera_from_world: Rigid 4×4 transform, metres.
+        distortion: OpenCV coefficients k1 k2 p1 p2 [k3 …]; empty for none.
+    """
+
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+    size_px: tuple[int, int]
+    camera_from_world: Float[np.ndarray, "4 4"]
+    distortion: tuple[float, ...] = ()
+
+    @classmethod
+    def from_intrinsic(
+        cls,
+        intrinsic: Float[np.ndarray, "3 3"],
+        size_px: tuple[int, int],
+        camera_from_world: Float[np.ndarray, "4 4"] | None = None,
+        distortion: Sequence[float] = (),
+    ) -> "Camera":
+        """A camera from its 3×3 matrix K; at the world's origin if no pose is given."""
+        return cls(
+            focal_px=(float(intrinsic[0, 0]), float(intrinsic[1, 1])),
+            center_px=(float(intrinsic[0, 2]), float(intrinsic[1, 2])),
+            size_px=size_px,
+            camera_from_world=np.eye(4) if camera_from_world is None else camera_from_world,
+            distortion=tuple(float(k) for k in distortion),
+        )
+
+    @property
+    def intrinsic(self) -> Float[np.ndarray, "3 3"]:
+        """The 3×3 matrix K."""
+        (fx, fy), (cx, cy) = self.focal_px, self.center_px
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def center_world(self) -> Float[np.ndarray, "3"]:
+        """Where the camera stands, in metres."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        return -rotation.T @ translation
+
+    def resized(self, size_px: tuple[int, int]) -> "Camera":
+        """The same camera for a picture scaled to another size (the same field of view)."""
+        sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
+        return replace(
+            self,
+            focal_px=(self.focal_px[0] * sx, self.focal_px[1] * sy),
+            center_px=(self.center_px[0] * sx, self.center_px[1] * sy),
+            size_px=size_px,
+        )
+
+    def pixel_centers(self) -> Float[np.ndarray, "height width 2"]:
+        """The centre (x, y) of every pixel."""
+        width, height = self.size_px
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        return np.stack([x, y], axis=-1)
+
+    def directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
+        """Unit directions in the world of the rays through `pixels` (x, y).
+
+        All rays start at `center_world`.
+        """
+        if self.distortion:
+            x, y = self._undistorted(pixels)
+        else:
+            x = (pixels[..., 0] - self.center_px[0]) / self.focal_px[0]
+            y = (pixels[..., 1] - self.center_px[1]) / self.focal_px[1]
+        in_camera = np.stack([x, y, np.ones_like(x)], axis=-1)
+        in_world = in_camera @ self.camera_from_world[:3, :3]
+        return in_world / np.linalg.norm(in_world, axis=-1, keepdims=True)
+
+    def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where points of the world land, as (x, y) in pixels; meaningless behind the camera."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        in_camera = points_world @ rotation.T + translation
+        x, y = in_camera[..., 0] / in_camera[..., 2], in_camera[..., 1] / in_camera[..., 2]
+        if self.distortion:
+            x, y = self._distorted(x, y)
+        return np.stack(
+            [x * self.focal_px[0] + self.center_px[0], y * self.focal_px[1] + self.center_px[1]],
+            axis=-1,
+        )
+
+    def _undistorted(
+        self, pixels: Float[np.ndarray, "*batch 2"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        import cv2  # heavy, and only needed for lenses that bend
+
+        flat = pixels.reshape(-1, 1, 2).astype(np.float64)
+        plane = cv2.undistortPoints(flat, self.intrinsic, np.array(self.distortion))
+        plane = np.asarray(plane).reshape(*pixels.shape)
+        return plane[..., 0], plane[..., 1]
+
+    def _distorted(
+        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]
+    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+        import cv2  # heavy, and only needed for lenses that bend
+
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 1, 3).astype(np.float64)
+        zero = np.zeros(3)
+        plane, _ = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(self.distortion))
+        plane = np.asarray(plane).reshape(*x.shape, 2)
+        return plane[..., 0], plane[..., 1]

@@ -1,0 +1,1 @@
+"""Export: an avatar that plays without torch."""

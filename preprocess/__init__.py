@@ -1,0 +1,8 @@
+"""Preprocess: what is known about each frame, as a mask, a body pose and a camera."""
+
+from preprocess.body import Body as Body
+from preprocess.body import PosedBody as PosedBody
+from preprocess.body import ShapedBody as ShapedBody
+from preprocess.observation import Observation as Observation
+from preprocess.pose import BodyPose as BodyPose
+from preprocess.pose import Motion as Motion

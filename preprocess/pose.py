@@ -1,0 +1,70 @@
+"""What a body does: one pose of the 24-joint tree, and poses over time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyPose:
+    """One pose of the SMPL tree (Loper et al. 2015): axis-angle rotations in world-aligned rest frames.
+
+    The root turns about the rest pelvis J0 of the shaped body:
+    `world = R(root_rotation) (x - J0) + J0 + root_translation`.
+
+    Attributes:
+        root_rotation: Axis-angle of the pelvis, radians (SMPL's global_orient).
+        root_translation: Metres (SMPL's transl).
+        joint_rotations: Axis-angle of joints 1 … 23 relative to their parents, radians.
+    """
+
+    root_rotation: Float[np.ndarray, "3"]
+    root_translation: Float[np.ndarray, "3"]
+    joint_rotations: Float[np.ndarray, "23 3"]
+
+    @classmethod
+    def rest(cls) -> "BodyPose":
+        """The T-pose at the origin."""
+        return cls(
+            root_rotation=np.zeros(3),
+            root_translation=np.zeros(3),
+            joint_rotations=np.zeros((23, 3)),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Motion:
+    """Poses over time, as one pose file holds them.
+
+    Attributes:
+        root_rotations, root_translations, joint_rotations: As in `BodyPose`, one row a pose.
+        valid: Which rows may be used (finite, and not marked as lost by the tracker).
+        betas: Shape coefficients; they mean something only to the body family named in `model`.
+        model: Body family whose tracker made the poses: "smpl" or "body24".
+        frames: Index of the video frame that each row belongs to, if the file says so.
+        times_s: Time of each row in seconds, if the file says so.
+        intrinsic: The tracker's own camera matrix K, if the file holds one.
+    """
+
+    root_rotations: Float[np.ndarray, "poses 3"]
+    root_translations: Float[np.ndarray, "poses 3"]
+    joint_rotations: Float[np.ndarray, "poses 23 3"]
+    valid: Bool[np.ndarray, "poses"]
+    betas: Float[np.ndarray, "betas"]
+    model: str
+    frames: Int[np.ndarray, "poses"] | None = None
+    times_s: Float[np.ndarray, "poses"] | None = None
+    intrinsic: Float[np.ndarray, "3 3"] | None = None
+
+    def __len__(self) -> int:
+        """How many rows there are, valid or not."""
+        return len(self.root_rotations)
+
+    def __getitem__(self, row: int) -> BodyPose:
+        """The pose in one row."""
+        return BodyPose(
+            root_rotation=self.root_rotations[row],
+            root_translation=self.root_translations[row],
+            joint_rotations=self.joint_rotations[row],
+        )
