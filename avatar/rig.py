@@ -1,0 +1,115 @@
+"""What moves the avatar: one person's joints, canonical pose, box and skinning volume."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32
+from scipy.ndimage import map_coordinates
+
+from avatar.skinning import distance_volume, skinning_volume
+from preprocess.body import ShapedBody
+from preprocess.kinematics import body_from_rest, world_from_body
+from preprocess.pose import BodyPose
+
+PARTS = np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13])
+"""Which of 14 body parts each joint moves: root finding starts once in every near part."""
+SEED_SPACING_M = 0.02
+WEIGHT_CELL_M = 0.023
+OCCUPANCY_CELL_M = 0.015
+
+
+def canonical_rotations() -> Float[np.ndarray, "23 3"]:
+    """The canonical A-pose: legs apart by 0.2 rad each, arms lowered by 0.8 rad.
+
+    The paper's released configuration; the root stays at rest.
+    """
+    body_pose = np.zeros(69)
+    body_pose[[2, 5, 47, 50]] = 0.2, -0.2, -0.8, 0.8
+    return body_pose.reshape(23, 3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rig:
+    """One person's articulation between the canonical and the body frame. It never changes.
+
+    Attributes:
+        rest_joints: Rest joints, metres.
+        parents: Parent of each joint, -1 for the root.
+        canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
+        box_low, box_high: Corners of the canonical box, metres.
+        weights: Skinning weights on nodes `low + (i, j, k) / (count - 1) * (high - low)`.
+        distance: Distance from each occupancy cell's centre to the body's skin, metres.
+        seeds: Canonical points of the skin, one per 2-cm voxel and body part: where root finding
+            starts.
+        seed_parts: The body part of each seed.
+    """
+
+    rest_joints: Float[np.ndarray, "24 3"]
+    parents: Int[np.ndarray, "24"]
+    canonical_rotations: Float[np.ndarray, "23 3"]
+    box_low: Float32[np.ndarray, "3"]
+    box_high: Float32[np.ndarray, "3"]
+    weights: Float32[np.ndarray, "x y z 24"]
+    distance: Float32[np.ndarray, "cx cy cz"]
+    seeds: Float32[np.ndarray, "seeds 3"]
+    seed_parts: Int32[np.ndarray, "seeds"]
+
+    @classmethod
+    def of(cls, shaped: ShapedBody, *, margin_m: float = 0.17) -> "Rig":
+        """The rig of a shaped body.
+
+        Args:
+            shaped: The body; its pose blend shapes play no part (as in the paper's code).
+            margin_m: How far the box reaches beyond the canonical skin. Clothes must fit into it.
+        """
+        rotations, body = canonical_rotations(), shaped.body
+        transforms = body_from_rest(shaped.joints, body.parents, rotations)
+        blended = np.einsum("vj,jab->vab", body.weights, transforms)
+        vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
+        low = (vertices.min(axis=0) - margin_m).astype(np.float32)
+        high = (vertices.max(axis=0) + margin_m).astype(np.float32)
+        seeds, parts = _seeds(vertices, body.weights)
+        return cls(
+            rest_joints=shaped.joints,
+            parents=body.parents,
+            canonical_rotations=rotations,
+            box_low=low,
+            box_high=high,
+            weights=skinning_volume(
+                vertices, body.weights, low, high, WEIGHT_CELL_M, margin_m + 0.05
+            ),
+            distance=distance_volume(vertices, low, high, OCCUPANCY_CELL_M, margin_m + 0.02),
+            seeds=seeds,
+            seed_parts=parts,
+        )
+
+    def body_from_canonical(
+        self, joint_rotations: Float[np.ndarray, "23 3"]
+    ) -> Float[np.ndarray, "24 4 4"]:
+        """The matrices that linear blend skinning blends, from canonical to body frame."""
+        posed = body_from_rest(self.rest_joints, self.parents, joint_rotations)
+        canonical = body_from_rest(self.rest_joints, self.parents, self.canonical_rotations)
+        return posed @ np.linalg.inv(canonical)
+
+    def world_from_body(self, pose: BodyPose) -> Float[np.ndarray, "4 4"]:
+        """The root's rigid motion."""
+        return world_from_body(self.rest_joints[0], pose.root_rotation, pose.root_translation)
+
+    def weights_at(self, points: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
+        """Trilinear skinning weights at canonical points; the border's value outside the box."""
+        nodes = np.array(self.weights.shape[:3]) - 1
+        coordinates = ((points - self.box_low) / (self.box_high - self.box_low) * nodes).T
+        read = [
+            map_coordinates(self.weights[..., joint], coordinates, order=1, mode="nearest")
+            for joint in range(24)
+        ]
+        return np.stack(read, axis=-1).astype(np.float32)
+
+
+def _seeds(
+    vertices: Float[np.ndarray, "vertices 3"], weights: Float[np.ndarray, "vertices 24"]
+) -> tuple[Float32[np.ndarray, "seeds 3"], Int32[np.ndarray, "seeds"]]:
+    parts = PARTS[weights.argmax(axis=1)]
+    voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
+    _, first = np.unique(np.column_stack([voxels, parts]), axis=0, return_index=True)
+    return vertices[first].astype(np.float32), parts[first].astype(np.int32)
