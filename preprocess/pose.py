@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyPose:
-    """One pose of the SMPL tree (Loper et al. 2015): axis-angle rotations in world-aligned rest frames.
+    """One pose of the SMPL tree (Loper et al. 2015): axis-angles in world-aligned rest frames.
 
     The root turns about the rest pelvis J0 of the shaped body:
     `world = R(root_rotation) (x - J0) + J0 + root_translation`.

@@ -1,0 +1,122 @@
+"""Body files: SMPL's own keys or the embedded body's, from .npz or .pkl."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, Shaped
+
+from capture.errors import BadInput
+from preprocess.body import Body
+from preprocess.npz import read_npz
+from preprocess.pickles import read_pickled_arrays
+from preprocess.skeleton import PARENTS
+
+ALWAYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
+KEYS = (*ALWAYS, "J_regressor", "J", "J_shapedirs", "posedirs")
+
+Arrays = dict[str, Shaped[np.ndarray, "..."] | str]
+
+
+def read_body(path: Path) -> Body:
+    """Reads a 24-joint body.
+
+    Keys: v_template (V, 3), shapedirs (V, 3, B), weights (V, 24), kintree_table (2, 24), f (F, 3),
+    and either J_regressor (24, V), which makes it SMPL's, or J (24, 3) and J_shapedirs (24, 3, B);
+    posedirs (V, 3, 207) if there are any. A .pkl is read without executing it.
+
+    Raises:
+        BadInput: If there is no such file, or it holds no such body, or code.
+    """
+    if not path.is_file():
+        raise BadInput(f"There is no body file {path}. Leave --body out for the embedded body.")
+    if path.suffix == ".npz":
+        arrays: Arrays = dict(read_npz(path, KEYS))
+    elif path.suffix == ".pkl":
+        arrays = read_pickled_arrays(path, KEYS)
+    else:
+        raise BadInput(f"{path} ends in {path.suffix!r}; a body file ends in .npz or .pkl.")
+    return _body(arrays, path)
+
+
+def _body(arrays: Arrays, path: Path) -> Body:
+    missing = [key for key in ALWAYS if key not in arrays]
+    if missing or not ("J_regressor" in arrays or {"J", "J_shapedirs"} <= arrays.keys()):
+        raise BadInput(
+            f"{path} is no body file: it lacks {', '.join(missing) or 'J_regressor'}. "
+            f"Expected {', '.join(ALWAYS)} and J_regressor (or J with J_shapedirs)."
+        )
+    template = _numbers(arrays, "v_template", (-1, 3), path)
+    directions = _numbers(arrays, "shapedirs", (len(template), 3, -1), path)
+    weights = _numbers(arrays, "weights", (len(template), -1), path)
+    if weights.shape[1] != len(PARENTS):
+        raise BadInput(
+            f"{path} has {weights.shape[1]} joints; a body of SMPL's {len(PARENTS)} joints was "
+            "expected (not SMPL+H or SMPL-X)."
+        )
+    if "J_regressor" in arrays:
+        regressor = _numbers(arrays, "J_regressor", (24, len(template)), path)
+        joints = regressor @ template
+        joint_directions = np.einsum("jv,vab->jab", regressor, directions)
+    else:
+        joints = _numbers(arrays, "J", (24, 3), path)
+        joint_directions = _numbers(arrays, "J_shapedirs", (24, 3, directions.shape[2]), path)
+    return Body(
+        family="smpl" if "J_regressor" in arrays else "body24",
+        template=template,
+        faces=_faces(arrays, len(template), path),
+        weights=_normalised(weights, path),
+        joints=joints,
+        parents=_parents(arrays, path),
+        shape_directions=directions,
+        joint_directions=joint_directions,
+        pose_directions=_numbers(arrays, "posedirs", (len(template), 3, 207), path)
+        if "posedirs" in arrays
+        else None,
+    )
+
+
+def _numbers(
+    arrays: Arrays, key: str, shape: tuple[int, ...], path: Path
+) -> Float64[np.ndarray, "..."]:
+    """One array as float64, of the shape given (-1: any length)."""
+    array = arrays[key]
+    if isinstance(array, str) or array.dtype.kind not in "biuf":
+        raise BadInput(f"`{key}` in {path} holds no numbers.")
+    fits = array.ndim == len(shape) and all(
+        wanted in (-1, length) for wanted, length in zip(shape, array.shape, strict=False)
+    )
+    if not fits:
+        expected = " x ".join("any" if n < 0 else str(n) for n in shape)
+        raise BadInput(f"`{key}` in {path} has the shape {array.shape}; expected {expected}.")
+    if not np.isfinite(array).all():
+        raise BadInput(f"`{key}` in {path} holds NaN or infinite numbers; the file is damaged.")
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def _parents(arrays: Arrays, path: Path) -> Int[np.ndarray, "24"]:
+    """Parents as integers; the root's, 2³² - 1 in unsigned files, becomes -1."""
+    parents = _numbers(arrays, "kintree_table", (2, 24), path)[0].astype(np.int64)
+    parents = np.where(parents == 2**32 - 1, -1, parents)
+    if tuple(parents) != PARENTS:
+        raise BadInput(
+            f"The joints of {path} form another tree than SMPL's: their parents are "
+            f"{parents.tolist()}, expected {list(PARENTS)}."
+        )
+    return parents
+
+
+def _faces(arrays: Arrays, vertices: int, path: Path) -> Int[np.ndarray, "faces 3"]:
+    faces = _numbers(arrays, "f", (-1, 3), path).astype(np.int64)
+    if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
+        raise BadInput(f"`f` in {path} names vertices that the body does not have.")
+    return faces
+
+
+def _normalised(
+    weights: Float[np.ndarray, "vertices 24"], path: Path
+) -> Float[np.ndarray, "vertices 24"]:
+    """Weights whose rows sum to 1 exactly."""
+    sums = weights.sum(axis=1, keepdims=True)
+    if weights.min() < 0.0 or np.abs(sums - 1.0).max() > 0.02:
+        raise BadInput(f"`weights` in {path} are no skinning weights: rows must sum to 1.")
+    return weights / sums

@@ -1,0 +1,41 @@
+"""Arrays out of .npz archives, with a message for everything that can be wrong with the file."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.errors import BadInput
+
+MAX_BYTES = 4 << 30
+"""Archives that would unpack to more are refused."""
+
+
+def read_npz(
+    path: Path, keys: tuple[str, ...] | None = None
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """The arrays of an archive (only those of `keys` that it has, if given); never executes any.
+
+    Raises:
+        BadInput: If the file is missing, damaged, too large, or holds pickled objects under a key
+            that is asked for.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist (or is no file); an .npz archive was expected.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > MAX_BYTES:
+            raise BadInput(
+                f"{path} unpacks to {size >> 20} MiB; more than {MAX_BYTES >> 20} MiB are not read."
+            )
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in (keys or archive.files) if key in archive.files}
+    except BadInput:
+        raise
+    except (OSError, ValueError, MemoryError, EOFError, zipfile.BadZipFile, KeyError) as cause:
+        raise BadInput(
+            f"{path} is no readable .npz of plain arrays ({cause}). "
+            "Is the file complete, and written without pickled objects?"
+        ) from cause
