@@ -1,0 +1,198 @@
+"""Bakes a trained field into the tables that the player draws."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int8, Int32, UInt8, UInt16
+from scipy import ndimage
+
+from avatar.rig import Rig
+from capture.errors import BadInput
+from export.hull import DEEPEST_M, Hull, find_hull
+from export.lattice import FieldAt, Lattice, read_field
+from export.tables import (
+    BRICK,
+    GRADIENT_LIMIT,
+    NODES,
+    SURFEL_BITS,
+    THICKNESS_STEP_M,
+    Bricks,
+    Surfels,
+    Tables,
+    density_codes,
+)
+from preprocess.kinematics import body_from_rest
+
+GRADIENT_STEP_M = 0.01
+"""Half the distance over which the skinning weights are differentiated."""
+MARGIN_M = 0.016
+"""Bricks reach this far outside of the hull."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeConfig:
+    """How finely an avatar is baked.
+
+    Attributes:
+        voxel_m: Distance between brick voxels.
+        surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
+        hull_density: Density of the hull's level set, 1/m.
+    """
+
+    voxel_m: float = 0.004
+    surfel_spacing_m: float = 0.005
+    hull_density: float = 3.0
+
+
+def bake(
+    field_at: FieldAt,
+    rig: Rig,
+    *,
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    config: BakeConfig | None = None,
+) -> Tables:
+    """The tables of a trained field.
+
+    Args:
+        field_at: The field; asked only inside `occupied`.
+        rig: What moves it.
+        occupied: Cells of the rig's box that are not empty, as in `rig.distance`.
+        config: How finely.
+
+    Raises:
+        BadInput: If there is nothing to be seen in the field.
+    """
+    config = config or BakeConfig()
+    lattice = read_field(field_at, rig, occupied, config.voxel_m)
+    hull = _hull_that_fits(lattice, config)
+    canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
+    pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
+    return Tables(
+        surfels=_surfels(hull, rig),
+        bricks=_bricks(lattice, hull),
+        pelvis=pelvis.astype(np.float32),
+        reach_m=_reach(rig),
+    )
+
+
+def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
+    """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
+    if not (lattice.density > config.hull_density).any():
+        raise BadInput(
+            "The avatar is empty: its density is nowhere above "
+            f"{config.hull_density:g} per metre. Train it longer, or check the masks."
+        )
+    spacing_m = config.surfel_spacing_m
+    while True:
+        hull = find_hull(lattice, level=config.hull_density, spacing_m=spacing_m)
+        if 0 < len(hull.positions) < 1 << SURFEL_BITS:
+            return hull
+        spacing_m *= 1.1
+
+
+def _reach(rig: Rig) -> float:
+    """No visible point gets farther from the pelvis in any pose, metres: bones and clothes."""
+    along = np.zeros(len(rig.parents))
+    for joint, parent in enumerate(rig.parents):
+        if parent >= 0:
+            bone = np.linalg.norm(rig.rest_joints[joint] - rig.rest_joints[parent])
+            along[joint] = along[parent] + bone
+    return float(along.max() + 0.35)
+
+
+def _surfels(hull: Hull, rig: Rig) -> Surfels:
+    low = hull.positions.min(axis=0)
+    extent_m = float((hull.positions.max(axis=0) - low).max())
+    codes = np.round((hull.positions - low) / extent_m * 65535.0).astype(np.uint16)
+    order = np.argsort(_morton(codes), kind="stable")
+    codes, points = codes[order], hull.positions[order]
+    thickness = np.round(hull.thickness[order] / THICKNESS_STEP_M)
+    return Surfels(
+        low=low,
+        extent_m=extent_m,
+        spacing_m=hull.spacing_m,
+        position_codes=codes,
+        normal_codes=np.round(hull.normals[order] * 127.0).astype(np.int8),
+        thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
+        weight_codes=np.ascontiguousarray(weight_codes(_weights(rig, points)).T),
+        gradient_codes=_gradient_codes(rig, points),
+    )
+
+
+def _morton(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "points"]:
+    """Place along a Z-order curve (10 bits an axis): neighbours in space lie close in memory."""
+    order = np.zeros(len(codes), dtype=np.int32)
+    for bit in range(10):
+        for axis in range(3):
+            set_bits = (codes[:, axis] >> (6 + bit) & 1).astype(np.int32)
+            order |= set_bits << (3 * bit + axis)
+    return order
+
+
+def weight_codes(weights: Float[np.ndarray, "points 24"]) -> UInt8[np.ndarray, "points 24"]:
+    """Weights × 255 rounded so that each row sums to 255 (largest remainders up)."""
+    scaled = weights / weights.sum(axis=1, keepdims=True) * 255.0
+    codes = np.floor(scaled).astype(np.int64)
+    missing = 255 - codes.sum(axis=1, keepdims=True)
+    rank = np.argsort(np.argsort(codes - scaled, axis=1, kind="stable"), axis=1)
+    return (codes + (rank < missing)).astype(np.uint8)
+
+
+def _weights(
+    rig: Rig, points: Float32[np.ndarray, "points 3"]
+) -> Float32[np.ndarray, "points 24"]:
+    """`rig.weights_at`, reading all 24 weights of a node at once."""
+    last = np.array(rig.weights.shape[:3]) - 1
+    places = (points - rig.box_low) / (rig.box_high - rig.box_low) * last
+    places = np.clip(places, 0, last - 1e-4)
+    base = places.astype(np.int32)
+    part = (places - base).astype(np.float32)
+    weights = np.zeros((len(points), 24), dtype=np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        share = np.prod(np.where(corner, part, 1 - part), axis=1, keepdims=True)
+        weights += rig.weights[tuple((base + corner).T)] * share
+    return weights
+
+
+def _gradient_codes(
+    rig: Rig, points: Float32[np.ndarray, "points 3"]
+) -> Int8[np.ndarray, "points 3 24"]:
+    codes = np.zeros((len(points), 3, 24), dtype=np.int8)
+    for axis, step in enumerate(np.eye(3, dtype=np.float32) * np.float32(GRADIENT_STEP_M)):
+        difference = _weights(rig, points + step) - _weights(rig, points - step)
+        scaled = difference / (2 * GRADIENT_STEP_M) / GRADIENT_LIMIT * 127.0
+        codes[:, axis] = np.clip(np.round(scaled), -127, 127).astype(np.int8)
+    return codes
+
+
+def _bricks(lattice: Lattice, hull: Hull) -> Bricks:
+    """The visible part of the lattice near the hull, cut into bricks."""
+    counts = np.array(lattice.density.shape) // BRICK
+    codes = density_codes(lattice.density)
+    codes[~_near_hull(lattice, hull)] = 0
+    visible = ndimage.maximum_filter(codes, size=3) > 0
+    blocks = np.lib.stride_tricks.sliding_window_view(visible, (NODES,) * 3)
+    used = blocks[::BRICK, ::BRICK, ::BRICK].any(axis=(3, 4, 5))
+    index = np.zeros(counts, dtype=np.int32)
+    index[used] = np.arange(1, used.sum() + 1)
+    voxels = np.zeros((used.sum() + 1, NODES, NODES, NODES, 4), dtype=np.uint8)
+    for number, corner in enumerate(np.argwhere(used) * BRICK, start=1):
+        cut = tuple(slice(c, c + NODES) for c in corner)
+        voxels[number, ..., :3] = lattice.rgb[cut]
+        voxels[number, ..., 3] = codes[cut]
+        voxels[number][~visible[cut]] = 0
+    return Bricks(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
+
+
+def _near_hull(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:
+    """Nodes that a ray's segment can reach: from a little outside of the hull to deep inside."""
+    stride = 2  # a coarse distance is good enough here
+    inside = hull.inside[::stride, ::stride, ::stride]
+    cell_m = stride * hull.spacing_m
+    near = ndimage.distance_transform_edt(inside) * cell_m < DEEPEST_M
+    near &= ndimage.distance_transform_edt(~inside) * cell_m < MARGIN_M
+    axes = [
+        np.clip(np.round(np.arange(n) * lattice.voxel_m / cell_m).astype(int), 0, m - 1)
+        for n, m in zip(lattice.density.shape, near.shape, strict=True)
+    ]
+    return near[np.ix_(*axes)]

@@ -1,0 +1,150 @@
+"""The hull: points on a level set just outside of what can be seen, with normals and depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy import ndimage
+
+from export.lattice import Lattice
+
+FAINT, DENSE = 0.3, 100.0
+"""Densities (1/m) between which the log-density makes the level set; the rest is clipped."""
+SMOOTHING_M = 0.004
+"""Deviation of the blur before the level is taken: a trained field is never quite smooth."""
+SMALLEST_PART = 0.01
+"""Parts of less volume than this share of the largest are floaters."""
+OPAQUE = 4.6
+"""Optical depth behind which nothing is seen (1 %)."""
+DEEPEST_M = 0.1
+"""Nothing is looked for deeper than this under the hull."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Hull:
+    """A person's hull in canonical space.
+
+    Attributes:
+        spacing_m: Cell of the lattice that the level set was taken on.
+        positions: Metres.
+        normals: Outward, of length 1.
+        thickness: How deep one sees into it along the normal, metres.
+        low: Corner of `inside`'s lattice.
+        inside: Lattice nodes (`low + spacing_m · (i, j, k)`) enclosed by the hull.
+    """
+
+    spacing_m: float
+    positions: Float32[np.ndarray, "surfels 3"]
+    normals: Float32[np.ndarray, "surfels 3"]
+    thickness: Float32[np.ndarray, "surfels"]
+    low: Float32[np.ndarray, "3"]
+    inside: Bool[np.ndarray, "x y z"]
+
+
+def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
+    """The outer level set of the blurred log-density, without floaters and hollows.
+
+    Args:
+        lattice: The field.
+        level: Density in 1/m; low, so that the hull lies outside of the visible fuzz.
+        spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
+    """
+    logs = np.log(np.clip(lattice.density, FAINT, DENSE)) - np.float32(np.log(level))
+    logs = _resampled(logs, spacing_m / lattice.voxel_m)
+    logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
+    inside = _largest_parts(logs > 0.0)
+    nothing = np.float32(1e-3)
+    logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
+    slope = ndimage.gaussian_filter(logs, 1.0, truncate=3.0)
+    nodes, normals = _crossings(logs, slope)
+    positions = (lattice.low + nodes * spacing_m).astype(np.float32)
+    return Hull(
+        spacing_m=spacing_m,
+        positions=positions,
+        normals=normals,
+        thickness=_thickness(lattice, positions, normals),
+        low=lattice.low,
+        inside=inside,
+    )
+
+
+def _resampled(
+    values: Float32[np.ndarray, "x y z"], step: float
+) -> Float32[np.ndarray, "x2 y2 z2"]:
+    """Linear interpolation at every `step`-th node along each axis."""
+    for axis in range(3):
+        places = np.arange(0.0, values.shape[axis] - 1, step)
+        below = places.astype(int)
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        part = (places - below).astype(np.float32).reshape(shape)
+        lower = np.take(values, below, axis=axis)
+        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
+    return values
+
+
+def _largest_parts(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Solid without floaters, and with what it encloses."""
+    parts, _ = ndimage.label(solid)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    kept = sizes >= SMALLEST_PART * sizes.max()
+    outside, _ = ndimage.label(~kept[parts])
+    return outside != outside[0, 0, 0]
+
+
+def _crossings(
+    logs: Float32[np.ndarray, "x y z"], slope: Float32[np.ndarray, "x y z"]
+) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
+    """Where lattice edges cross zero (marching cubes' vertices), in nodes, and unit normals there.
+
+    `slope` is a smoother version of `logs`, for the normals.
+    """
+    nodes, normals = [], []
+    for axis in range(3):
+        along = np.eye(3, dtype=int)[axis]
+        here = tuple(slice(1, -1) for _ in range(3))
+        there = tuple(slice(1 + a, -1 + a or None) for a in along)
+        start = np.argwhere((logs[here] > 0) != (logs[there] > 0)) + 1
+        low, high = logs[tuple(start.T)], logs[tuple((start + along).T)]
+        share = (low / (low - high))[:, None]
+        normal = _gradient(slope, start) * (1 - share) + _gradient(slope, start + along) * share
+        nodes.append(start + along * share)
+        normals.append(-normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))
+    return np.concatenate(nodes).astype(np.float32), np.concatenate(normals).astype(np.float32)
+
+
+def _gradient(
+    values: Float32[np.ndarray, "x y z"], nodes: Float[np.ndarray, "nodes 3"]
+) -> Float32[np.ndarray, "nodes 3"]:
+    """Central differences at nodes that are not on the border, per two nodes."""
+    parts = []
+    last = np.array(values.shape) - 1
+    for along in np.eye(3, dtype=int):
+        ahead, behind = np.minimum(nodes + along, last), np.maximum(nodes - along, 0)
+        parts.append(values[tuple(ahead.T)] - values[tuple(behind.T)])
+    return np.stack(parts, axis=1)
+
+
+def _thickness(
+    lattice: Lattice,
+    positions: Float32[np.ndarray, "surfels 3"],
+    normals: Float32[np.ndarray, "surfels 3"],
+) -> Float32[np.ndarray, "surfels"]:
+    """Depth along the normal at which all that can be seen has been seen.
+
+    That is where the optical depth reaches `OPAQUE`, or 99 % of all there is within `DEEPEST_M`.
+    """
+    step = np.float32(0.5 * lattice.voxel_m)
+    depths = np.arange(0.5, DEEPEST_M / step, dtype=np.float32) * step
+    optical = np.zeros((len(depths), len(positions)), dtype=np.float32)
+    total = np.zeros(len(positions), dtype=np.float32)
+    for row, depth in enumerate(depths):
+        nodes = (positions - normals * depth - lattice.low) / lattice.voxel_m
+        nearest = np.round(nodes).astype(np.int32)
+        nearest = np.clip(nearest, 0, np.array(lattice.density.shape) - 1)
+        total = total + lattice.density[tuple(nearest.T)] * step
+        optical[row] = total
+    enough = np.minimum(OPAQUE, 0.99 * total)
+    seen = (optical < enough).sum(axis=0)
+    return ((seen + 1) * step).astype(np.float32)

@@ -1,0 +1,116 @@
+"""The trained field read once on a voxel lattice: everything else of a bake looks at this."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int, UInt8
+from scipy import ndimage
+
+from avatar.rig import Rig
+from export.tables import BRICK, LOG_DENSITY
+
+FieldAt = Callable[
+    [Float32[torch.Tensor, "points 3"]],
+    tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
+]
+"""Canonical points to colour in [0, 1] and density in 1/m."""
+CHUNK = 1 << 18
+"""Points that the field is asked for at a time."""
+FAINTEST = float(np.exp(LOG_DENSITY[0]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lattice:
+    """Density and colour on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
+
+    Attributes:
+        low: Corner, canonical metres.
+        voxel_m: Distance between nodes.
+        density: 1/m.
+        rgb: 8 bits; nodes that are empty but touch a visible one hold their neighbours' mean.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    voxel_m: float
+    density: Float32[np.ndarray, "x y z"]
+    rgb: UInt8[np.ndarray, "x y z 3"]
+
+
+def read_field(
+    field_at: FieldAt, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
+) -> Lattice:
+    """Asks the field at every node inside an occupied cell; the others are empty.
+
+    Args:
+        field_at: The field.
+        rig: Whose box the cells divide.
+        occupied: Cells of the box that are not empty, as in `rig.distance`.
+        voxel_m: Distance between nodes.
+    """
+    first, last = _bounds(occupied)
+    cell = (rig.box_high - rig.box_low) / occupied.shape
+    low = (rig.box_low + (first - 1) * cell).astype(np.float32)
+    extent = (last - first + 3) * cell
+    counts = np.ceil(extent / (voxel_m * BRICK)).astype(int) * BRICK + 1
+    density = np.zeros(counts, dtype=np.float32)
+    rgb = np.zeros((*counts, 3), dtype=np.uint8)
+    for nodes in _occupied_nodes(occupied, (low - rig.box_low) / cell, voxel_m / cell, counts):
+        points = torch.from_numpy((low + nodes * voxel_m).astype(np.float32))
+        with torch.no_grad():
+            colors, densities = field_at(points)
+        i, j, k = nodes.T
+        density[i, j, k] = densities.numpy()
+        rgb[i, j, k] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
+    _spread_colors(density > FAINTEST, rgb)
+    return Lattice(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
+
+
+def _bounds(
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+    axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+    return np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
+
+
+def _occupied_nodes(
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    offset: Float32[np.ndarray, "3"],
+    step: Float32[np.ndarray, "3"],
+    counts: Int[np.ndarray, "3"],
+) -> Iterator[Int[np.ndarray, "nodes 3"]]:
+    """Lattice nodes inside occupied cells, some 10⁵ at a time."""
+    padded = np.pad(occupied, 1)
+    cells = [
+        np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)
+        for k, size in enumerate(padded.shape)
+    ]
+    waiting: list[Int[np.ndarray, "nodes 3"]] = []
+    for i, cell in enumerate(cells[0]):
+        j, k = np.nonzero(padded[cell][np.ix_(cells[1], cells[2])])
+        waiting.append(np.stack([np.full_like(j, i), j, k], axis=1))
+        if sum(len(nodes) for nodes in waiting) > CHUNK or i == counts[0] - 1:
+            nodes = np.concatenate(waiting)
+            yield from (nodes[start : start + CHUNK] for start in range(0, len(nodes), CHUNK))
+            waiting = []
+
+
+def _spread_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
+    """Gives each empty node beside visible ones their mean colour, in place.
+
+    Between a visible and an empty node colour is interpolated too: black would darken the rim.
+    """
+    visible[[0, -1]] = visible[:, [0, -1]] = visible[:, :, [0, -1]] = False
+    near = ndimage.binary_dilation(visible, np.ones((3, 3, 3))) & ~visible
+    near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
+    flat, colors, places = visible.ravel(), rgb.reshape(-1, 3), np.flatnonzero(near)
+    strides = np.array([visible.shape[1] * visible.shape[2], visible.shape[2], 1])
+    total = np.zeros((len(places), 3), dtype=np.float32)
+    count = np.zeros((len(places), 1), dtype=np.float32)
+    for offset in np.ndindex(3, 3, 3):
+        beside = places + (np.array(offset) - 1) @ strides
+        weight = flat[beside].astype(np.float32)[:, None]
+        total += colors[beside] * weight
+        count += weight
+    colors[places] = np.round(total / np.maximum(count, 1.0)).astype(np.uint8)

@@ -1,0 +1,45 @@
+"""How an avatar is drawn from its tables: the numbers that the graph and its twin share."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawingRules:
+    """The rules of one tier.
+
+    Attributes:
+        layers: Depth layers, 1 or 2.
+        samples: Samples along a ray and layer unless the player asks for another number.
+        largest_footprint_px: Surfels cover at most so many pixels along x and y.
+        footprint_spacings: A footprint's size in surfel spacings at the nearest surfel's depth.
+        behind: Cosine up to which a surfel that faces away still covers what is behind it.
+        lead_m: How far in front of the hull a ray's segment begins.
+        slack_m: How far the segment's begin may lie from the surfel, along the ray.
+        grazing: How much longer a segment is where the ray grazes the hull (× sin²).
+        steepest: Least cosine between ray and normal that lengthens a segment.
+        longest_m: Longest segment, metres.
+        stretch: Where the volume of the local map is outside of [1/stretch, stretch], its
+            gradient terms are left out.
+        hole_m: A pixel that opposite neighbours overtop by this much is a hole, and filled.
+        gap_m: The second layer begins at least this far behind the first.
+        facing: Least cosine with which a surfel of the second layer faces the camera.
+        transmitted: Least transmittance of the first layer that the second is drawn for.
+        nearest_m: Nearer surfels are not drawn.
+    """
+
+    layers: int = 2
+    samples: int = 6
+    largest_footprint_px: int = 16
+    footprint_spacings: float = 1.4
+    behind: float = 0.35
+    lead_m: float = 0.0
+    slack_m: float = 0.012
+    grazing: float = 1.5
+    steepest: float = 0.1
+    longest_m: float = 0.15
+    stretch: float = 4.0
+    hole_m: float = 0.025
+    gap_m: float = 0.03
+    facing: float = 0.2
+    transmitted: float = 0.02
+    nearest_m: float = 0.1
