@@ -12,13 +12,13 @@ class Camera:
     """A pinhole camera with OpenCV axes (x right, y down, z forward) and OpenCV distortion.
 
     A pixel is a point (x, y) of the picture plane in pixels; the pixel in row i and column j
-    covers [j, j+1) × [i, i+1) and has its centre at (j + 0.5, i + 0.5).
+    covers [j, j+1) x [i, i+1) and has its centre at (j + 0.5, i + 0.5).
 
     Attributes:
         focal_px: Focal lengths along x and y.
         center_px: Principal point.
         size_px: Width and height of the picture.
-        camera_from_world: Rigid 4×4 transform, metres.
+        camera_from_world: Rigid 4x4 transform, metres.
         distortion: OpenCV coefficients k1 k2 p1 p2 [k3 …]; empty for none.
     """
 
@@ -36,7 +36,7 @@ class Camera:
         camera_from_world: Float[np.ndarray, "4 4"] | None = None,
         distortion: Sequence[float] = (),
     ) -> "Camera":
-        """A camera from its 3×3 matrix K; at the world's origin if no pose is given."""
+        """A camera from its 3x3 matrix K; at the world's origin if no pose is given."""
         return cls(
             focal_px=(float(intrinsic[0, 0]), float(intrinsic[1, 1])),
             center_px=(float(intrinsic[0, 2]), float(intrinsic[1, 2])),
@@ -47,7 +47,7 @@ class Camera:
 
     @property
     def intrinsic(self) -> Float[np.ndarray, "3 3"]:
-        """The 3×3 matrix K."""
+        """The 3x3 matrix K."""
         (fx, fy), (cx, cy) = self.focal_px, self.center_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 

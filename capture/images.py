@@ -1,0 +1,143 @@
+"""A folder of pictures as frames, in natural order; and the reading of one picture."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.errors import BadInput
+from capture.frame import Frame
+from capture.quiet import silence_opencv
+from capture.selection import Selection
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+
+RATE = 30.0
+"""Pictures a second, where nobody has said when each was taken."""
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """Sorts `image_9` before `image_10`."""
+    return [
+        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)
+    ]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The pictures in a folder, in natural order."""
+    images = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((file for file in images if not file.name.startswith(".")), key=natural_key)
+
+
+def read_image(
+    path: Path,
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None, bool]:
+    """One upright picture as RGB, its alpha channel if it has one, and whether it is all there.
+
+    Raises:
+        BadInput: If it cannot be decoded.
+    """
+    data = path.read_bytes()
+    encoded = np.frombuffer(data, np.uint8)
+    picture = _decode(encoded, cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise BadInput(f"{path} is no picture that can be decoded; it is empty or damaged.")
+    alpha = None
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        alpha = picture[..., 3]
+        alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
+        alpha = np.ascontiguousarray(alpha)
+    picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
+    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    if alpha is not None and alpha.shape != rgb.shape[:2]:
+        raise BadInput(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
+    return rgb, alpha, _is_complete(data)
+
+
+def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
+    silence_opencv()
+    try:
+        return cv2.imdecode(encoded, mode) if len(encoded) else None
+    except cv2.error:  # sizes that OpenCV refuses
+        return None
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether a PNG or JPEG has its end (decoders fill the missing rest in silence)."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-1024:]
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[-65536:]
+    return True
+
+
+class ImageFolder:
+    """A folder of pictures; picture i was taken at i / 30 s."""
+
+    live = False
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        """Lists the folder and reads the first picture that can be read.
+
+        Raises:
+            BadInput: If there is none, or none is wanted.
+        """
+        self.path = path
+        self.selection = selection
+        self.warnings: list[str] = []
+        self._images = list_images(path)
+        self.frames_in_file = len(self._images)
+        self.frame_count = selection.count(self.frames_in_file)
+        if not self.frame_count:
+            raise BadInput(
+                f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
+                f"; at least one was expected from number {selection.start} on."
+            )
+        self.size_px = self._first_size()
+
+    def frames(self) -> Iterator[Frame]:
+        """The wanted pictures in order; every call starts anew."""
+        previous = None
+        for index, path in enumerate(self._images):
+            if not self.selection.wants(index):
+                continue
+            try:
+                rgb, alpha, complete = read_image(path)
+            except BadInput as cause:
+                self._warn(f"{cause} It was left out.")
+                continue
+            if rgb.shape[1::-1] != self.size_px:
+                self._warn(
+                    f"{path.name} has {rgb.shape[1]}x{rgb.shape[0]} px, the first picture "
+                    f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
+                )
+                continue
+            flags = set() if complete else {"corrupt"}
+            if not complete:
+                self._warn(f"{path.name} is cut off; the file is not complete.")
+            if previous is not None and np.array_equal(rgb, previous):
+                flags.add("repeated")
+            yield Frame(
+                index=index, time_s=index / RATE, rgb=rgb, flags=frozenset(flags), alpha=alpha
+            )
+            previous = rgb
+
+    def count_frames(self) -> int:
+        """How many pictures the folder holds."""
+        return len(self._images)
+
+    def _first_size(self) -> tuple[int, int]:
+        for path in self._images:
+            try:
+                rgb, _, _ = read_image(path)
+            except BadInput:
+                continue
+            return rgb.shape[1], rgb.shape[0]
+        raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings:
+            self.warnings.append(message)

@@ -1,0 +1,13 @@
+"""OpenCV without its noise on stderr: what is wrong with a file is said in our own words."""
+
+import os
+from functools import cache
+
+
+@cache
+def silence_opencv() -> None:
+    """Silences OpenCV and its FFmpeg; to be called before a file is opened."""
+    import cv2  # heavy, and this file must not make others so
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -1,0 +1,75 @@
+"""Where frames come from: a video file, a folder of pictures, or a capture folder with either."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+from capture.errors import BadInput
+from capture.frame import Frame
+from capture.selection import Selection
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
+)
+
+
+class Source(Protocol):
+    """A recorded or live stream of upright RGB frames of one size.
+
+    Attributes:
+        path: The video file or the folder of pictures itself.
+        size_px: Width and height of every frame.
+        selection: The frames that are wanted.
+        frames_in_file: How many frames there are in all, wanted or not, as the container claims.
+        frame_count: How many of them are wanted; fewer may come, see `warnings`.
+        live: Whether frames that are not taken in time are lost.
+        warnings: What was wrong so far; grows while `frames()` is read.
+    """
+
+    path: Path
+    size_px: tuple[int, int]
+    selection: Selection
+    frames_in_file: int | None
+    frame_count: int | None
+    live: bool
+    warnings: list[str]
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, lazily and in order; every call starts anew."""
+        ...
+
+    def count_frames(self) -> int:
+        """How many frames there really are in all, found by decoding; slow."""
+        ...
+
+
+def open_source(path: Path, *, frames: slice | None = None) -> Source:
+    """Opens a video file, a folder of pictures or a native capture folder.
+
+    Args:
+        path: A video, a folder of pictures, or a folder with `images/` or a single video in it.
+        frames: Which frames are wanted; they keep their numbers. All if None.
+
+    Raises:
+        BadInput: If there is nothing there that can be read.
+    """
+    from capture.images import ImageFolder, list_images
+    from capture.video import VideoFile
+
+    selection = Selection.of(frames)
+    if not path.exists():
+        raise BadInput(f"{path} does not exist; a video or a folder of pictures was expected.")
+    if not path.is_dir():
+        return VideoFile(path, selection)
+    if (path / "images").is_dir():
+        return ImageFolder(path / "images", selection)
+    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+    if list_images(path) and not videos:
+        return ImageFolder(path, selection)
+    if len(videos) != 1:
+        found = ", ".join(file.name for file in videos) or "neither"
+        raise BadInput(
+            f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
+            f"{found}. Name the video itself."
+        )
+    return VideoFile(videos[0], selection)
