@@ -41,6 +41,7 @@ class Rig:
         distance: Distance from each occupancy cell's centre to the body's skin, metres.
         seeds: Canonical points of the skin, one per 2-cm voxel and body part: where root finding
             starts.
+        seed_weights: Their skinning weights.
         seed_parts: The body part of each seed.
     """
 
@@ -52,6 +53,7 @@ class Rig:
     weights: Float32[np.ndarray, "x y z 24"]
     distance: Float32[np.ndarray, "cx cy cz"]
     seeds: Float32[np.ndarray, "seeds 3"]
+    seed_weights: Float32[np.ndarray, "seeds 24"]
     seed_parts: Int32[np.ndarray, "seeds"]
 
     @classmethod
@@ -68,7 +70,7 @@ class Rig:
         vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
         low = (vertices.min(axis=0) - margin_m).astype(np.float32)
         high = (vertices.max(axis=0) + margin_m).astype(np.float32)
-        seeds, parts = _seeds(vertices, body.weights)
+        seeds = _seeds(vertices, body.weights)
         return cls(
             rest_joints=shaped.joints,
             parents=body.parents,
@@ -79,8 +81,9 @@ class Rig:
                 vertices, body.weights, low, high, WEIGHT_CELL_M, margin_m + 0.05
             ),
             distance=distance_volume(vertices, low, high, OCCUPANCY_CELL_M, margin_m + 0.02),
-            seeds=seeds,
-            seed_parts=parts,
+            seeds=vertices[seeds].astype(np.float32),
+            seed_weights=body.weights[seeds].astype(np.float32),
+            seed_parts=PARTS[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
 
     def body_from_canonical(
@@ -108,8 +111,8 @@ class Rig:
 
 def _seeds(
     vertices: Float[np.ndarray, "vertices 3"], weights: Float[np.ndarray, "vertices 24"]
-) -> tuple[Float32[np.ndarray, "seeds 3"], Int32[np.ndarray, "seeds"]]:
-    parts = PARTS[weights.argmax(axis=1)]
+) -> Int[np.ndarray, "seeds"]:
+    """Vertices to start from: the first of each 2-cm voxel and body part."""
     voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
-    _, first = np.unique(np.column_stack([voxels, parts]), axis=0, return_index=True)
-    return vertices[first].astype(np.float32), parts[first].astype(np.int32)
+    keys = np.column_stack([voxels, PARTS[weights.argmax(axis=1)]])
+    return np.unique(keys, axis=0, return_index=True)[1]

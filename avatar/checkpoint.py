@@ -1,0 +1,110 @@
+"""What training has learnt, on disk: written whole or not at all, read as plain data."""
+
+import dataclasses
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from avatar.config import TrainConfig
+from avatar.rig import Rig
+from avatar.train import Trainer
+from capture.errors import BadInput
+
+FORMAT = 1
+FILE = "state.pt"
+COUNTS = ("steps", "rays", "samples", "frames_seen", "wall_seconds", "cpu_seconds")
+
+
+def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None) -> Path:
+    """Writes the trainer's state, the rig and the caller's notes into `folder`.
+
+    Args:
+        trainer: What has been learnt. Frames are not kept: the video still has them.
+        folder: Made if it is not there.
+        notes: What the caller wants back (plain data: numbers, text, lists, dicts).
+
+    Raises:
+        OSError: If the disk is full, or the folder cannot be written. An older checkpoint stays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    occupancy, field = trainer.avatar.occupancy.grid, trainer.avatar.field
+    state = {
+        "format": FORMAT,
+        "config": dataclasses.asdict(trainer.config),
+        "rig": {
+            item.name: torch.from_numpy(
+                np.ascontiguousarray(getattr(trainer.avatar.rig, item.name))
+            )
+            for item in dataclasses.fields(Rig)
+        },
+        "field": [parameter.detach() for parameter in field.parameters()],
+        "optimizer": trainer.optimizer.state_dict(),
+        "density": occupancy.density,
+        "occupied": occupancy.occupied,
+        "counts": {name: getattr(trainer, name) for name in COUNTS},
+        "notes": notes or {},
+    }
+    path, part = folder / FILE, folder / (FILE + ".part")
+    try:
+        with part.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except (OSError, RuntimeError) as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise
+        raise OSError(f"The checkpoint could not be written to {folder}: {error}") from error
+    return path
+
+
+def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
+    """The trainer that `save` left, without frames, and the caller's notes.
+
+    Raises:
+        FileNotFoundError: If there is no checkpoint in `folder`.
+        BadInput: If it cannot be read.
+    """
+    path = folder / FILE
+    if not path.exists():
+        raise FileNotFoundError(path)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if state["format"] != FORMAT:
+            raise BadInput(
+                f"The checkpoint {path} has format {state['format']}; this version reads {FORMAT}. "
+                "Train again with --overwrite."
+            )
+        rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
+        trainer = Trainer(rig, TrainConfig(**state["config"]), device)
+        with torch.no_grad():
+            for parameter, values in zip(
+                trainer.avatar.field.parameters(), state["field"], strict=True
+            ):
+                parameter.copy_(values)
+        trainer.optimizer.load_state_dict(state["optimizer"])
+        grid = trainer.avatar.occupancy.grid
+        grid.density.copy_(state["density"])
+        grid.occupied.copy_(state["occupied"])
+        for name in COUNTS:
+            setattr(trainer, name, state["counts"][name])
+        return trainer, state["notes"]
+    except BadInput:
+        raise
+    except (RuntimeError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise BadInput(
+            f"The checkpoint {path} cannot be read ({error}). "
+            "Expected one that ia-ingest wrote. Train again with --overwrite."
+        ) from error
+    except Exception as error:
+        if type(error).__name__ != "UnpicklingError":
+            raise
+        raise BadInput(
+            f"The checkpoint {path} holds something other than numbers and is refused. "
+            "Train again with --overwrite."
+        ) from error

@@ -1,0 +1,74 @@
+"""How an avatar is learnt: the recipe, and what follows from how long the user will wait."""
+
+import math
+from dataclasses import dataclass
+
+COARSEST_M = 0.13
+"""Cells of the coarsest hash level: 16 along a two-metre box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """The recipe. It stands in report.json as it was used."""
+
+    seconds: float = 60.0
+    """Wall time from the first frame to the last step."""
+    steps: int | None = None
+    """Stops after this many steps instead (tests)."""
+    rays: int = 1024
+    """Rays per step."""
+    step_m: float = 0.01
+    """Distance between samples along a ray, metres."""
+    grace_m: float = 0.06
+    """How far a ray is followed once its cached optical depth says it is opaque, metres."""
+    most_samples: int = 128
+    """Samples a ray may have."""
+    levels: int = 8
+    """Levels of the hash grid."""
+    table_size: int = 1 << 17
+    """Entries of a hashed level."""
+    finest_m: float = 0.008
+    """Cells of the finest level, metres."""
+    learning_rate: float = 2e-2
+    """Of the table; the network's is 0.3 of it."""
+    alpha_weight: float = 0.1
+    """Of the L1 loss on alpha."""
+    hard_weight: float = 0.02
+    """Of the hard-surface loss."""
+    empty_weight: float = 0.1
+    """Of the opacity in cells that should be empty."""
+    empty_points: int = 256
+    """Points at which that opacity is measured in each step."""
+    occupancy_every: int = 16
+    """Steps between updates of the occupancy."""
+    key_frames: int = 200
+    """Frames that stay for replay."""
+    hold_every: int = 10
+    """Every so manieth frame is held out; 0 for none."""
+    seed: int = 0
+    """Of everything random."""
+
+    @classmethod
+    def within(
+        cls, seconds: float, *, footprint_m: float, seed: int = 0, hold_every: int = 10
+    ) -> "TrainConfig":
+        """The recipe for a waiting time and a picture size.
+
+        Args:
+            seconds: How long the user will wait.
+            footprint_m: What one pixel covers on the body, metres.
+            seed: Of everything random.
+            hold_every: Every so manieth frame is held out.
+        """
+        finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
+        # about four times as many entries as the skin has cells, within what a cache can hold
+        wanted = 4.0 * 2.0 / finest_m**2
+        size = 1 << min(max(round(math.log2(wanted)), 15), 19 if seconds > 120 else 17)
+        return cls(
+            seconds=seconds,
+            step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
+            finest_m=finest_m,
+            table_size=size,
+            seed=seed,
+            hold_every=hold_every,
+        )

@@ -1,0 +1,105 @@
+"""The canonical radiance field: a hash grid and a small network, with a hand-written gradient."""
+
+import math
+from typing import NamedTuple, final
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.kernels.backend import Backend
+from avatar.levels import FEATURES, HashLevels
+
+HIDDEN = 64
+FIRST_LOG_DENSITY = 1.5
+"""Raw density of an untrained field: exp(1.5) = 4.5 per metre, a thin fog to start from."""
+CHUNK = 1 << 17
+
+
+class Activations(NamedTuple):
+    """What the backward pass needs of the forward pass.
+
+    Attributes:
+        points: Canonical positions, metres.
+        features: Of the hash grid.
+        hidden: After the first layer's ReLU.
+        raw: Colour logits and log density (log 1/m).
+    """
+
+    points: Float32[Tensor, "points 3"]
+    features: Float32[Tensor, "points width"]
+    hidden: Float32[Tensor, "points hidden"]
+    raw: Float32[Tensor, "points 4"]
+
+
+@final
+class Field:
+    """Colour and density at canonical points, without view direction (InstantAvatar, §3.1).
+
+    One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code.
+
+    Attributes:
+        levels: The grid's levels.
+        table: Entries of the grid.
+        layers: Weights and biases of both layers.
+    """
+
+    def __init__(
+        self,
+        levels: HashLevels,
+        backend: Backend,
+        device: torch.device,
+        generator: torch.Generator,
+    ) -> None:
+        """A field that has seen nothing; `generator` (on the CPU) decides how it starts."""
+        self.levels = levels
+        self.backend = backend
+
+        def normal(rows: int, columns: int, spread: float) -> Tensor:
+            return torch.randn(rows, columns, generator=generator) * spread
+
+        table = (torch.rand(levels.entries, FEATURES, generator=generator) * 2.0 - 1.0) * 1e-2
+        first = normal(levels.width, HIDDEN, math.sqrt(2.0 / levels.width))
+        second = normal(HIDDEN, 4, math.sqrt(1.0 / HIDDEN))
+        bias = torch.tensor([0.0, 0.0, 0.0, FIRST_LOG_DENSITY])
+        self.table, *self.layers = (
+            torch.nn.Parameter(values.to(device))
+            for values in (table, first, torch.zeros(HIDDEN), second, bias)
+        )
+        for parameter in self.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+
+    def parameters(self) -> list[torch.nn.Parameter]:
+        """The table, then weights and biases of both layers."""
+        return [self.table, *self.layers]
+
+    @torch.no_grad()
+    def forward(self, points: Float32[Tensor, "points 3"]) -> Activations:
+        """Raw outputs at canonical points, and what their gradient will need."""
+        first, first_bias, second, second_bias = self.layers
+        features = self.backend.encode(points, self.table, self.levels)
+        hidden = torch.addmm(first_bias, features, first).relu_()
+        return Activations(points, features, hidden, torch.addmm(second_bias, hidden, second))
+
+    @torch.no_grad()
+    def backward(self, seen: Activations, grad_raw: Float32[Tensor, "points 4"]) -> None:
+        """Writes the gradient of every parameter (the table's is added to what is there)."""
+        first, _, second, _ = self.layers
+        for parameter, grad in zip(
+            self.layers[2:], (seen.hidden.T @ grad_raw, grad_raw.sum(dim=0)), strict=True
+        ):
+            parameter.grad = grad
+        grad_hidden = (grad_raw @ second.T).mul_(seen.hidden > 0)
+        for parameter, grad in zip(
+            self.layers[:2], (seen.features.T @ grad_hidden, grad_hidden.sum(dim=0)), strict=True
+        ):
+            parameter.grad = grad
+        self.backend.encode_backward(
+            seen.points, grad_hidden @ first.T, self.levels, self.table.grad
+        )
+
+    @torch.no_grad()
+    def raw_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
+        """Raw outputs at any number of canonical points, in chunks."""
+        chunks = [self.forward(chunk).raw for chunk in points.split(CHUNK)]
+        return torch.cat(chunks) if chunks else points.new_empty(0, 4)

@@ -1,0 +1,92 @@
+"""Held-out frames: which they are, and how well they are rendered."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from preprocess.observe import Dropped
+
+from avatar.cells import WarpCells
+from avatar.events import Score
+from avatar.metrics import psnr, ssim
+from avatar.model import Avatar
+from avatar.prepare import PreparedFrame, prepare
+from avatar.render import render
+from avatar.rig import Rig
+from preprocess.observation import Observation
+
+SCORED_AT_A_MARK = 12
+"""Held-out frames scored at each mark of the curve; all of them at the end."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldOut:
+    """A frame that is never trained on, and its warp."""
+
+    observation: Observation
+    cells: WarpCells
+
+
+def is_held_out(position: int, *, every: int, total: int | None) -> bool:
+    """Whether the frame at a position of the stream is held out: 9, 19, 29, …
+
+    Args:
+        position: How many frames came before it.
+        every: Every so manieth; 0 for none.
+        total: How many frames there will be, if that is known. Of fewer than 20 it is the last
+            quarter, at least one.
+    """
+    if every == 0:
+        return False
+    if total is not None and total < 2 * every:
+        return total > 1 and position >= total - max(1, total // 4)
+    return position % every == every - 1
+
+
+def prepared(
+    observations: Iterator[Observation | Dropped], rig: Rig, *, every: int, total: int | None
+) -> Iterator[PreparedFrame | HeldOut | Dropped]:
+    """Makes each observation ready, for training or for scoring, in the order they come."""
+    for position, observation in enumerate(observations):
+        if isinstance(observation, Dropped):
+            yield observation
+        elif is_held_out(position, every=every, total=total):
+            cells = WarpCells.of(rig, observation.pose.joint_rotations)
+            yield HeldOut(observation=observation, cells=cells)
+        else:
+            yield prepare(observation, rig)
+
+
+def on_white(
+    premultiplied: Float32[np.ndarray, "height width 4"],
+) -> Float32[np.ndarray, "height width 3"]:
+    """A premultiplied picture composited over white."""
+    return premultiplied[..., :3] + (1.0 - premultiplied[..., 3:])
+
+
+def truth_on_white(observation: Observation) -> Float32[np.ndarray, "height width 3"]:
+    """What a rendering on white should show: alpha · image + (1 - alpha) · white."""
+    alpha = observation.alpha[..., None]
+    return alpha * (observation.frame.rgb.astype(np.float32) / 255.0) + (1.0 - alpha)
+
+
+def score(avatar: Avatar, held: HeldOut) -> Score:
+    """Renders a held-out frame and compares it with the truth."""
+    observation = held.observation
+    truth = truth_on_white(observation)
+    picture = render(avatar, observation.pose, observation.camera, cells=held.cells)
+    image = np.clip(on_white(picture), 0.0, 1.0)
+    return Score(
+        frame=observation.frame.index,
+        psnr=psnr(image, truth),
+        psnr_mask=psnr(image, truth, observation.alpha > 0.5),
+        ssim=ssim(image, truth),
+    )
+
+
+def spread(held: list[HeldOut], most: int) -> list[HeldOut]:
+    """At most `most` of them, evenly over the stream."""
+    if len(held) <= most:
+        return held
+    return [held[i] for i in np.linspace(0, len(held) - 1, most).round().astype(int)]

@@ -1,0 +1,210 @@
+"""One seam for the fast path: the operations of a step, on whatever runs them."""
+
+import os
+from typing import NamedTuple, Protocol, final
+
+import torch
+from jaxtyping import Float32, Int32, Int64, UInt8
+from torch import Tensor
+
+from avatar.kernels import reference
+from avatar.levels import HashLevels
+
+
+class Samples(NamedTuple):
+    """Canonical samples of a batch of rays, packed ray by ray.
+
+    Attributes:
+        points: Canonical positions, metres.
+        first: Where each ray's samples begin.
+        count: How many each ray has.
+    """
+
+    points: Float32[Tensor, "samples 3"]
+    first: Int64[Tensor, "rays"]
+    count: Int32[Tensor, "rays"]
+
+
+class Rays(NamedTuple):
+    """Rays in the body frame of the frame that each belongs to.
+
+    Attributes:
+        origins: Metres.
+        directions: Unit vectors.
+        slots: Which frame's warp cells each ray runs through.
+        jitter: Offset of each ray's sample lattice, in steps, in [0, 1).
+    """
+
+    origins: Float32[Tensor, "rays 3"]
+    directions: Float32[Tensor, "rays 3"]
+    slots: Int32[Tensor, "rays"]
+    jitter: Float32[Tensor, "rays"]
+
+
+class CellTables(NamedTuple):
+    """Warp cells of many frames, one slot each (`avatar.cells.WarpCells`, padded).
+
+    Attributes:
+        index: `first_root * 4 + count` of each cell.
+        roots: Root and inverse Jacobian.
+        low: Corner of each slot's grid, body frame, metres.
+        shape: Cells along each axis of each slot's grid.
+        cell_m: Edge of a cell, metres.
+    """
+
+    index: Int32[Tensor, "slots cells"]
+    roots: Float32[Tensor, "slots roots 12"]
+    low: Float32[Tensor, "slots 3"]
+    shape: Int32[Tensor, "slots 3"]
+    cell_m: float
+
+
+class Grid(NamedTuple):
+    """Canonical occupancy: which cells may hold anything, and the density last seen there.
+
+    Attributes:
+        occupied: 0 or 1.
+        density: 1/m.
+        low: Corner of the box, metres.
+        cells_per_m: Along each axis.
+    """
+
+    occupied: UInt8[Tensor, "x y z"]
+    density: Float32[Tensor, "x y z"]
+    low: Float32[Tensor, "3"]
+    cells_per_m: Float32[Tensor, "3"]
+
+
+class Marching(NamedTuple):
+    """How a ray is sampled.
+
+    Attributes:
+        step_m: Distance between samples, metres.
+        grace_m: How much farther a ray is followed once its cached optical depth says it is
+            opaque; infinity for exact rendering. Metres, never a number of samples: a grace that
+            shrinks with the step cuts grazing rays before the surface.
+        most: Samples a ray may have.
+    """
+
+    step_m: float
+    grace_m: float
+    most: int
+
+    @property
+    def grace_steps(self) -> int:
+        """The grace in samples."""
+        return int(min(self.grace_m / self.step_m + 1.0, 1e9))
+
+
+class Backend(Protocol):
+    """The operations of a training step. `avatar.kernels.reference` says what each means."""
+
+    name: str
+
+    def encode(
+        self,
+        points: Float32[Tensor, "points 3"],
+        table: Float32[Tensor, "entries 4"],
+        levels: HashLevels,
+    ) -> Float32[Tensor, "points width"]:
+        """Hash-grid features."""
+        ...
+
+    def encode_backward(
+        self,
+        points: Float32[Tensor, "points 3"],
+        grad_features: Float32[Tensor, "points width"],
+        levels: HashLevels,
+        grad_table: Float32[Tensor, "entries 4"],
+    ) -> None:
+        """Adds the table's gradient to `grad_table`."""
+        ...
+
+    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
+        """Canonical samples along rays."""
+        ...
+
+    def composite(
+        self, raw: Float32[Tensor, "samples 4"], samples: Samples, step_m: float
+    ) -> Float32[Tensor, "rays 4"]:
+        """Premultiplied colour and alpha of each ray."""
+        ...
+
+    def composite_loss(
+        self,
+        raw: Float32[Tensor, "samples 4"],
+        samples: Samples,
+        step_m: float,
+        target: Float32[Tensor, "rays 4"],
+        background: Float32[Tensor, "rays 3"],
+        alpha_weight: float,
+        hard_weight: float,
+    ) -> tuple[Float32[Tensor, "rays 4"], Float32[Tensor, "rays"], Float32[Tensor, "samples 4"]]:
+        """Rendering, loss of each ray, and the gradient of the mean loss for `raw`."""
+        ...
+
+    def keep_highest(
+        self,
+        points: Float32[Tensor, "points 3"],
+        log_density: Float32[Tensor, "points"],
+        grid: Grid,
+    ) -> None:
+        """Raises the grid's cached density, in place, to that of the samples."""
+        ...
+
+
+@final
+class TorchBackend:
+    """The reference itself, on any device torch knows."""
+
+    name = "torch"
+
+    def encode(self, points, table, levels):  # noqa: D102 - see the protocol
+        with torch.no_grad():
+            return reference.encode(points, table, levels)
+
+    def encode_backward(self, points, grad_features, levels, grad_table):  # noqa: D102
+        table = torch.zeros_like(grad_table, requires_grad=True)
+        with torch.enable_grad():
+            features = reference.encode(points, table, levels)
+            (grad,) = torch.autograd.grad(features, table, grad_features)
+        grad_table += grad
+
+    def march(self, rays, cells, grid, how):  # noqa: D102
+        points, count = reference.march(*rays, how.step_m, *cells, *grid, how.grace_steps, how.most)
+        return Samples(points, torch.cumsum(count, 0) - count, count)
+
+    def composite(self, raw, samples, step_m):  # noqa: D102
+        with torch.no_grad():
+            return reference.composite(raw, samples.first, samples.count, step_m)
+
+    def composite_loss(  # noqa: D102
+        self, raw, samples, step_m, target, background, alpha_weight, hard_weight
+    ):
+        leaf = raw.detach().requires_grad_()
+        with torch.enable_grad():
+            rendered = reference.composite(leaf, samples.first, samples.count, step_m)
+            loss = reference.loss_per_ray(rendered, target, background, alpha_weight, hard_weight)
+            (grad,) = torch.autograd.grad(loss.mean(), leaf)
+        return rendered.detach(), loss.detach(), grad
+
+    def keep_highest(self, points, log_density, grid):  # noqa: D102
+        reference.keep_highest(points, log_density, grid.low, grid.cells_per_m, grid.density)
+
+
+def backend_for(device: torch.device) -> Backend:
+    """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
+
+    Raises:
+        ValueError: If the forced backend is unknown or cannot run on the device.
+    """
+    forced = os.environ.get("IA_BACKEND", "")
+    if forced not in ("", "torch", "numba"):
+        raise ValueError(f"IA_BACKEND is '{forced}'; it may be 'torch' or 'numba'.")
+    if forced == "numba" and device.type != "cpu":
+        raise ValueError(f"IA_BACKEND=numba runs on the CPU only, not on {device}.")
+    if forced == "torch" or device.type != "cpu":
+        return TorchBackend()
+    from avatar.kernels.cpu import NumbaBackend  # compiles: only where it is used
+
+    return NumbaBackend()

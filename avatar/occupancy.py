@@ -1,0 +1,103 @@
+"""Canonical occupancy: one density grid that every pose looks up after its warp.
+
+The paper keeps a grid in posed space: a union over the sequence for training, one per frame for
+rendering. Looked up in canonical space a single grid is exact for every pose, forgets none, and
+needs no pass of the network per frame.
+"""
+
+from collections.abc import Callable
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int64, UInt8
+from torch import Tensor
+
+from avatar.cells import BAND_M
+from avatar.kernels.backend import Grid
+from avatar.rig import Rig
+
+DECAY = 0.9
+"""What a cell keeps of its density when a probe finds nothing. At 0.6 thin surfaces vanish."""
+OPACITY = 0.02
+"""A cell counts as empty when a step through it would be less opaque than this."""
+FIRST_DENSITY = 1e-3
+
+
+@final
+class Occupancy:
+    """Where the canonical person may be.
+
+    Attributes:
+        grid: What marching looks up; updated in place.
+        band: Flat indices of the cells near enough to the skin to hold anything.
+    """
+
+    def __init__(self, rig: Rig, device: torch.device, *, band_m: float = BAND_M) -> None:
+        """Everything near the skin counts as occupied until something is known."""
+        band = torch.from_numpy(rig.distance <= band_m).to(device)
+        cells = np.array(rig.distance.shape, dtype=np.float32)
+        self.grid = Grid(
+            occupied=band.to(torch.uint8),
+            density=torch.where(band, FIRST_DENSITY, 0.0),
+            low=torch.from_numpy(rig.box_low).to(device),
+            cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
+        )
+        self.band: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
+        self._in_band = band.to(torch.uint8)
+
+    @torch.no_grad()
+    def update(
+        self,
+        log_density_at: Callable[[Float32[Tensor, "points 3"]], Float32[Tensor, "points"]],
+        *,
+        share: float,
+        step_m: float,
+        generator: torch.Generator,
+    ) -> None:
+        """Probes a share of the band once, at a random place in each cell, and re-thresholds.
+
+        Args:
+            log_density_at: Log density at canonical points.
+            share: How much of the band is probed, in (0, 1].
+            step_m: Distance between samples along a ray.
+            generator: Chooses cells and places.
+        """
+        chosen = self._draw(self.band, int(len(self.band) * share), generator)
+        density = torch.exp(log_density_at(self._somewhere_in(chosen, generator)).clamp(max=9.0))
+        flat = self.grid.density.view(-1)
+        flat[chosen] = torch.maximum(flat[chosen] * DECAY, density)
+        bar = min(OPACITY / step_m, float(flat[self.band].mean()))
+        self.grid.occupied.copy_(grown((self.grid.density > bar).to(torch.uint8)) & self._in_band)
+
+    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Random points of cells near the skin that hold nothing, at most `count`."""
+        empty = self.band[self.grid.occupied.view(-1)[self.band] == 0]
+        return self._somewhere_in(self._draw(empty, count, generator), generator)
+
+    def _draw(
+        self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
+    ) -> Int64[Tensor, "drawn"]:
+        count = count if len(cells) else 0
+        drawn = torch.randint(
+            max(len(cells), 1), (count,), generator=generator, device=generator.device
+        )
+        return cells[drawn.to(cells.device)]
+
+    def _somewhere_in(
+        self, cells: Int64[Tensor, "cells"], generator: torch.Generator
+    ) -> Float32[Tensor, "cells 3"]:
+        _, ny, nz = self.grid.occupied.shape
+        corner = torch.stack([cells // (ny * nz), cells // nz % ny, cells % nz], dim=1)
+        within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
+        return (corner + within.to(cells.device)) / self.grid.cells_per_m + self.grid.low
+
+
+def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+    """The cells and their six neighbours."""
+    out = occupied.clone()
+    for axis in range(3):
+        length = occupied.shape[axis] - 1
+        out.narrow(axis, 1, length).bitwise_or_(occupied.narrow(axis, 0, length))
+        out.narrow(axis, 0, length).bitwise_or_(occupied.narrow(axis, 1, length))
+    return out

@@ -1,0 +1,166 @@
+"""Replay: the key frames that stay, and the rays drawn from them.
+
+Training on the newest frames alone loses 5-9 dB on the oldest. Half of the rays are drawn from
+all kept frames alike, half in proportion to each frame's running error; a new frame enters with
+the largest error.
+"""
+
+from typing import NamedTuple, final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
+
+from avatar.cells import CELL_M
+from avatar.kernels.backend import CellTables, Rays
+from avatar.prepare import PreparedFrame
+
+NEAR_SHARE = 0.9
+"""Of the rays, how many go through pixels near the person."""
+ERROR_MEMORY = 0.9
+JOINT_SPREAD = 0.5
+"""How much a radian of a joint counts beside a radian of the view when frames are compared."""
+
+
+class Batch(NamedTuple):
+    """Rays and what the video shows along them.
+
+    Attributes:
+        rays: In the body frames of their frames.
+        target: Premultiplied colour and alpha, in [0, 1].
+    """
+
+    rays: Rays
+    target: Float32[Tensor, "rays 4"]
+
+
+@final
+class Replay:
+    """A bounded store of prepared frames, one slot each, kept for distinct views and poses.
+
+    Attributes:
+        indices: Which frame of the source each slot holds.
+    """
+
+    def __init__(self, capacity: int, device: torch.device) -> None:
+        """An empty store for at most `capacity` frames."""
+        self.capacity = capacity
+        self.device = device
+        self.indices: list[int] = []
+        self._likeness = np.empty((0, 3 + 69))
+        self._error = torch.zeros(capacity, device=device)
+        self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._origins = torch.zeros(capacity, 3, device=device)
+        self._low = torch.zeros(capacity, 3, device=device)
+        self._shape = torch.ones(capacity, 3, dtype=torch.int32, device=device)
+        self._index = torch.zeros(capacity, 1, dtype=torch.int32, device=device)
+        self._roots = torch.zeros(capacity, 1, 12, device=device)
+        self._directions = torch.zeros(capacity, 1, 3, device=device)
+        self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8, device=device)
+
+    def __len__(self) -> int:
+        """How many frames are kept."""
+        return len(self.indices)
+
+    @property
+    def cells(self) -> CellTables:
+        """The warp cells of all slots."""
+        return CellTables(self._index, self._roots, self._low, self._shape, CELL_M)
+
+    def add(self, frame: PreparedFrame) -> None:
+        """Takes a frame in; when full, the more replaceable of the two most alike goes."""
+        likeness = np.concatenate(
+            [_facing(frame), frame.pose.joint_rotations.ravel() * JOINT_SPREAD]
+        )
+        if len(self) < self.capacity:
+            slot = len(self)
+            self.indices.append(frame.index)
+            self._likeness = np.concatenate([self._likeness, likeness[None]])
+        else:
+            slot = self._most_alike()
+            self.indices[slot] = frame.index
+            self._likeness[slot] = likeness
+        self._fill(slot, frame)
+        held = self._error[: len(self)]
+        self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        """Draws rays from the kept frames.
+
+        Args:
+            count: How many.
+            generator: On the store's device.
+        """
+        held = len(self)
+        error = self._error[:held]
+        chance = 0.5 / held + 0.5 * error / error.sum()
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, device=self.device)
+
+        slot = torch.multinomial(chance, count, replacement=True, generator=generator).sort()[0]
+        near, far = self._near[slot], self._far[slot]
+        wants_near = (uniform(count) < NEAR_SHARE) | (far == 0)
+        place = uniform(count)
+        pixel = torch.where(wants_near, (place * near).long(), near + (place * far).long())
+        pixel = torch.minimum(pixel, near + far - 1)
+        rays = Rays(
+            self._origins[slot],
+            self._directions[slot, pixel],
+            slot.int(),
+            uniform(count),
+        )
+        return Batch(rays, self._colors[slot, pixel].float() / 255.0)
+
+    def learn_errors(self, slots: Int64[Tensor, "rays"], loss: Float32[Tensor, "rays"]) -> None:
+        """Updates the running error of the frames that the rays came from."""
+        held = len(self)
+        count = torch.bincount(slots, minlength=held)[:held]
+        total = torch.bincount(slots, weights=loss.clamp(min=0.0), minlength=held)[:held]
+        seen = count > 0
+        mean = (total / count.clamp(min=1)).to(self._error)
+        error = self._error[:held]
+        error[seen] = ERROR_MEMORY * error[seen] + (1.0 - ERROR_MEMORY) * mean[seen]
+
+    def _fill(self, slot: int, frame: PreparedFrame) -> None:
+        index, roots = frame.cells.index.reshape(-1), frame.cells.roots
+        self._index = self._write(self._index, slot, index)
+        self._roots = self._write(self._roots, slot, roots)
+        self._directions = self._write(self._directions, slot, frame.directions)
+        self._colors = self._write(self._colors, slot, frame.colors)
+        self._low[slot] = torch.from_numpy(frame.cells.low).to(self.device)
+        self._shape[slot] = torch.tensor(frame.cells.index.shape, dtype=torch.int32)
+        self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
+        self._near[slot] = frame.near
+        self._far[slot] = len(frame.colors) - frame.near
+
+    def _write(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
+        """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""
+        needed = len(values)
+        if needed > store.shape[1]:
+            width = needed + needed // 4
+            # untouched memory costs nothing: pages are committed when they are written
+            wider = torch.empty(
+                self.capacity, width, *store.shape[2:], dtype=store.dtype, device=self.device
+            )
+            held = len(self)
+            wider[:held, : store.shape[1]] = store[:held]
+            store = wider
+        store[slot, :needed] = torch.from_numpy(values).to(self.device)
+        return store
+
+    def _most_alike(self) -> int:
+        """Of the two frames that differ least, the one nearer to a third."""
+        gap = np.linalg.norm(self._likeness[:, None] - self._likeness[None], axis=-1)
+        np.fill_diagonal(gap, np.inf)
+        first, second = np.unravel_index(gap.argmin(), gap.shape)
+        pair = gap[[first, second]]
+        pair[:, [first, second]] = np.inf
+        return int((first, second)[int(pair.min(axis=1).argmin())])
+
+
+def _facing(frame: PreparedFrame) -> Float[np.ndarray, "3"]:
+    """The direction from which the camera sees the body: a unit vector of the body frame."""
+    return frame.origin / np.linalg.norm(frame.origin)

@@ -1,0 +1,94 @@
+"""One training step: the only place where the operations meet, without autograd."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.config import TrainConfig
+from avatar.field import Activations, Field
+from avatar.kernels.backend import CellTables, Marching
+from avatar.kernels.reference import MAX_LOG_DENSITY
+from avatar.occupancy import Occupancy
+from avatar.replay import Batch
+
+EMPTY_STEP_M = 0.01
+"""The opacity of emptiness is that of one centimetre, as in the paper's code."""
+
+
+class StepResult(NamedTuple):
+    """What a step tells.
+
+    Attributes:
+        loss: Of each ray.
+        samples: How many samples its rays had.
+    """
+
+    loss: Float32[Tensor, "rays"]
+    samples: int
+
+
+@torch.no_grad()
+def gradients(
+    field: Field,
+    occupancy: Occupancy,
+    cells: CellTables,
+    batch: Batch,
+    config: TrainConfig,
+    *,
+    hard_share: float,
+    remember: bool,
+    generator: torch.Generator,
+) -> StepResult:
+    """Renders a batch and leaves the gradient of its mean loss in the field's parameters.
+
+    Args:
+        field: What is learnt.
+        occupancy: Where samples may be.
+        cells: Warp cells of the frames that the batch's slots name.
+        batch: Rays and what the video shows along them.
+        config: The recipe.
+        hard_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
+            must be found before it can be hard.
+        remember: Whether the samples' densities raise the occupancy's.
+        generator: Of backgrounds and empty points, on the field's device.
+    """
+    how = Marching(config.step_m, config.grace_m, config.most_samples)
+    samples = field.backend.march(batch.rays, cells, occupancy.grid, how)
+    empty = (
+        occupancy.empty_points(config.empty_points, generator).to(samples.points)
+        if config.empty_weight
+        else samples.points[:0]
+    )
+    seen = field.forward(torch.cat([samples.points, empty]))
+    count = len(samples.points)
+    background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
+    _, loss, grad = field.backend.composite_loss(
+        seen.raw[:count], samples, config.step_m, batch.target, background,
+        config.alpha_weight, config.hard_weight * hard_share,
+    )  # fmt: skip
+    grad_empty = _grad_of_emptiness(seen.raw[count:], config.empty_weight)
+    field.backward(seen, torch.cat([grad, grad_empty]))
+    if remember:
+        _remember(field, occupancy, seen, count)
+    return StepResult(loss, count)
+
+
+def _grad_of_emptiness(raw: Float32[Tensor, "points 4"], weight: float) -> Tensor:
+    """Gradient of the mean opacity of one centimetre, 1 - exp(-σ · 1 cm) (the paper's §3.4)."""
+    grad = torch.zeros_like(raw)
+    optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * EMPTY_STEP_M
+    grad[:, 3] = weight / max(len(raw), 1) * optical * torch.exp(-optical)
+    return grad
+
+
+def _remember(field: Field, occupancy: Occupancy, seen: Activations, count: int) -> None:
+    log_density = seen.raw[:count, 3].contiguous()
+    field.backend.keep_highest(seen.points[:count], log_density, occupancy.grid)
+
+
+def cosine(progress: float) -> float:
+    """The learning rate's factor: 1 at progress 0, 0.05 at 1."""
+    return max(0.05, 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))

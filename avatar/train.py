@@ -1,0 +1,210 @@
+"""The online trainer: improves an avatar while frames arrive, and says what happens."""
+
+import time
+from collections.abc import Iterator
+from typing import final
+
+import torch
+from preprocess.observe import Dropped
+
+from avatar.config import COARSEST_M, TrainConfig
+from avatar.events import Evaluated, Finished, Score, Stepped, TrainEvent, Warned
+from avatar.field import Field
+from avatar.hold import SCORED_AT_A_MARK, HeldOut, score, spread
+from avatar.kernels.backend import Backend, backend_for
+from avatar.levels import HashLevels
+from avatar.model import Avatar
+from avatar.occupancy import Occupancy
+from avatar.prepare import PreparedFrame
+from avatar.replay import Replay
+from avatar.rig import Rig
+from avatar.step import StepResult, cosine, gradients
+from capture.inbox import Inbox
+
+NETWORK_RATE = 0.3
+"""The network's learning rate as a share of the table's."""
+FULL_PROBING_STEPS = 300
+"""Steps during which half of the band is probed at each update of the occupancy, not a quarter."""
+MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
+"""When the curve is measured, in seconds of training; then every 30 s."""
+
+
+@final
+class Trainer:
+    """Everything that training changes, and one step of it.
+
+    Attributes:
+        avatar: As it stands.
+        config: The recipe.
+        replay: The frames it learns from.
+        steps, rays, samples: How much has been done.
+        wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
+        frames_seen: Frames taken in so far, whether or not they are still kept.
+    """
+
+    def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
+        """A trainer that has seen nothing."""
+        self.config = config
+        self.backend: Backend = backend_for(device)
+        levels = HashLevels.over(
+            rig.box_low, rig.box_high, coarsest_m=COARSEST_M, finest_m=config.finest_m,
+            levels=config.levels, table_size=config.table_size,
+        )  # fmt: skip
+        start = torch.Generator().manual_seed(config.seed)
+        field = Field(levels, self.backend, device, start)
+        self.avatar = Avatar(
+            rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
+        )
+        self.replay = Replay(config.key_frames, device)
+        self.steps = self.rays = self.samples = self.frames_seen = 0
+        self.wall_seconds = self.cpu_seconds = 0.0
+        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        rate = config.learning_rate
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [field.table], "lr": rate, "eps": 1e-15},
+                {"params": field.layers, "lr": rate * NETWORK_RATE},
+            ],
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+
+    def add(self, frame: PreparedFrame) -> None:
+        """Takes in a frame to learn from."""
+        self.replay.add(frame)
+        self.frames_seen += 1
+
+    def step(self, *, rate: float, hard_share: float) -> StepResult:
+        """Draws rays, follows their gradient once, and keeps the occupancy up to date.
+
+        Args:
+            rate: Factor of the learning rates, in (0, 1].
+            hard_share: Share of the hard-surface loss's weight, in [0, 1].
+        """
+        config, field, occupancy = self.config, self.avatar.field, self.avatar.occupancy
+        batch = self.replay.draw(config.rays, self._generator)
+        result = gradients(
+            field, occupancy, self.replay.cells, batch, config,
+            hard_share=hard_share,
+            remember=self.steps % config.occupancy_every < 2,
+            generator=self._generator,
+        )  # fmt: skip
+        for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE), strict=True):
+            group["lr"] = config.learning_rate * base * rate
+        self.optimizer.step()
+        field.table.grad.zero_()
+        self.replay.learn_errors(batch.rays.slots.long(), result.loss)
+        if self.steps % config.occupancy_every == 0:
+            occupancy.update(
+                lambda points: field.raw_at(points)[:, 3],
+                share=0.5 if self.steps < FULL_PROBING_STEPS else 0.25,
+                step_m=config.step_m,
+                generator=self._generator,
+            )
+        self.steps += 1
+        self.rays += config.rays
+        self.samples += result.samples
+        return result
+
+
+@final
+class Clock:
+    """Training time, wall and CPU, on top of what earlier runs have used."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        """Starts now."""
+        self._trainer = trainer
+        self._wall = time.perf_counter() - trainer.wall_seconds
+        self._cpu = time.process_time() - trainer.cpu_seconds
+
+    def read(self) -> float:
+        """Wall seconds; the trainer's own counts are set to now."""
+        self._trainer.wall_seconds = time.perf_counter() - self._wall
+        self._trainer.cpu_seconds = time.process_time() - self._cpu
+        return self._trainer.wall_seconds
+
+
+def train(
+    trainer: Trainer, inbox: Inbox[PreparedFrame | HeldOut | Dropped], held: list[HeldOut]
+) -> Iterator[TrainEvent]:
+    """Trains until the time is up, on whatever has arrived.
+
+    The learning rate is constant while frames arrive and falls as a cosine after the last.
+
+    Args:
+        trainer: Goes on from where it stands.
+        inbox: Frames as they become ready.
+        held: Held-out frames; those that arrive are appended.
+
+    Yields:
+        What happens, on the caller's thread: what the caller does with an event takes training
+        time.
+    """
+    config, clock = trainer.config, None
+    arrived_at: float | None = None
+    marks = _marks(after=trainer.wall_seconds)
+    mark = next(marks)
+    while True:
+        if arrived_at is None:
+            empty = len(trainer.replay) == 0
+            for item in inbox.take(wait_s=0.1 if empty else 0.0):
+                if isinstance(item, Dropped):
+                    yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+                    continue
+                clock = clock or Clock(trainer)
+                if isinstance(item, HeldOut):
+                    held.append(item)
+                else:
+                    trainer.add(item)
+            if inbox.finished:
+                arrived_at = trainer.wall_seconds if clock is None else clock.read()
+        if len(trainer.replay) == 0:
+            if arrived_at is not None:
+                return
+            continue
+        now = clock.read()
+        if now >= config.seconds or (config.steps and trainer.steps >= config.steps):
+            break
+        if now >= mark:
+            mark = next(m for m in marks if m > now)
+            yield _evaluated(trainer, spread(held, SCORED_AT_A_MARK))
+        tail = config.seconds - arrived_at if arrived_at is not None else 1.0
+        progress = (now - arrived_at) / max(tail, 1e-6) if arrived_at is not None else 0.0
+        result = trainer.step(
+            rate=cosine(progress), hard_share=min(1.0, 4.0 * now / config.seconds)
+        )
+        yield Stepped(
+            step=trainer.steps,
+            wall_seconds=clock.read(),
+            loss=float(result.loss.mean()),
+            samples_per_ray=result.samples / config.rays,
+            frames_seen=trainer.frames_seen,
+        )
+    yield Finished(
+        wall_seconds=trainer.wall_seconds,
+        cpu_seconds=trainer.cpu_seconds,
+        steps=trainer.steps,
+        rays=trainer.rays,
+        samples=trainer.samples,
+    )
+
+
+def _evaluated(trainer: Trainer, held: list[HeldOut]) -> Evaluated:
+    scores: list[Score] = [score(trainer.avatar, frame) for frame in held]
+    return Evaluated(
+        wall_seconds=trainer.wall_seconds,
+        cpu_seconds=trainer.cpu_seconds,
+        frames_seen=trainer.frames_seen,
+        scores=tuple(scores),
+    )
+
+
+def _marks(*, after: float) -> Iterator[float]:
+    for mark in MARKS_S:
+        if mark > after:
+            yield mark
+    mark = MARKS_S[-1] + 30.0
+    while True:
+        if mark > after:
+            yield mark
+        mark += 30.0

@@ -1,0 +1,81 @@
+"""Where two speeds meet: one thread fills, another takes what is there."""
+
+import queue
+import threading
+from collections.abc import Iterable
+from typing import Generic, TypeVar, final
+
+Item = TypeVar("Item")
+
+
+@final
+class Inbox(Generic[Item]):
+    """Runs an iterable on a thread of its own and hands its items over, in order.
+
+    Nothing is lost: when the inbox is full the producer waits. An error in the producer is raised
+    in the consumer, after the items that came before it.
+    """
+
+    def __init__(self, items: Iterable[Item], *, capacity: int = 64) -> None:
+        """Starts the producer.
+
+        Args:
+            items: Iterated on the inbox's own thread.
+            capacity: How many items wait at most.
+        """
+        self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
+        self._error: BaseException | None = None
+        self._stop = threading.Event()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._fill, args=(items,), daemon=True)
+        self._thread.start()
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything has been taken and nothing more will come."""
+        return self._ended.is_set() and self._queue.empty() and self._error is None
+
+    def take(self, *, wait_s: float = 0.0) -> list[Item]:
+        """Everything that has arrived; waits up to `wait_s` seconds for a first item."""
+        taken: list[Item] = []
+        try:
+            taken.append(self._queue.get(timeout=wait_s) if wait_s else self._queue.get_nowait())
+            while True:
+                taken.append(self._queue.get_nowait())
+        except queue.Empty:
+            pass
+        if not taken and self._ended.is_set() and self._error and self._queue.empty():
+            error, self._error = self._error, None
+            raise error
+        return taken
+
+    def close(self) -> None:
+        """Tells the producer to stop and waits until it has."""
+        self._stop.set()
+        while self._thread.is_alive():
+            self.take_quietly()
+            self._thread.join(timeout=0.02)
+
+    def take_quietly(self) -> None:
+        """Empties the inbox, so that a waiting producer can see that it should stop."""
+        while not self._queue.empty():
+            try:
+                self._queue.get_nowait()
+            except queue.Empty:
+                return
+
+    def _fill(self, items: Iterable[Item]) -> None:
+        try:
+            for item in items:
+                while not self._stop.is_set():
+                    try:
+                        self._queue.put(item, timeout=0.1)
+                        break
+                    except queue.Full:
+                        continue
+                if self._stop.is_set():
+                    return
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._ended.set()
