@@ -1,0 +1,1 @@
+"""The studio: a dressed synthetic person, filmed into a capture folder with exact truth."""

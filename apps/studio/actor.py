@@ -1,0 +1,151 @@
+"""The person in front of the camera: the embedded body, dressed, lit and drawn in any pose."""
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32, UInt8
+
+from apps.studio.cut import SHOE
+from apps.studio.light import bake
+from apps.studio.outfit import OUTFITS, Outfit
+from apps.studio.raster import rasterise
+from apps.studio.shade import over, shade
+from apps.studio.wardrobe import dressed, places32, vertex_normals
+from capture.camera import Camera
+from preprocess.body import Body, ShapedBody
+from preprocess.pose import BodyPose
+
+A_POSE = np.zeros(69)
+A_POSE[[2, 5, 47, 50]] = (0.2, -0.2, -0.8, 0.8)
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Actor:
+    """A dressed person who can be drawn in any pose.
+
+    Attributes:
+        betas: Its shape coefficients.
+        shaped: The body underneath; `poses.npz` is about this one.
+        outfit: What it wears.
+        rest: Vertices of all layers at rest, metres.
+        place: Where each vertex lies on the undressed template.
+        source: The body vertex that each vertex hangs from.
+        faces, kinds: Triangles, and what each is made of.
+        light: Painted light on each vertex.
+        palette: The outfit's colours, tinted by the seed.
+    """
+
+    betas: Float[np.ndarray, "10"]
+    shaped: ShapedBody
+    outfit: Outfit
+    rest: Float[np.ndarray, "vertices 3"]
+    place: Float32[np.ndarray, "vertices 3"]
+    source: Int32[np.ndarray, "vertices"]
+    faces: Int32[np.ndarray, "faces 3"]
+    kinds: Int32[np.ndarray, "faces"]
+    light: Float32[np.ndarray, "vertices 3"]
+    palette: Float32[np.ndarray, "colours 3"]
+
+    @classmethod
+    def of(cls, subject: int = 1, seed: int = 0) -> "Actor":
+        """Subject 1 or 2; the seed varies shape and colours a little (0: as designed)."""
+        body, outfit = Body.load(), OUTFITS[subject]
+        generator = np.random.default_rng([seed, subject])
+        spread = 0.0 if seed == 0 else 1.0
+        betas = np.zeros(10)
+        betas[:4] = np.array(outfit.betas) + 0.15 * spread * generator.standard_normal(4)
+        tint = 1.0 + 0.05 * spread * generator.standard_normal((len(outfit.palette), 3))
+        layers = dressed(body, outfit)
+        starts = np.cumsum([0] + [len(layer.rest) for layer in layers])
+        source = np.concatenate([layer.source for layer in layers])
+        shape = body.shape_directions[source] @ betas
+        rest = np.concatenate([layer.rest for layer in layers]) + shape
+        faces = np.concatenate([layer.faces + start for layer, start in zip(layers, starts, strict=False)])
+        kinds = np.concatenate([np.full(len(layer.faces), layer.kind) for layer in layers])
+        undone = cls(
+            betas=betas,
+            shaped=body.with_shape(betas),
+            outfit=outfit,
+            rest=rest,
+            place=places32(layers),
+            source=source,
+            faces=faces.astype(np.int32),
+            kinds=kinds.astype(np.int32),
+            light=np.ones((len(rest), 3), dtype=np.float32),
+            palette=np.clip(np.array(outfit.palette) * tint, 0.0, 1.0).astype(np.float32),
+        )
+        return undone._lit()
+
+    @property
+    def soles(self) -> Int[np.ndarray, "chosen"]:
+        """The vertices of the shoes."""
+        return np.unique(self.faces[self.kinds == SHOE])
+
+    def vertices(
+        self, pose: BodyPose, chosen: Int[np.ndarray, "chosen"] | slice = slice(None)
+    ) -> Float[np.ndarray, "chosen 3"]:
+        """Vertices of all layers in the world, metres, skinned with the body's own weights."""
+        weights = self.shaped.body.weights[self.source[chosen]]
+        transforms = self.shaped.with_pose(pose).world_from_rest()[:, :3, :].reshape(24, 12)
+        blended = (weights @ transforms).reshape(-1, 3, 4)
+        return np.einsum("vab,vb->va", blended[..., :3], self.rest[chosen]) + blended[..., 3]
+
+    def lowest(self, pose: BodyPose) -> float:
+        """Height of the lowest shoe in a pose, metres: where the floor is."""
+        return float(self.vertices(pose, self.soles)[:, 1].min())
+
+    def layers_of(
+        self, pose: BodyPose, camera: Camera, fine: int = 4
+    ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+        """Colour of the covered part of each pixel, and how much of it is covered, in [0, 1]."""
+        cut = self.outfit.cut
+        seen = rasterise(
+            self.vertices(pose),
+            self.faces,
+            camera,
+            fine=fine,
+            texture=self.place,
+            kinds=self.kinds,
+            cut=cut,
+        )
+        return shade(
+            seen,
+            faces=self.faces,
+            kinds=self.kinds,
+            place=self.place,
+            light=self.light,
+            palette=self.palette,
+            cut=cut,
+            checked=self.outfit.checked,
+        )
+
+    def picture(
+        self,
+        pose: BodyPose,
+        camera: Camera,
+        background: UInt8[np.ndarray, "height width 3"] | None = None,
+    ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+        """The person in front of a background (white if None), and the soft mask."""
+        rgb, alpha = self.layers_of(pose, camera)
+        return over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
+
+    def _lit(self) -> "Actor":
+        from dataclasses import replace
+
+        pose = BodyPose(
+            root_rotation=np.zeros(3),
+            root_translation=np.zeros(3),
+            joint_rotations=A_POSE.reshape(23, 3),
+        )
+        points = self.vertices(pose)
+        light = bake(
+            points,
+            vertex_normals(points, self.faces),
+            self.faces,
+            place=self.place,
+            kinds=self.kinds,
+            cut=self.outfit.cut,
+        )
+        return replace(self, light=light)

@@ -1,0 +1,61 @@
+"""Where the camera stands: 3.2 m away at chest height, the whole person in the picture."""
+
+import numpy as np
+from jaxtyping import Float
+
+from apps.studio.actor import Actor
+from apps.studio.gesture import Gesture
+from capture.camera import Camera
+from preprocess.pose import BodyPose
+
+DISTANCE_M = 3.2
+HEIGHT_M = 1.2
+
+PERSON_SHARE = 0.815
+"""Height of the standing person as a share of the picture's."""
+ABOVE_SHARE = 0.115
+"""Share of the picture above the head: room for raised arms."""
+
+
+def framed(actor: Actor, size: int) -> Camera:
+    """The studio's square camera, set up for one actor; the world's floor is y = 0."""
+    points = _standing(actor)
+    focal, target = 1.3 * size, 0.9
+    camera = _aimed(size, focal, target)
+    for _ in range(12):
+        rows = camera.project(points)[:, 1] / size
+        focal *= PERSON_SHARE / float(np.ptp(rows))
+        target -= (ABOVE_SHARE - float(rows.min())) * size * DISTANCE_M / focal * -1.0
+        camera = _aimed(size, focal, target)
+    return camera
+
+
+def _standing(actor: Actor) -> Float[np.ndarray, "vertices 3"]:
+    """The standing actor from the front and from the side, feet on the floor."""
+    views = []
+    for yaw in (0.0, 0.5 * np.pi):
+        pelvis = actor.shaped.joints[0]
+        pose = BodyPose(
+            root_rotation=np.array([0.0, yaw, 0.0]),
+            root_translation=-pelvis,
+            joint_rotations=Gesture().rotations().as_rotvec(),
+        )
+        views.append(actor.vertices(pose) - np.array([0.0, actor.lowest(pose), 0.0]))
+    return np.concatenate(views)
+
+
+def _aimed(size: int, focal: float, target: float) -> Camera:
+    """A camera in front of the actor that looks at the height `target` above the origin."""
+    eye = np.array([0.0, HEIGHT_M, DISTANCE_M])
+    forward = np.array([0.0, target, 0.0]) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.array([1.0, 0.0, 0.0])
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = [right, np.cross(forward, right), forward]
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
+    return Camera(
+        focal_px=(focal, focal),
+        center_px=(0.5 * size, 0.5 * size),
+        size_px=(size, size),
+        camera_from_world=camera_from_world,
+    )
