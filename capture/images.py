@@ -96,7 +96,7 @@ class ImageFolder:
                 f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
                 f"; at least one was expected from number {selection.start} on."
             )
-        self.size_px = self._first_size()
+        self.size_px, self.has_alpha = self._look()
 
     def frames(self) -> Iterator[Frame]:
         """The wanted pictures in order; every call starts anew."""
@@ -129,13 +129,14 @@ class ImageFolder:
         """How many pictures the folder holds."""
         return len(self._images)
 
-    def _first_size(self) -> tuple[int, int]:
+    def _look(self) -> tuple[tuple[int, int], bool]:
+        """Size of the first picture that can be read, and whether it has an alpha channel."""
         for path in self._images:
             try:
-                rgb, _, _ = read_image(path)
+                rgb, alpha, _ = read_image(path)
             except BadInput:
                 continue
-            return rgb.shape[1], rgb.shape[0]
+            return (rgb.shape[1], rgb.shape[0]), alpha is not None
         raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
 
     def _warn(self, message: str) -> None:

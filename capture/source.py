@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -13,6 +13,7 @@ VIDEO_SUFFIXES = frozenset(
 )
 
 
+@runtime_checkable
 class Source(Protocol):
     """A recorded or live stream of upright RGB frames of one size.
 
@@ -22,6 +23,7 @@ class Source(Protocol):
         selection: The frames that are wanted.
         frames_in_file: How many frames there are in all, wanted or not, as the container claims.
         frame_count: How many of them are wanted; fewer may come, see `warnings`.
+        has_alpha: Whether the frames have an alpha channel of their own.
         live: Whether frames that are not taken in time are lost.
         warnings: What was wrong so far; grows while `frames()` is read.
     """
@@ -31,6 +33,7 @@ class Source(Protocol):
     selection: Selection
     frames_in_file: int | None
     frame_count: int | None
+    has_alpha: bool
     live: bool
     warnings: list[str]
 

@@ -26,6 +26,7 @@ class VideoFile:
     OpenCV does not tell which pictures FFmpeg has patched up from damaged data.
     """
 
+    has_alpha = False
     live = False
 
     def __init__(self, path: Path, selection: Selection) -> None:

@@ -1,0 +1,168 @@
+"""Cameras from files: InstantAvatar's cameras.npz, one for all frames or one for each."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from preprocess.masks import same_shape
+from preprocess.npz import read_npz
+from preprocess.pose import Motion
+
+DEFAULT_FOCAL = 0.85
+"""Focal length of a phone's main camera in video, in units of the picture's longer side."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraTrack:
+    """The cameras of a capture, already of the frames' size.
+
+    Attributes:
+        cameras: One for all frames, or one for each in order.
+        source: Where they come from, in words for the report.
+        note: What was changed to make them fit, if anything.
+    """
+
+    cameras: tuple[Camera, ...]
+    source: str
+    note: str | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether each frame has a camera of its own."""
+        return len(self.cameras) > 1
+
+    def __getitem__(self, frame_index: int) -> Camera:
+        """The camera of one frame."""
+        return self.cameras[frame_index if self.moves else 0]
+
+
+def read_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
+    """Reads an .npz: intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each.
+
+    Optional: height and width (of the pictures that the matrices belong to), distortion (OpenCV's
+    coefficients). Cameras of another size and the same shape are scaled to `size_px`.
+
+    Raises:
+        BadInput: If there is no such file, or it holds no such cameras, or their pictures had
+            another aspect ratio.
+    """
+    if path.is_dir() or path.suffix != ".npz":
+        raise BadInput(
+            f"{path}: cameras are read from a cameras.npz (intrinsic, extrinsic, height, width); "
+            "other formats are not read yet."
+        )
+    arrays = read_npz(path)
+    if "intrinsic" not in arrays:
+        found = ", ".join(sorted(arrays)) or "nothing"
+        raise BadInput(f"{path} holds {found}; expected intrinsic, extrinsic, height and width.")
+    intrinsics = _matrices(arrays, "intrinsic", 3, path)
+    if (intrinsics[:, [0, 1], [0, 1]] <= 0.0).any():
+        raise BadInput(f"`intrinsic` in {path} has no positive focal lengths, in pixels.")
+    extrinsics = np.eye(4)[None]
+    if "extrinsic" in arrays:
+        extrinsics = _rigid(_matrices(arrays, "extrinsic", 4, path), path)
+    count = max(len(intrinsics), len(extrinsics))
+    if {len(intrinsics), len(extrinsics)} - {1, count}:
+        raise BadInput(
+            f"{path} holds {len(intrinsics)} intrinsic and {len(extrinsics)} extrinsic matrices; "
+            "expected one of each, or one of each per frame."
+        )
+    stored_px = _stored_size(arrays, size_px, path)
+    distortion = _distortion(arrays, path)
+    cameras = tuple(
+        Camera.from_intrinsic(
+            intrinsics[min(row, len(intrinsics) - 1)],
+            stored_px,
+            extrinsics[min(row, len(extrinsics) - 1)],
+            distortion,
+        ).resized(size_px)
+        for row in range(count)
+    )
+    note = None
+    if stored_px != size_px:
+        note = (
+            f"The cameras in {path.name} belong to {stored_px[0]}x{stored_px[1]} px and were "
+            f"scaled to the video's {size_px[0]}x{size_px[1]}."
+        )
+    return CameraTrack(cameras=cameras, source=path.name, note=note)
+
+
+def default_cameras(motion: Motion, size_px: tuple[int, int]) -> CameraTrack:
+    """One camera at the world's origin: the tracker's K if the poses hold it, else a phone's."""
+    width, height = size_px
+    if motion.intrinsic is not None:
+        camera = Camera.from_intrinsic(motion.intrinsic, size_px)
+        return CameraTrack(cameras=(camera,), source="K of the poses")
+    focal = DEFAULT_FOCAL * max(size_px)
+    camera = Camera(
+        focal_px=(focal, focal),
+        center_px=(width / 2.0, height / 2.0),
+        size_px=size_px,
+        camera_from_world=np.eye(4),
+    )
+    note = f"No camera was given; a focal length of {focal:.0f} px is assumed."
+    return CameraTrack(cameras=(camera,), source=f"{DEFAULT_FOCAL} x longer side", note=note)
+
+
+def _matrices(
+    arrays: dict[str, Shaped[np.ndarray, "..."]], key: str, size: int, path: Path
+) -> Float[np.ndarray, "cameras rows columns"]:
+    """One or many square matrices, with the last row of (3, 4) ones filled in."""
+    found = arrays[key]
+    if found.dtype.kind not in "iuf" or found.ndim not in (2, 3):
+        raise BadInput(f"`{key}` in {path} holds no {size}x{size} matrices.")
+    matrices = found.astype(np.float64).reshape(-1, *found.shape[-2:])
+    if size == 4 and matrices.shape[1:] == (3, 4):
+        last = np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(matrices), 1, 4))
+        matrices = np.concatenate([matrices, last], axis=1)
+    if matrices.shape[1:] != (size, size) or not len(matrices) or not np.isfinite(matrices).all():
+        raise BadInput(
+            f"`{key}` in {path} has the shape {found.shape}; expected finite {size}x{size} "
+            "matrices, one or one per frame."
+        )
+    return matrices
+
+
+def _rigid(
+    transforms: Float[np.ndarray, "cameras 4 4"], path: Path
+) -> Float[np.ndarray, "cameras 4 4"]:
+    rotations = transforms[:, :3, :3]
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
+    if off > 1e-3 or (np.linalg.det(rotations) < 0.0).any():
+        raise BadInput(
+            f"`extrinsic` in {path} is no rigid camera-from-world transform: its rotation is off "
+            f"by {off:.2g}. Expected OpenCV axes (x right, y down, z forward) and no scale."
+        )
+    return transforms
+
+
+def _stored_size(
+    arrays: dict[str, Shaped[np.ndarray, "..."]], size_px: tuple[int, int], path: Path
+) -> tuple[int, int]:
+    """Width and height that the matrices belong to; the frames' where the file does not say."""
+    if not {"width", "height"} <= arrays.keys():
+        return size_px
+    try:
+        stored = int(arrays["width"].reshape(-1)[0]), int(arrays["height"].reshape(-1)[0])
+    except (ValueError, TypeError, IndexError) as cause:
+        raise BadInput(f"`width` and `height` in {path} are no numbers of pixels.") from cause
+    if min(stored) < 1 or not same_shape(stored, size_px):
+        raise BadInput(
+            f"The cameras in {path} belong to pictures of {stored[0]}x{stored[1]} px, the video "
+            f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated or "
+            "cropped, change the cameras with it."
+        )
+    return stored
+
+
+def _distortion(arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path) -> tuple[float, ...]:
+    if "distortion" not in arrays:
+        return ()
+    found = arrays["distortion"].reshape(-1)
+    if found.dtype.kind not in "iuf" or len(found) not in (0, 4, 5, 8, 12, 14):
+        raise BadInput(f"`distortion` in {path}: expected OpenCV's 4, 5, 8, 12 or 14 numbers.")
+    return tuple(float(k) for k in found) if found.any() else ()

@@ -1,0 +1,75 @@
+"""Where the parts of a capture lie: what was named, what lies in its folder, what lies beside."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.errors import BadInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class CapturePaths:
+    """The parts of a capture.
+
+    Attributes:
+        video: Video file, folder of pictures, or native capture folder.
+        poses: The pose file.
+        masks: Folder or file of masks; None where there are none.
+        cameras: The camera file; None for a static camera that nobody described.
+    """
+
+    video: Path
+    poses: Path
+    masks: Path | None
+    cameras: Path | None
+
+
+def find_capture(
+    video: Path,
+    poses: Path | None = None,
+    masks: Path | None = None,
+    cameras: Path | str | None = None,
+) -> CapturePaths:
+    """Finds what was not named.
+
+    For a folder, everything defaults to what lies in it. For a file (and a folder that is named
+    `images`), masks and cameras are looked for beside it, then beside the poses.
+
+    Args:
+        video: Video file, folder of pictures, or native capture folder.
+        poses: Pose file; needed unless `video` is a folder that holds poses.npz.
+        masks: Folder or file of masks.
+        cameras: Camera file, or "static" for a static camera that nobody described.
+
+    Raises:
+        BadInput: If something that was named, or the poses, is not there.
+    """
+    if str(cameras) == "solve":
+        raise BadInput("--cameras solve is not built yet; give a cameras.npz, or leave it out.")
+    named = [Path(p) for p in (video, poses, masks) if p is not None]
+    if cameras is not None and str(cameras) != "static":
+        named.append(Path(cameras))
+    for path in named:
+        if not path.exists():
+            raise BadInput(f"{path} does not exist; check the path.")
+    if poses is None:
+        poses = _first([video], ["poses.npz"])
+    if poses is None:
+        raise BadInput(
+            f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys). Finding "
+            "poses in the video itself is a tracker's work."
+        )
+    inside = video.is_dir() and video.name != "images"
+    places = [video if inside else video.parent, poses.parent]
+    if cameras is None:
+        cameras = _first(places, ["cameras.npz"])
+    return CapturePaths(
+        video=video,
+        poses=poses,
+        masks=masks or _first(places, ["masks", "masks.npz", "masks.npy"]),
+        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
+    )
+
+
+def _first(places: list[Path], names: list[str]) -> Path | None:
+    candidates = (place / name for place in places if place.is_dir() for name in names)
+    return next((path for path in candidates if path.exists()), None)

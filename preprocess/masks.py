@@ -1,0 +1,187 @@
+"""Masks from files: how far each pixel is person, in [0, 1], never thresholded."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Shaped
+from PIL import Image
+
+from capture.errors import BadInput
+from capture.images import IMAGE_SUFFIXES, natural_key
+from preprocess.npz import read_npz
+
+SAMPLED = 9
+"""How many masks are looked at to find out which side is the person."""
+
+
+class Masks:
+    """One mask a frame, in order.
+
+    Attributes:
+        path: Where they lie.
+        count: How many there are.
+        size_px: Width and height of the first.
+        inverted: Whether the files hold the background, and are turned here.
+    """
+
+    def __init__(
+        self, path: Path, count: int, read: Callable[[int], Float32[np.ndarray, "height width"]]
+    ) -> None:
+        """Takes the masks as stored; `open_masks` finds out about their polarity."""
+        self.path = path
+        self.count = count
+        self.inverted = False
+        self._read = read
+        height, width = read(0).shape
+        self.size_px = (int(width), int(height))
+
+    def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+        """The mask in one row, scaled to a picture's size.
+
+        Raises:
+            BadInput: If it cannot be read or is not of the picture's shape.
+        """
+        stored = self._read(row)
+        height, width = stored.shape
+        if not same_shape((width, height), size_px):
+            raise BadInput(
+                f"Mask {row} in {self.path} has {width}x{height} px, its picture "
+                f"{size_px[0]}x{size_px[1]}; expected the same shape. Was one of them cropped "
+                "or rotated?"
+            )
+        if (width, height) != size_px:
+            shrinks = width >= size_px[0]
+            stored = cv2.resize(
+                stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+            )
+        return np.float32(1.0) - stored if self.inverted else stored
+
+
+def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
+    """Opens a folder of pictures or .npy files, or one .npz or .npy of (N, H, W).
+
+    Args:
+        path: The folder or the file.
+        invert: Whether the person is dark; None finds out from a few masks.
+
+    Raises:
+        BadInput: If there are none, if they are all empty, or if it cannot be seen which side is
+            the person.
+    """
+    if not path.exists():
+        raise BadInput(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
+    masks = _masks_of_folder(path) if path.is_dir() else _masks_of_file(path)
+    masks.inverted = _shows_background(masks) if invert is None else invert
+    return masks
+
+
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether two pictures have one aspect ratio, up to the rounding of their sizes."""
+    tolerance = max(0.01, 1.0 / min(*a, *b))
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) <= tolerance
+
+
+def _masks_of_folder(path: Path) -> Masks:
+    suffixes = IMAGE_SUFFIXES | {".npy"}
+    files = [file for file in path.iterdir() if file.suffix.lower() in suffixes]
+    files = sorted((file for file in files if not file.name.startswith(".")), key=natural_key)
+    if not files:
+        raise BadInput(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
+    return Masks(path, len(files), lambda row: _read_file(files[row]))
+
+
+def _masks_of_file(path: Path) -> Masks:
+    if path.suffix == ".npz":
+        arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
+        stack = arrays.get("masks", next(iter(arrays.values()), None))
+    elif path.suffix == ".npy":
+        stack = _load(path)
+    else:
+        raise BadInput(
+            f"{path} holds no masks that can be read; expected a folder of pictures, an .npz or an "
+            ".npy (masks as a video are not read yet)."
+        )
+    if stack is None or stack.ndim != 3 or not stack.size:
+        raise BadInput(f"{path} holds no array of masks (N, height, width).")
+    return Masks(path, len(stack), lambda row: _as_alpha(stack[row], path))
+
+
+def _load(path: Path) -> Shaped[np.ndarray, "..."]:
+    try:
+        return np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, ValueError, EOFError) as cause:
+        raise BadInput(f"{path} is no readable .npy of numbers ({cause}).") from cause
+
+
+def _read_file(path: Path) -> Float32[np.ndarray, "height width"]:
+    if path.suffix == ".npy":
+        return _as_alpha(np.asarray(_load(path)), path)
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+            return _as_alpha(_channel(picture), path)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
+        raise BadInput(f"{path} is no mask that can be decoded ({cause}).") from cause
+
+
+def _channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
+    """The one channel that holds the mask: objects' numbers, the alpha channel, or brightness."""
+    if picture.mode == "P":
+        colours = np.array(picture.getpalette()).reshape(-1, 3)
+        if (colours != colours[:, :1]).any():  # coloured: the index is an object's number
+            return np.asarray(picture) > 0
+        picture = picture.convert("L")
+    if picture.mode in ("LA", "RGBA"):
+        alpha = np.asarray(picture)[..., -1]
+        if alpha.min() < 255:
+            return alpha
+    if picture.mode in ("LA", "RGBA", "RGB", "CMYK", "YCbCr"):
+        picture = picture.convert("L")
+    return np.asarray(picture)
+
+
+def _as_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:
+    """Stored numbers as alpha; a mask of nothing but 0 and 1 needs no scaling."""
+    stored = np.squeeze(np.asarray(stored))
+    if stored.ndim != 2 or stored.dtype.kind not in "biuf":
+        raise BadInput(f"A mask in {path} has the shape {stored.shape}; expected height x width.")
+    if not np.isfinite(stored).all():
+        raise BadInput(f"A mask in {path} holds NaN; expected numbers from 0 to 1, or to 255.")
+    return np.clip(stored.astype(np.float32) / _full_scale(stored), 0.0, 1.0)
+
+
+def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
+    """The number that means "all person"."""
+    if stored.dtype.kind == "f":
+        return np.float32(1.0 if stored.max() < 1.5 else 255.0)
+    if stored.max() <= 1:
+        return np.float32(1.0)
+    return np.float32(65535.0 if stored.dtype == np.uint16 else 255.0)
+
+
+def _shows_background(masks: Masks) -> bool:
+    """Whether the masks are 1 where the person is not: most of the picture and of its rim."""
+    rows = np.unique(np.linspace(0, masks.count - 1, SAMPLED).round().astype(int))
+    shares = np.array([_shares(masks._read(int(row))) for row in rows])
+    told = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
+    if not len(told):
+        raise BadInput(
+            f"The masks in {masks.path} show nothing: all {len(rows)} that were looked at are "
+            "empty or full. Expected the person at 255 and the rest at 0."
+        )
+    area, rim = told.mean(axis=0) > 0.5
+    if area != rim:
+        raise BadInput(
+            f"It cannot be seen which side of the masks in {masks.path} is the person: they cover "
+            f"{told[:, 0].mean():.0%} of the pictures and {told[:, 1].mean():.0%} of the rims. "
+            "Say so with --mask-invert (the person is 0) or --no-mask-invert (the person is 255)."
+        )
+    return bool(area)
+
+
+def _shares(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
+    """How much of the picture, and of its rim, is covered."""
+    rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    return np.array([alpha.mean(), rim.mean()], dtype=np.float64)

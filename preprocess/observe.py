@@ -1,0 +1,194 @@
+"""Joins frames, poses, masks and cameras into observations, and says what it drops and why."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from capture.errors import BadInput
+from capture.frame import Frame
+from capture.source import Source
+from preprocess.camera_file import CameraTrack
+from preprocess.masks import Masks, same_shape
+from preprocess.observation import Observation
+from preprocess.pairing import row_by_order
+from preprocess.pose import Motion
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dropped:
+    """A frame that cannot be used.
+
+    Attributes:
+        index: Its number in the source.
+        reason: Why, in a few words.
+    """
+
+    index: int
+    reason: str
+
+
+def observe(
+    source: Source,
+    motion: Motion,
+    masks: Masks | None,
+    cameras: CameraTrack,
+    *,
+    size_px: int | None = None,
+) -> Iterator[Observation | Dropped]:
+    """Observations of the wanted frames in order, lazily, after everything was checked.
+
+    Args:
+        source: The frames.
+        motion: Poses; matched by their frame numbers, by their times, or by order.
+        masks: One mask a frame; None if the pictures have an alpha channel.
+        cameras: Cameras of the frames' size.
+        size_px: Longer side of the observations; pictures are never enlarged.
+
+    Raises:
+        BadInput: At once, if the parts do not fit together.
+    """
+    row_of = check_motion(motion, source)
+    mask_row = check_masks(masks, source)
+    camera_row = check_cameras(cameras, source)
+    target_px = shrunk(source.size_px, size_px)
+
+    def observed(frame: Frame) -> Observation | Dropped:
+        row = row_of(frame)
+        if "corrupt" in frame.flags:
+            return Dropped(index=frame.index, reason="picture damaged")
+        if row is None:
+            return Dropped(index=frame.index, reason="no pose")
+        if not motion.valid[row]:
+            return Dropped(index=frame.index, reason="pose invalid")
+        try:
+            alpha = _alpha(frame, masks, mask_row(frame.index), target_px)
+        except BadInput as cause:
+            return Dropped(index=frame.index, reason=f"mask unusable: {cause}")
+        if not (alpha > 0.5).any():
+            return Dropped(index=frame.index, reason="mask empty")
+        return Observation(
+            frame=_resized(frame, target_px),
+            alpha=alpha,
+            pose=motion[row],
+            camera=cameras[camera_row(frame.index)].resized(target_px),
+        )
+
+    return map(observed, source.frames())
+
+
+def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None]:
+    """Whether the poses fit the frames; cheap unless their numbers differ.
+
+    Returns:
+        From a frame to its row in the motion, or to None where it has none.
+
+    Raises:
+        BadInput: If most poses are unusable, none belongs to a frame that is wanted, or rows and
+            frames are of different number and nothing tells which belong together.
+    """
+    usable = int(motion.valid.sum())
+    if 2 * usable < len(motion):
+        raise BadInput(
+            f"Only {usable} of {len(motion)} poses are usable, the others are NaN or marked as "
+            "not valid; at least half were expected. Did the tracker lose the person?"
+        )
+    if motion.frames is not None:
+        rows = {int(frame): row for row, frame in enumerate(motion.frames)}
+        total = source.frames_in_file
+        if not any(source.selection.wants(f) and f >= 0 and (not total or f < total) for f in rows):
+            raise BadInput(
+                f"The poses belong to the frames {min(rows)} to {max(rows)}, and none of those is "
+                f"among the {source.frame_count} wanted frames of {source.path}."
+            )
+        return lambda frame: rows.get(frame.index)
+    if motion.times_s is not None:
+        return _row_by_time(motion)
+    by_order = row_by_order(len(motion), source, "poses")
+    return lambda frame: by_order(frame.index)
+
+
+def check_masks(masks: Masks | None, source: Source) -> Callable[[int], int]:
+    """Whether the masks fit the frames; returns the mask's row by the frame's number.
+
+    Raises:
+        BadInput: If there are none, or not one per frame, or of another shape.
+    """
+    if masks is None:
+        if source.has_alpha:
+            return lambda index: index
+        raise BadInput(
+            f"No masks were found for {source.path}, and making masks from the video is not built "
+            "yet. Give --masks: a folder with one 8-bit picture a frame, 255 where the person is."
+        )
+    if not same_shape(masks.size_px, source.size_px):
+        raise BadInput(
+            f"The masks in {masks.path} have {masks.size_px[0]}x{masks.size_px[1]} px, the frames "
+            f"{source.size_px[0]}x{source.size_px[1]}; expected the same shape. Was the video "
+            "cropped or rotated?"
+        )
+    return row_by_order(masks.count, source, f"masks in {masks.path}")
+
+
+def check_cameras(cameras: CameraTrack, source: Source) -> Callable[[int], int]:
+    """Whether there is a camera for each frame; returns its row by the frame's number.
+
+    Raises:
+        BadInput: If there are many, but not one per frame.
+    """
+    if not cameras.moves:
+        return lambda index: 0
+    return row_by_order(len(cameras.cameras), source, f"cameras in {cameras.source}")
+
+
+def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
+    """Width and height with the longer side shrunk to `longer_px`; never enlarged."""
+    if longer_px is None or longer_px >= max(size_px):
+        return size_px
+    scale = longer_px / max(size_px)
+    return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
+
+
+def _row_by_time(motion: Motion) -> Callable[[Frame], int | None]:
+    """The row nearest in time, if it is nearer than half the usual step."""
+    finite = np.flatnonzero(np.isfinite(motion.times_s))
+    rows = finite[np.argsort(motion.times_s[finite], kind="stable")]
+    times = motion.times_s[rows]
+    steps = np.diff(times)
+    reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
+
+    def row(frame: Frame) -> int | None:
+        place = int(np.searchsorted(times, frame.time_s))
+        around = range(max(0, place - 1), min(len(times), place + 1))
+        nearest = min(around, key=lambda i: abs(times[i] - frame.time_s), default=None)
+        if nearest is None or abs(times[nearest] - frame.time_s) > reach + 1e-6:
+            return None
+        return int(rows[nearest])
+
+    return row
+
+
+def _alpha(
+    frame: Frame, masks: Masks | None, row: int, size_px: tuple[int, int]
+) -> Float32[np.ndarray, "height width"]:
+    if masks is not None:
+        return masks.alpha(row, size_px)
+    if frame.alpha is None:
+        raise BadInput("the picture has no alpha channel")
+    alpha = frame.alpha.astype(np.float32) / np.float32(255.0)
+    if frame.size_px == size_px:
+        return alpha
+    return cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA)
+
+
+def _resized(frame: Frame, size_px: tuple[int, int]) -> Frame:
+    if frame.size_px == size_px:
+        return frame
+    alpha = frame.alpha
+    return replace(
+        frame,
+        rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA),
+        alpha=None if alpha is None else cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA),
+    )

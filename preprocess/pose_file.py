@@ -1,0 +1,163 @@
+"""Pose files: InstantAvatar's .npz, which its successors read too, with a few keys of ours."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from capture.errors import BadInput
+from preprocess.npz import read_npz
+from preprocess.pose import Motion
+
+LAYOUTS = (
+    ("global_orient", "body_pose", "transl"),
+    ("thetas", "transl"),
+    ("poses", "trans"),
+)
+"""The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
+
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
+
+
+def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
+    """Reads poses: axis-angles and metres, one row a pose.
+
+    Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
+    (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
+    (N, 3, 3), model. Rows with NaN are marked as not valid.
+
+    Args:
+        path: The .npz file.
+        default_model: Body family of files that do not say theirs.
+
+    Raises:
+        BadInput: If there is no such file, or it holds no such poses.
+    """
+    if path.suffix != ".npz":
+        raise BadInput(f"{path}: poses are read from .npz files (InstantAvatar's keys).")
+    arrays = read_npz(path)
+    layout = next((keys for keys in LAYOUTS if set(keys) <= arrays.keys()), None)
+    if layout is None:
+        expected = "; or ".join(" and ".join(keys) for keys in LAYOUTS)
+        raise BadInput(
+            f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}."
+        )
+    poses = np.concatenate([_rows(arrays, key, path) for key in layout[:-1]], axis=1)
+    translations = _rows(arrays, layout[-1], path)
+    count = len(poses)
+    if poses.shape[1] != 72 or translations.shape != (count, 3) or not count:
+        raise BadInput(
+            f"{path}: {' + '.join(layout)} have {poses.shape} and {translations.shape} numbers; "
+            "expected (N, 72) rotations (SMPL's root and 23 joints) and (N, 3) metres."
+        )
+    times = _per_row(arrays, "time", count, path)
+    return Motion(
+        root_rotations=poses[:, :3],
+        root_translations=translations,
+        joint_rotations=poses[:, 3:].reshape(count, 23, 3),
+        valid=_valid(arrays, np.column_stack([poses, translations]), times, path),
+        betas=_betas(arrays, path),
+        model=str(arrays["model"]) if "model" in arrays else default_model,
+        frames=_frame_numbers(arrays, count, path),
+        times_s=times,
+        intrinsic=_intrinsic(arrays, path),
+    )
+
+
+def write_motion(path: Path, motion: Motion) -> None:
+    """Writes a motion in the keys that `read_motion` reads; reading gives the same numbers."""
+    optional = {"frame": motion.frames, "time": motion.times_s, "K": motion.intrinsic}
+    np.savez_compressed(
+        path,
+        betas=motion.betas,
+        global_orient=motion.root_rotations,
+        body_pose=motion.joint_rotations.reshape(len(motion), 69),
+        transl=motion.root_translations,
+        valid=motion.valid,
+        model=np.array(motion.model),
+        **{key: value for key, value in optional.items() if value is not None},
+    )
+
+
+def _numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
+    if arrays[key].dtype.kind not in "biuf":
+        raise BadInput(f"`{key}` in {path} holds no numbers.")
+    return arrays[key].astype(np.float64)
+
+
+def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses numbers"]:
+    """An array of one row a pose; (N, 1, 3) and (N, 23, 3) are flattened."""
+    rows = _numbers(arrays, key, path)
+    if rows.ndim < 2 or not rows.size:
+        raise BadInput(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
+    first = arrays["transl"] if "transl" in arrays else arrays["trans"]
+    if len(rows) != len(np.atleast_1d(first)):
+        raise BadInput(
+            f"{path} holds {len(rows)} rows of `{key}` but {len(np.atleast_1d(first))} "
+            "translations; expected one of each per pose."
+        )
+    return rows.reshape(len(rows), -1)
+
+
+def _per_row(arrays: Arrays, key: str, count: int, path: Path) -> Float[np.ndarray, "poses"] | None:
+    """An optional array of one number a pose."""
+    if key not in arrays:
+        return None
+    numbers = _numbers(arrays, key, path).reshape(-1)
+    if len(numbers) != count:
+        raise BadInput(f"{path} holds {len(numbers)} numbers in `{key}` for {count} poses.")
+    return numbers
+
+
+def _valid(
+    arrays: Arrays,
+    numbers: Float[np.ndarray, "poses 75"],
+    times: Float[np.ndarray, "poses"] | None,
+    path: Path,
+) -> Bool[np.ndarray, "poses"]:
+    """Rows that are finite and not marked as lost."""
+    valid = np.isfinite(numbers).all(axis=1)
+    marked = _per_row(arrays, "valid", len(valid), path)
+    if marked is not None:
+        valid &= marked > 0
+    return valid if times is None else valid & np.isfinite(times)
+
+
+def _betas(arrays: Arrays, path: Path) -> Float[np.ndarray, "betas"]:
+    """One shape for the whole motion: the mean, where each row has its own."""
+    if "betas" not in arrays:
+        return np.zeros(0)
+    betas = _numbers(arrays, "betas", path)
+    if betas.ndim > 2:
+        raise BadInput(
+            f"`betas` in {path} have the shape {betas.shape}; expected (10,) or (1, 10)."
+        )
+    rows = np.atleast_2d(betas)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        raise BadInput(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
+    return rows.mean(axis=0)
+
+
+def _frame_numbers(arrays: Arrays, count: int, path: Path) -> Int[np.ndarray, "poses"] | None:
+    numbers = _per_row(arrays, "frame", count, path)
+    if numbers is None:
+        return None
+    if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
+        raise BadInput(f"`frame` in {path} holds numbers that are no frame numbers.")
+    frames = numbers.astype(np.int64)
+    if len(np.unique(frames)) < count:
+        raise BadInput(f"`frame` in {path} names a frame twice; expected one person's poses.")
+    return frames
+
+
+def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
+    """The tracker's K; the median, where each row has its own."""
+    if "K" not in arrays:
+        return None
+    intrinsic = _numbers(arrays, "K", path)
+    if intrinsic.ndim == 3:
+        intrinsic = np.nanmedian(intrinsic, axis=0)
+    if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
+        raise BadInput(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
+    return intrinsic
