@@ -138,9 +138,7 @@ def weight_codes(weights: Float[np.ndarray, "points 24"]) -> UInt8[np.ndarray, "
     return (codes + (rank < missing)).astype(np.uint8)
 
 
-def _weights(
-    rig: Rig, points: Float32[np.ndarray, "points 3"]
-) -> Float32[np.ndarray, "points 24"]:
+def _weights(rig: Rig, points: Float32[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
     """`rig.weights_at`, reading all 24 weights of a node at once."""
     last = np.array(rig.weights.shape[:3]) - 1
     places = (points - rig.box_low) / (rig.box_high - rig.box_low) * last

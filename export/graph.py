@@ -9,9 +9,6 @@ from export.rules import DrawingRules
 from export.shading import Layer, shade
 from export.tables import Tables, initialisers
 
-TABLES_FILE = "tables.bin"
-"""Where the graph believes its tables to be; the player hands them over in memory."""
-
 
 def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
     """The graph that draws `tables`.

@@ -200,9 +200,12 @@ class Graph:
         self._outputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
 
     def table(self, name: str, array: Shaped[np.ndarray, "..."]) -> Value:
-        """A named initialiser kept outside of the graph (the package holds it as a stream)."""
-        info = TensorProto(name=name, data_type=KINDS[array.dtype], dims=array.shape)
-        self._initialisers.append(info)
+        """A named initialiser kept outside of the model, as a "file" of its own name."""
+        tensor = TensorProto(name=name, data_type=KINDS[array.dtype], dims=array.shape)
+        tensor.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", name), ("offset", 0), ("length", array.nbytes)):
+            tensor.external_data.add(key=key, value=str(value))
+        self._initialisers.append(tensor)
         return Value(self, name, array.dtype)
 
     def constant(self, array: Any) -> Value:
@@ -286,7 +289,7 @@ class Graph:
         return outputs
 
     def model(self) -> onnx.ModelProto:
-        """The graph as a model, checked by ONNX's own rules (tables are still without content)."""
+        """The graph as a model; its tables are handed to the runtime beside it."""
         return helper.make_model(
             helper.make_graph(
                 self._nodes, "avatar", self._inputs, self._outputs, self._initialisers

@@ -119,9 +119,7 @@ def depth_code(depth: Value, view: View, tables: Tables) -> Value:
     return steps.clipped(0.0, DEPTH_STEPS - 1.0).cast(np.int32)
 
 
-def footprint(
-    graph: Graph, depth: Value, view: View, tables: Tables, rules: DrawingRules
-) -> Value:
+def footprint(graph: Graph, depth: Value, view: View, tables: Tables, rules: DrawingRules) -> Value:
     """Pixels along the edge of every surfel's footprint, an int64 scalar of at least 2.
 
     It follows the spacing of the surfels where they are nearest to the camera, so that one does
@@ -160,7 +158,9 @@ def nearest_keys(graph: Graph, splats: Splats, view: View) -> Value:
     return keys.slices([0], [view.pixels])
 
 
-def holes_filled(graph: Graph, keys: Value, view: View, tables: Tables, rules: DrawingRules) -> Value:
+def holes_filled(
+    graph: Graph, keys: Value, view: View, tables: Tables, rules: DrawingRules
+) -> Value:
     """Fills single pixels that two opposite neighbours overtop."""
     image = keys.reshaped(view.height, view.width)
     border = graph.constant(np.array([1, 1, 1, 1], dtype=np.int64))

@@ -64,7 +64,13 @@ def shade(
     direction = applied(inverse, ray)
     to_surfel = applied(inverse, camera)
     begin, length = _extent(
-        graph, normal, direction, to_surfel, dot(camera, ray), tables["thickness"].take(surfel), rules
+        graph,
+        normal,
+        direction,
+        to_surfel,
+        dot(camera, ray),
+        tables["thickness"].take(surfel),
+        rules,
     )
     segment = Segment(
         origin=[a - b for a, b in zip(canonical, to_surfel, strict=True)],

@@ -53,7 +53,9 @@ def stand_in() -> StandIn:
     rig = Rig.of(Body.load().with_shape())
     field_at = capsule_field(rig)
     size = (rig.box_high - rig.box_low) / rig.distance.shape
-    centers = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in rig.distance.shape], indexing="ij"), -1)
+    centers = np.stack(
+        np.meshgrid(*[np.arange(n) + 0.5 for n in rig.distance.shape], indexing="ij"), -1
+    )
     centers = (centers * size + rig.box_low).reshape(-1, 3).astype(np.float32)
     occupied = np.zeros(rig.distance.shape, bool)
     for shift in np.ndindex(3, 3, 3):

@@ -1,0 +1,250 @@
+"""Avatar to package: bakes, builds, checks, and only then writes."""
+
+import io
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from PIL import Image
+
+from avatar.metrics import psnr
+from avatar.model import Avatar
+from avatar.render import render
+from avatar.rig import Rig
+from capture.camera import Camera
+from capture.errors import BadInput
+from export.bake import BakeConfig, bake
+from export.errors import ExportRefused
+from export.graph import build_graph
+from export.lattice import FieldAt
+from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
+from export.codec import Layout
+from export.package import AvatarPackage, write_package
+from export.player import ALIKE, Likeness, Player, premultiplied
+from export.rules import DrawingRules
+from export.tables import Tables
+from export.twin import Shot, draw
+from preprocess.pose import BodyPose
+
+LOWEST_PSNR, GOOD_PSNR = 30.0, 38.0
+"""Player against volume renderer, dB: below the first nothing is written, below the second the
+report says so."""
+CHECKED_PX = 256
+"""Longer side of the pictures that are compared with the volume renderer."""
+MOST_GOLDEN = 4
+
+View = tuple[BodyPose, Camera]
+"""A pose and a camera that looks at it."""
+Picture = Float32[np.ndarray, "height width 4"]
+Renderer = Callable[[BodyPose, Camera], Picture]
+"""The exact picture of the avatar: premultiplied RGBA in [0, 1]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExportReport:
+    """What became of an export.
+
+    Attributes:
+        path: The package.
+        bytes: Its size.
+        seconds: Wall time of baking, checking and writing.
+        psnr_to_renderer: Of each tier, dB, mean over the views.
+        largest_difference: Between graph and twin, in 1/255.
+        warnings: What the user should know.
+    """
+
+    path: Path
+    bytes: int
+    seconds: float
+    psnr_to_renderer: Mapping[str, float]
+    largest_difference: float
+    warnings: tuple[str, ...]
+
+
+def export_avatar(
+    avatar: Avatar,
+    path: Path,
+    *,
+    views: Sequence[View],
+    metrics: Mapping[str, Any],
+    renderer: Callable[[Avatar, BodyPose, Camera], Picture] = render,
+    config: BakeConfig | None = None,
+) -> ExportReport:
+    """Writes an avatar's package, or nothing.
+
+    Args:
+        avatar: As training left it.
+        path: The `.iavatar` file; replaced at once if it exists.
+        views: Poses and cameras to check it with, at least one; the first is the preview, and
+            the first few become golden frames. Lens distortion is left out.
+        metrics: What training reported, kept in the manifest (JSON).
+        renderer: The exact picture of an avatar.
+        config: How finely to bake.
+
+    Raises:
+        ExportRefused: If the player would not draw what the avatar looks like.
+        BadInput: If there is nothing in the avatar.
+        OSError: If it cannot be written.
+    """
+    occupied = avatar.rendering_grid().occupied.cpu().numpy()
+    device = avatar.field.table.device
+
+    def field_at(points):  # noqa: ANN001, ANN202
+        rgb, density = avatar.field_at(points.to(device))
+        return rgb.cpu(), density.cpu()
+
+    return export_field(
+        field_at,
+        avatar.rig,
+        occupied,
+        path,
+        views=views,
+        metrics=metrics,
+        renderer=lambda pose, camera: renderer(avatar, pose, camera),
+        config=config,
+    )
+
+
+def export_field(
+    field_at: FieldAt,
+    rig: Rig,
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    path: Path,
+    *,
+    views: Sequence[View],
+    metrics: Mapping[str, Any],
+    renderer: Renderer,
+    config: BakeConfig | None = None,
+) -> ExportReport:
+    """As `export_avatar`, of any canonical field."""
+    if not views:
+        raise BadInput("An avatar cannot be checked without a pose and a camera; give one view.")
+    started = time.perf_counter()
+    rules = DrawingRules()
+    views = [(pose, replace(camera, distortion=())) for pose, camera in views]
+    tables = bake(field_at, rig, occupied=occupied, config=config)
+    package = _package(tables, rules, rig, views, metrics)
+    player = Player(package)
+    worst = _check_graph(player, tables, rules, package.manifest.golden)
+    score, warnings = _check_pictures(player, views, renderer)
+    golden = tuple(player.render(frame.pose, frame.camera) for frame in package.manifest.golden)
+    note = replace(package.manifest.tiers["hq"], psnr_to_renderer=score, largest_difference=worst)
+    package = replace(
+        package,
+        manifest=replace(package.manifest, tiers={"hq": note}),
+        golden=golden,
+        preview=_png(player.render(*views[0])),
+    )
+    size = write_package(package, path)
+    return ExportReport(
+        path=path,
+        bytes=size,
+        seconds=time.perf_counter() - started,
+        psnr_to_renderer={"hq": score},
+        largest_difference=worst,
+        warnings=tuple(warnings),
+    )
+
+
+def _package(
+    tables: Tables,
+    rules: DrawingRules,
+    rig: Rig,
+    views: Sequence[View],
+    metrics: Mapping[str, Any],
+) -> AvatarPackage:
+    """The package as it stands before the checks: no scores, no pictures."""
+    note = TierNote(
+        layout=Layout.of(tables), rules=rules, psnr_to_renderer=0.0, largest_difference=0.0
+    )
+    golden = [
+        GoldenFrame(pose=pose, camera=_fitted(camera, GOLDEN_PX))
+        for pose, camera in views[:MOST_GOLDEN]
+    ]
+    return AvatarPackage(
+        manifest=Manifest(
+            rest_joints=rig.rest_joints,
+            parents=rig.parents,
+            canonical_rotations=rig.canonical_rotations,
+            tiers={"hq": note},
+            golden=tuple(golden),
+            metrics=dict(metrics),
+            sha256={},
+        ),
+        graphs={"hq": build_graph(tables, rules).SerializeToString()},
+        tables={"hq": tables},
+        golden=(),
+        preview=b"",
+    )
+
+
+def _fitted(camera: Camera, longest_px: int) -> Camera:
+    """The camera for a picture whose longer side is at most so long."""
+    scale = min(1.0, longest_px / max(camera.size_px))
+    width, height = (max(1, round(size * scale)) for size in camera.size_px)
+    return camera.resized((width, height))
+
+
+def _check_graph(
+    player: Player, tables: Tables, rules: DrawingRules, golden: Sequence[GoldenFrame]
+) -> float:
+    """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
+    worst = 0.0
+    for number, frame in enumerate(golden):
+        camera = frame.camera
+        shot = Shot(
+            bones=player.bones(frame.pose, camera),
+            focal=np.array(camera.focal_px, dtype=np.float32),
+            center=np.array(camera.center_px, dtype=np.float32),
+            size_px=camera.size_px,
+            samples=rules.samples,
+        )
+        drawn = premultiplied(player.render(frame.pose, camera))
+        likeness = Likeness.of(drawn, draw(tables, rules, shot))
+        worst = max(worst, likeness.largest)
+        if not likeness.alike:
+            raise ExportRefused(
+                f"In view {number} the player's graph is within 2/255 of its meaning on only "
+                f"{likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
+                "written; the checkpoint is kept. This is a fault of the program: please report "
+                "it with the version of onnxruntime."
+            )
+    return worst
+
+
+def _check_pictures(
+    player: Player, views: Sequence[View], renderer: Renderer
+) -> tuple[float, list[str]]:
+    """Compares the player with the exact renderer on white."""
+    scores = []
+    for pose, camera in views:
+        camera = _fitted(camera, CHECKED_PX)
+        drawn = _on_white(premultiplied(player.render(pose, camera)))
+        scores.append(min(psnr(drawn, _on_white(renderer(pose, camera))), 99.0))
+    score = float(np.mean(scores))
+    if score < LOWEST_PSNR:
+        raise ExportRefused(
+            f"The player draws the avatar at {score:.1f} dB to the volume renderer; at least "
+            f"{LOWEST_PSNR:.0f} are wanted. Nothing was written; the checkpoint is kept. Train "
+            "longer (--resume), so that the avatar has a firm surface."
+        )
+    if score < GOOD_PSNR:
+        return score, [
+            f"The player draws the avatar at {score:.1f} dB to the volume renderer "
+            f"({GOOD_PSNR:.0f} dB are good): fine detail or fuzzy edges are simplified."
+        ]
+    return score, []
+
+
+def _on_white(picture: Picture) -> Float32[np.ndarray, "height width 3"]:
+    return np.clip(picture[..., :3] + (1.0 - picture[..., 3:]), 0.0, 1.0)
+
+
+def _png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(rgba).save(buffer, format="PNG")
+    return buffer.getvalue()

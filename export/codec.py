@@ -1,0 +1,172 @@
+"""Tables to compact streams and back, without loss: differences of neighbours deflate well."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+from capture.errors import BadInput
+from export.tables import BRICK, NODES, SURFEL_BITS, Bricks, Surfels, Tables
+
+MOST_BRICKS = 1 << 16
+MOST_BLOCKS = 1 << 20
+"""Larger tables are refused before anything is allocated; a 2-m person at 4 mm has 5,000 bricks."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Layout:
+    """What the streams do not hold themselves: sizes and scales. Lengths in metres.
+
+    Attributes:
+        surfels: How many there are.
+        surfel_low, surfel_extent_m, surfel_spacing_m: As in `Surfels`.
+        bricks: How many there are, without the empty one.
+        brick_counts: Blocks of the lattice along x, y, z.
+        brick_low, voxel_m: As in `Bricks`.
+        pelvis, reach_m: As in `Tables`.
+    """
+
+    surfels: int
+    surfel_low: tuple[float, float, float]
+    surfel_extent_m: float
+    surfel_spacing_m: float
+    bricks: int
+    brick_counts: tuple[int, int, int]
+    brick_low: tuple[float, float, float]
+    voxel_m: float
+    pelvis: tuple[float, float, float]
+    reach_m: float
+
+    @classmethod
+    def of(cls, tables: Tables) -> "Layout":
+        """The layout of some tables."""
+        surfels, bricks = tables.surfels, tables.bricks
+        x, y, z = bricks.index.shape
+        return cls(
+            surfels=len(surfels),
+            surfel_low=_triple(surfels.low),
+            surfel_extent_m=surfels.extent_m,
+            surfel_spacing_m=surfels.spacing_m,
+            bricks=len(bricks.voxels) - 1,
+            brick_counts=(x, y, z),
+            brick_low=_triple(bricks.low),
+            voxel_m=bricks.voxel_m,
+            pelvis=_triple(tables.pelvis),
+            reach_m=tables.reach_m,
+        )
+
+    def check(self) -> None:
+        """Raises BadInput if a table would be larger than the player can use."""
+        counts = self.brick_counts
+        sound = (
+            0 < self.surfels < 1 << SURFEL_BITS
+            and 0 <= self.bricks <= MOST_BRICKS
+            and min(counts) > 0
+            and max(counts) <= MOST_BLOCKS
+            and counts[0] * counts[1] * counts[2] <= MOST_BLOCKS
+        )
+        if not sound:
+            raise BadInput(
+                f"The package claims {self.surfels} surfels and {self.bricks} bricks on "
+                f"{counts} blocks; at most {1 << SURFEL_BITS}, {MOST_BRICKS} and {MOST_BLOCKS} "
+                "can be. The file is damaged or no avatar."
+            )
+
+    def streams(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Element type and shape of every stream."""
+        x, y, z = self.brick_counts
+        return {
+            "blocks": ("u1", ((x * y * z + 7) // 8,)),
+            "voxels": ("u1", (4, self.bricks, BRICK**3)),
+            "positions": ("<u2", (3, self.surfels)),
+            "normals": ("i1", (3, self.surfels)),
+            "thickness": ("u1", (self.surfels,)),
+            "weights": ("u1", (24, self.surfels)),
+            "gradients": ("i1", (72, self.surfels)),
+        }
+
+
+def _triple(vector: Shaped[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = (float(component) for component in vector)
+    return x, y, z
+
+
+def encode(tables: Tables) -> dict[str, bytes]:
+    """The streams, ready to be deflated; `Layout.of(tables).streams()` says how to read them."""
+    surfels, bricks = tables.surfels, tables.bricks
+    core = bricks.voxels[1:, :BRICK, :BRICK, :BRICK].reshape(-1, BRICK**3, 4)
+    arrays = {
+        "blocks": np.packbits(bricks.index.ravel() > 0),
+        "voxels": _differences(np.moveaxis(core, -1, 0)),
+        "positions": _differences(surfels.position_codes.T),
+        "normals": surfels.normal_codes.T,
+        "thickness": surfels.thickness_codes,
+        "weights": surfels.weight_codes,
+        "gradients": surfels.gradient_codes.reshape(-1, 72).T,
+    }
+    layout = Layout.of(tables).streams()
+    return {name: array.astype(layout[name][0]).tobytes() for name, array in arrays.items()}
+
+
+def decode(streams: dict[str, bytes], layout: Layout) -> Tables:
+    """The inverse of `encode`. Sizes were checked where the streams were read.
+
+    Raises:
+        BadInput: If the blocks do not count as many bricks as there are.
+    """
+    arrays = {
+        name: np.frombuffer(streams[name], dtype=dtype).reshape(shape)
+        for name, (dtype, shape) in layout.streams().items()
+    }
+    return Tables(
+        surfels=Surfels(
+            low=np.array(layout.surfel_low, dtype=np.float32),
+            extent_m=layout.surfel_extent_m,
+            spacing_m=layout.surfel_spacing_m,
+            position_codes=_sums(arrays["positions"]).T,
+            normal_codes=arrays["normals"].T,
+            thickness_codes=arrays["thickness"],
+            weight_codes=arrays["weights"],
+            gradient_codes=np.ascontiguousarray(arrays["gradients"].T).reshape(-1, 3, 24),
+        ),
+        bricks=_bricks(arrays["blocks"], arrays["voxels"], layout),
+        pelvis=np.array(layout.pelvis, dtype=np.float32),
+        reach_m=layout.reach_m,
+    )
+
+
+def _differences(codes: Shaped[np.ndarray, "*rows length"]) -> Shaped[np.ndarray, "*rows length"]:
+    """Each code minus the one before it, modulo its own type."""
+    result = codes.copy()
+    result[..., 1:] -= codes[..., :-1]
+    return result
+
+
+def _sums(codes: Shaped[np.ndarray, "*rows length"]) -> Shaped[np.ndarray, "*rows length"]:
+    """The inverse of `_differences`."""
+    return np.cumsum(codes, axis=-1, dtype=codes.dtype)
+
+
+def _bricks(
+    blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 512"], layout: Layout
+) -> Bricks:
+    counts = np.array(layout.brick_counts)
+    used = np.unpackbits(blocks)[: counts.prod()].astype(np.int32)
+    if used.sum() != layout.bricks:
+        raise BadInput(
+            f"The package marks {used.sum()} blocks as used but holds {layout.bricks} bricks. "
+            "The file is damaged."
+        )
+    index = (np.cumsum(used, dtype=np.int32) * used).reshape(counts)
+    core = np.moveaxis(_sums(voxels), 0, -1).reshape(-1, BRICK, BRICK, BRICK, 4)
+    core = np.concatenate([np.zeros_like(core, shape=(1, BRICK, BRICK, BRICK, 4)), core])
+    whole = np.zeros((len(core), NODES, NODES, NODES, 4), dtype=np.uint8)
+    padded = np.pad(index, [(0, 1)] * 3)
+    place = np.argwhere(index > 0)
+    for step in np.ndindex(2, 2, 2):  # the core itself, then the first layers of its neighbours
+        neighbour = padded[tuple((place + step).T)]
+        target = tuple(slice(BRICK, NODES) if s else slice(0, BRICK) for s in step)
+        source = tuple(slice(0, 1) if s else slice(0, BRICK) for s in step)
+        whole[(slice(1, None), *target)] = core[neighbour][(slice(None), *source)]
+    low = np.array(layout.brick_low, dtype=np.float32)
+    return Bricks(low=low, voxel_m=layout.voxel_m, index=index, voxels=whole)

@@ -1,0 +1,220 @@
+"""The page at the front of a package: what it is, in which units, and how to check it."""
+
+import json
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from export.codec import Layout
+from export.rules import DrawingRules
+from preprocess.pose import BodyPose
+
+FORMAT = 1
+GOLDEN_PX = 128
+"""Golden frames are no longer than this along either side."""
+JOINTS = (
+    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 "
+    "left_foot right_foot neck left_collar right_collar head left_shoulder right_shoulder "
+    "left_elbow right_elbow left_wrist right_wrist left_hand right_hand"
+).split()
+CONVENTIONS = {
+    "units": "metres, radians, density in 1/m",
+    "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",
+    "camera_axes": "x right, y down, z forward (OpenCV); pixel centres at +0.5",
+    "pose": "world = R(root_rotation) (x - J0) + J0 + root_translation; axis-angle joint rotations",
+    "picture": "RGBA, 8 bits, straight alpha",
+}
+LICENCE = (
+    "A likeness of a person: use it only as that person allows. It is neither the body model's "
+    "data nor code; the rights in it are those of the recording it was learnt from."
+)
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TierNote:
+    """One quality of the player.
+
+    Attributes:
+        layout: How its streams are read.
+        rules: How it is drawn.
+        psnr_to_renderer: Against the volume renderer, dB.
+        largest_difference: Between graph and twin, in 1/255, over the golden frames.
+    """
+
+    layout: Layout
+    rules: DrawingRules
+    psnr_to_renderer: float
+    largest_difference: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GoldenFrame:
+    """A picture that the player must draw again: its pose and its camera."""
+
+    pose: BodyPose
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Manifest:
+    """What a package says about itself.
+
+    Attributes:
+        rest_joints: Rest joints, metres.
+        parents: Parent of each joint, -1 for the root.
+        canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
+        tiers: By name; "hq" is always there.
+        golden: Of the "hq" tier, at its usual number of samples.
+        metrics: What training reported, as JSON.
+        licence: A note on who may use it.
+        sha256: Of every entry but the manifest.
+    """
+
+    rest_joints: Float[np.ndarray, "24 3"]
+    parents: Int[np.ndarray, "24"]
+    canonical_rotations: Float[np.ndarray, "23 3"]
+    tiers: dict[str, TierNote]
+    golden: tuple[GoldenFrame, ...]
+    metrics: dict[str, Any]
+    licence: str = LICENCE
+    sha256: dict[str, str]
+
+    def to_json(self) -> str:
+        """The text of manifest.json."""
+        content = {
+            "format": FORMAT,
+            **CONVENTIONS,
+            "joints": JOINTS,
+            "parents": self.parents.tolist(),
+            "rest_joints": self.rest_joints.tolist(),
+            "canonical_rotations": self.canonical_rotations.tolist(),
+            "tiers": {name: asdict(tier) for name, tier in self.tiers.items()},
+            "golden": [_golden_to_json(frame) for frame in self.golden],
+            "metrics": self.metrics,
+            "licence": self.licence,
+            "sha256": self.sha256,
+        }
+        return json.dumps(content, indent=1)
+
+    @classmethod
+    def from_json(cls, text: bytes) -> "Manifest":
+        """Reads manifest.json.
+
+        Raises:
+            BadInput: If it is none, or of another format, or something in it cannot be.
+        """
+        content = _parsed(text)
+        try:
+            return cls(
+                rest_joints=_numbers(content["rest_joints"], (24, 3)),
+                parents=_tree(content["parents"]),
+                canonical_rotations=_numbers(content["canonical_rotations"], (23, 3)),
+                tiers={str(name): _tier(note) for name, note in content["tiers"].items()},
+                golden=tuple(_golden(frame) for frame in content["golden"]),
+                metrics=dict(content["metrics"]),
+                licence=str(content["licence"]),
+                sha256={str(name): str(sum_) for name, sum_ in content["sha256"].items()},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            if isinstance(error, BadInput):
+                raise
+            raise BadInput(f"The package's manifest is damaged: {error!r}.") from error
+
+
+def _parsed(text: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BadInput("The package's manifest is no JSON; the file is damaged.") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else None
+        raise BadInput(
+            f"The package has format {found!r}; this version reads format {FORMAT}. "
+            "Export the avatar again, or use the version that wrote it."
+        )
+    return content
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected finite numbers of shape {shape}, found {array.shape}")
+    return array
+
+
+def _tree(values: Any) -> Int[np.ndarray, "24"]:
+    parents = np.asarray(values)
+    known = parents.shape == (24,) and parents.dtype.kind == "i" and parents[0] == -1
+    if not (known and all(0 <= parents[j] < j for j in range(1, 24))):
+        raise ValueError("parents must be a tree of 24 joints, each after its parent")
+    return parents
+
+
+def _tier(note: dict[str, Any]) -> TierNote:
+    layout = _record(Layout, note["layout"])
+    layout.check()
+    return TierNote(
+        layout=layout,
+        rules=_record(DrawingRules, note["rules"]),
+        psnr_to_renderer=float(note["psnr_to_renderer"]),
+        largest_difference=float(note["largest_difference"]),
+    )
+
+
+def _record(kind: type[Record], values: dict[str, Any]) -> Record:
+    """A record of numbers and of tuples of three numbers."""
+    content: dict[str, Any] = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        value, whole = values[field.name], "int" in str(field.type)
+        if "tuple" in str(field.type):
+            content[field.name] = tuple(_number(v, whole) for v in value)
+            if len(value) != 3:
+                raise ValueError(f"{field.name} must be three numbers")
+        else:
+            content[field.name] = _number(value, whole)
+    return kind(**content)
+
+
+def _number(value: Any, whole: bool) -> float | int:
+    number = int(value) if whole else float(value)
+    if number != value or not np.isfinite(number):
+        raise ValueError(f"{value!r} is not a usable number")
+    return number
+
+
+def _golden_to_json(frame: GoldenFrame) -> dict[str, Any]:
+    pose, camera = frame.pose, frame.camera
+    return {
+        "root_rotation": pose.root_rotation.tolist(),
+        "root_translation": pose.root_translation.tolist(),
+        "joint_rotations": pose.joint_rotations.tolist(),
+        "focal_px": camera.focal_px,
+        "center_px": camera.center_px,
+        "size_px": camera.size_px,
+        "camera_from_world": camera.camera_from_world.tolist(),
+    }
+
+
+def _golden(content: dict[str, Any]) -> GoldenFrame:
+    width, height = (int(size) for size in content["size_px"])
+    if not (0 < width <= GOLDEN_PX and 0 < height <= GOLDEN_PX):
+        raise ValueError(f"golden frames are at most {GOLDEN_PX} px, not {width}x{height}")
+    focal, center = _numbers(content["focal_px"], (2,)), _numbers(content["center_px"], (2,))
+    return GoldenFrame(
+        pose=BodyPose(
+            root_rotation=_numbers(content["root_rotation"], (3,)),
+            root_translation=_numbers(content["root_translation"], (3,)),
+            joint_rotations=_numbers(content["joint_rotations"], (23, 3)),
+        ),
+        camera=Camera(
+            focal_px=(float(focal[0]), float(focal[1])),
+            center_px=(float(center[0]), float(center[1])),
+            size_px=(width, height),
+            camera_from_world=_numbers(content["camera_from_world"], (4, 4)),
+        ),
+    )

@@ -1,0 +1,190 @@
+"""The `.iavatar` file: a zip of manifest, graph and compact streams, written whole or not at all."""
+
+import hashlib
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.errors import BadInput
+from export.codec import Layout, decode, encode
+from export.manifest import Manifest
+from export.tables import Tables
+
+MANIFEST, PREVIEW = "manifest.json", "preview.png"
+MOST_ENTRIES = 64
+LARGEST_TEXT = 4 << 20
+"""Bytes of a manifest, a graph or a preview."""
+EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Time stamp of every entry: the same avatar is always the same bytes."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AvatarPackage:
+    """An avatar that plays without torch.
+
+    Attributes:
+        manifest: What it says about itself.
+        graphs: ONNX model of each tier; its tables are external.
+        tables: Of each tier.
+        golden: Pictures of `manifest.golden`, straight alpha.
+        preview: A PNG.
+    """
+
+    manifest: Manifest
+    graphs: Mapping[str, bytes]
+    tables: Mapping[str, Tables]
+    golden: tuple[UInt8[np.ndarray, "_ _ 4"], ...]
+    preview: bytes
+
+
+def graph_entry(tier: str) -> str:
+    """Where a tier's graph lies: player.onnx is the "hq" one."""
+    return "player.onnx" if tier == "hq" else f"{tier}/player.onnx"
+
+
+def stream_entry(tier: str, stream: str) -> str:
+    """Where a tier's stream lies."""
+    return f"{tier}/{stream}.bin"
+
+
+def golden_entry(number: int) -> str:
+    """Where a golden frame lies: raw RGBA bytes."""
+    return f"golden/{number}.rgba"
+
+
+def write_package(package: AvatarPackage, path: Path) -> int:
+    """Writes the package under a temporary name, flushes it to the disk and renames it.
+
+    Returns:
+        Its size in bytes.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    entries = {PREVIEW: package.preview}
+    for tier, graph in package.graphs.items():
+        entries[graph_entry(tier)] = graph
+        for name, stream in encode(package.tables[tier]).items():
+            entries[stream_entry(tier, name)] = stream
+    for number, frame in enumerate(package.golden):
+        entries[golden_entry(number)] = frame.tobytes()
+    sums = {name: hashlib.sha256(content).hexdigest() for name, content in entries.items()}
+    manifest = replace(package.manifest, sha256=sums).to_json().encode()
+    return _write_whole(path, {MANIFEST: manifest, **entries})
+
+
+def _write_whole(path: Path, entries: Mapping[str, bytes]) -> int:
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            with zipfile.ZipFile(file, "w") as archive:
+                for name, content in entries.items():
+                    info = zipfile.ZipInfo(name, EPOCH)
+                    archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
+            file.flush()
+            os.fsync(file.fileno())
+            size = file.tell()
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(FileNotFoundError):
+            os.unlink(temporary)
+        raise
+    return size
+
+
+def read_package(path: Path, *, tier: str = "hq") -> AvatarPackage:
+    """Reads one tier of a package, checking each entry's size before and its sum after reading.
+
+    Raises:
+        BadInput: If the file is missing, truncated, altered, or no package, or has no such tier.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _read(_Archive(archive, path), tier)
+    except FileNotFoundError:
+        raise BadInput(f"There is no package {path}. Make one with ia-ingest.") from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as error:
+        raise BadInput(
+            f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
+        ) from error
+
+
+class _Archive:
+    """A zip that is not trusted."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
+        infos = archive.infolist()
+        names = [info.filename for info in infos]
+        if len(names) > MOST_ENTRIES or len(set(names)) < len(names) or MANIFEST not in names:
+            raise BadInput(
+                f"{path} is no avatar package: it must hold {MANIFEST} and at most "
+                f"{MOST_ENTRIES} entries, none of them twice. It holds {len(names)}."
+            )
+        for name in names:
+            parts = PurePosixPath(name).parts
+            if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
+                raise BadInput(f"{path} holds {name!r}, a path outside of the package. Refused.")
+        self._archive, self.path = archive, path
+        self._sizes = {info.filename: info.file_size for info in infos}
+
+    def read(self, name: str, *, most: int, exactly: int | None = None) -> bytes:
+        """One entry; its size is known to be right before a byte of it is unpacked."""
+        size = self._sizes.get(name)
+        if size is None:
+            raise BadInput(f"{self.path} is incomplete: {name} is missing. Export it again.")
+        if size > most or (exactly is not None and size != exactly):
+            wanted = f"{exactly} bytes" if exactly is not None else f"at most {most} bytes"
+            raise BadInput(f"{self.path}: {name} claims {size} bytes, expected {wanted}. Refused.")
+        with self._archive.open(name) as file:
+            content = file.read(size + 1)
+        if len(content) != size:
+            raise BadInput(f"{self.path}: {name} does not hold the {size} bytes that it claims.")
+        return content
+
+
+def _read(archive: _Archive, tier: str) -> AvatarPackage:
+    manifest = Manifest.from_json(archive.read(MANIFEST, most=LARGEST_TEXT))
+    if tier not in manifest.tiers:
+        known = ", ".join(sorted(manifest.tiers))
+        raise BadInput(f"{archive.path} has no tier {tier!r}; it has: {known}.")
+
+    def checked(name: str, exactly: int | None = None) -> bytes:
+        content = archive.read(
+            name, most=LARGEST_TEXT if exactly is None else exactly, exactly=exactly
+        )
+        if hashlib.sha256(content).hexdigest() != manifest.sha256.get(name):
+            raise BadInput(
+                f"{archive.path} was altered: {name} is not what was written. Export it again."
+            )
+        return content
+
+    layout = manifest.tiers[tier].layout
+    golden = []
+    for number, frame in enumerate(manifest.golden):
+        width, height = frame.camera.size_px
+        content = checked(golden_entry(number), height * width * 4)
+        golden.append(np.frombuffer(content, dtype=np.uint8).reshape(height, width, 4))
+    return AvatarPackage(
+        manifest=manifest,
+        graphs={tier: checked(graph_entry(tier))},
+        tables={tier: decode(_streams(checked, tier, layout), layout)},
+        golden=tuple(golden),
+        preview=checked(PREVIEW),
+    )
+
+
+def _streams(checked, tier: str, layout: Layout) -> dict[str, bytes]:  # noqa: ANN001
+    streams = {}
+    for name, (dtype, shape) in layout.streams().items():
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        streams[name] = checked(stream_entry(tier, name), size)
+    return streams
