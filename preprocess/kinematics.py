@@ -4,7 +4,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 
-def rotation_matrices(axis_angles: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+def rotation_matrices(
+    axis_angles: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of axis-angle vectors in radians (Rodrigues' formula)."""
     axis_angles = np.asarray(axis_angles, dtype=np.float64)
     angle = np.linalg.norm(axis_angles, axis=-1)[..., None, None]
