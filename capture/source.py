@@ -31,8 +31,8 @@ class Source(Protocol):
     path: Path
     size_px: tuple[int, int]
     selection: Selection
-    frames_in_file: int | None
-    frame_count: int | None
+    frames_in_file: int
+    frame_count: int
     has_alpha: bool
     live: bool
     warnings: list[str]

@@ -1,7 +1,7 @@
 """One seam for the fast path: the operations of a step, on whatever runs them."""
 
 import os
-from typing import NamedTuple, Protocol, final
+from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
@@ -96,6 +96,7 @@ class Marching(NamedTuple):
         return int(min(self.grace_m / self.step_m + 1.0, 1e9))
 
 
+@runtime_checkable
 class Backend(Protocol):
     """The operations of a training step. `avatar.kernels.reference` says what each means."""
 

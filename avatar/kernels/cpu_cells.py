@@ -6,7 +6,6 @@ Serial and without the interpreter's lock: the ingest thread runs it beside the 
 import math
 
 import numpy as np
-from numba import njit
 
 from avatar.kernels.jit import compile_kernel
 
@@ -23,7 +22,7 @@ PROBE_M = 5e-3
 """Half the base of the central differences that give the Jacobian."""
 
 
-@njit(inline="always", **FAST)
+@compile_kernel(inline="always", **FAST)
 def _blended(transforms, low, nodes_per_m, x, y, z, out):
     """Trilinear 3×4 transform at a canonical point; the border's value outside."""
     a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(transforms.shape[0] - 1.001))
@@ -42,7 +41,7 @@ def _blended(transforms, low, nodes_per_m, x, y, z, out):
         )  # fmt: skip
 
 
-@njit(inline="always", **FAST)
+@compile_kernel(inline="always", **FAST)
 def _posed(m, x, y, z):
     return (
         m[0] * x + m[1] * y + m[2] * z + m[3],
@@ -51,7 +50,7 @@ def _posed(m, x, y, z):
     )
 
 
-@njit(inline="always", **FAST)
+@compile_kernel(inline="always", **FAST)
 def _inverse(m, out):
     """Inverse of the 3×3 part of a row-major 3×4 matrix."""
     a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
@@ -63,7 +62,7 @@ def _inverse(m, out):
     out[6], out[7], out[8] = r * s, (b * g - a * h) * s, (a * e - b * d) * s
 
 
-@njit(**FAST)
+@compile_kernel(**FAST)
 def _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
     """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest."""
     _blended(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
@@ -108,7 +107,7 @@ def _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
     return fx * fx + fy * fy + fz * fz <= F32(4 * TOLERANCE_M * TOLERANCE_M)
 
 
-@njit(**FAST)
+@compile_kernel(**FAST)
 def _jacobian_inverse(transforms, low, nodes_per_m, x, blend, jacobian, out):
     """Inverse of dLBS/dx at x by central differences, weight gradients included."""
     for axis in range(3):
@@ -125,7 +124,7 @@ def _jacobian_inverse(transforms, low, nodes_per_m, x, blend, jacobian, out):
     _inverse(jacobian, out)
 
 
-@njit(**FAST)
+@compile_kernel(**FAST)
 def _nearest_seeds(seeds, parts, center_x, grid_low, cell_m, reach_m, distance, nearest):
     """The nearest seed of each of the `STARTS` nearest body parts, for one slab of cells."""
     ny, nz = nearest.shape[0], nearest.shape[1]
@@ -159,7 +158,7 @@ def _nearest_seeds(seeds, parts, center_x, grid_low, cell_m, reach_m, distance, 
                 nearest[j, k, place] = s
 
 
-@njit(**FAST)
+@compile_kernel(**FAST)
 def _in_band(x, low, cells_per_m, distance, band_m):
     a = I32(math.floor((x[0] - low[0]) * cells_per_m[0]))
     b = I32(math.floor((x[1] - low[1]) * cells_per_m[1]))

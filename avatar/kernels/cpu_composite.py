@@ -1,7 +1,7 @@
 """Volume rendering of packed samples, its losses and their gradient, compiled for the CPU."""
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from avatar.kernels.jit import compile_kernel
 
@@ -12,7 +12,7 @@ HUBER_DELTA = 0.1
 ALPHA_DEAD_ZONE = 1e-3
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
 
@@ -36,12 +36,12 @@ def composite(raw, first, count, step_m, rendered):
         rendered[ray, 3] = F32(1) - through
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _huber_slope(error, scale):
     return max(F32(-1), min(F32(1), error * F32(1.0 / HUBER_DELTA))) * scale
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _huber(error):
     size = abs(error)
     if size <= F32(HUBER_DELTA):

@@ -5,7 +5,7 @@ two write to one place: no atomics, and the same sums for any number of threads.
 """
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 
 from avatar.kernels.jit import compile_kernel
 from avatar.levels import FEATURES
@@ -15,7 +15,7 @@ F32, I32, I64, U32 = np.float32, np.int32, np.int64, np.uint32
 FAST = {"fastmath": True, "error_model": "numpy", "nogil": True}
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _cell(points, i, low, scale, counts, level):  # noqa: ANN
     x = (points[i, 0] - low[0]) * scale
     y = (points[i, 1] - low[1]) * scale
@@ -26,7 +26,7 @@ def _cell(points, i, low, scale, counts, level):  # noqa: ANN
     return ix, iy, iz, x - ix, y - iy, z - iz
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _entry(ix, iy, iz, counts, level, dense, first, mask):
     if dense == 1:
         return first + I64(ix + counts[level, 0] * (iy + counts[level, 1] * iz))
@@ -68,7 +68,7 @@ def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
                     )  # fmt: skip
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _add(grad_table, entry, grad_features, i, column, weight):
     for f in range(FEATURES):
         grad_table[entry, f] += weight * grad_features[i, column + f]

@@ -1,7 +1,7 @@
 """Ray marching through warp cells and canonical occupancy, compiled for the CPU."""
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from avatar.kernels.jit import compile_kernel
 
@@ -11,12 +11,12 @@ OPAQUE_DEPTH = 12.0
 """Optical depth, by cached densities, from which a training ray may end after its grace."""
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _safe(x):
     return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 
-@njit(inline="always")
+@compile_kernel(inline="always")
 def _exit(position, low, cell, index, direction):
     """Distance along the ray to the far wall of the cell, on one axis."""
     wall = low + (F32(index) + (F32(1) if direction > 0 else F32(0))) * cell

@@ -1,0 +1,233 @@
+"""Compiled kernels against their plain torch meaning, and the meaning against closed forms."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from avatar.cells import WarpCells
+from avatar.kernels import reference
+from avatar.kernels.backend import Grid, Marching, Rays, Samples, TorchBackend, backend_for
+from avatar.kernels.cpu import NumbaBackend
+from avatar.levels import FEATURES
+from avatar.occupancy import Occupancy
+from avatar.render import cell_tables
+
+TORCH, NUMBA = TorchBackend(), NumbaBackend()
+BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
+
+
+def points_in(levels, count, generator, *, beyond=0.0):
+    extent = torch.from_numpy((levels.counts[0] - 1) / levels.cells_per_m[0])
+    unit = torch.rand(count, 3, generator=generator) * (1 + 2 * beyond) - beyond
+    return torch.from_numpy(levels.low) + unit * extent.float()
+
+
+def packed(counts):
+    counts = torch.tensor(counts, dtype=torch.int32)
+    return Samples(torch.zeros(int(counts.sum()), 3), torch.cumsum(counts, 0) - counts, counts)
+
+
+def test_the_levels_hold_dense_and_hashed_ones(levels):
+    assert levels.dense.tolist() == [1, 1, 0, 0]
+    assert (np.diff(levels.offsets)[2:] == 4096).all()
+
+
+@BACKENDS
+def test_features_at_a_vertex_of_a_dense_level_are_its_entry(backend, levels, generator):
+    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    i, j, k = 3, 2, 1
+    point = torch.from_numpy(levels.low) + torch.tensor([i, j, k]) / float(levels.cells_per_m[0])
+    features = backend.encode(point[None].float(), table, levels)
+    nx, ny, _ = levels.counts[0].tolist()
+    torch.testing.assert_close(
+        features[0, :FEATURES], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 700])
+def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
+    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    points = points_in(levels, count, generator, beyond=0.1)
+    torch.testing.assert_close(
+        NUMBA.encode(points, table, levels), TORCH.encode(points, table, levels),
+        atol=1e-4, rtol=1e-5,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [0, 1, 700])
+def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
+    points = points_in(levels, count, generator)
+    slope = torch.randn(count, levels.width, generator=generator)
+    ours, theirs = (torch.zeros(levels.entries, FEATURES) for _ in range(2))
+    NUMBA.encode_backward(points, slope, levels, ours)
+    TORCH.encode_backward(points, slope, levels, theirs)
+    torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_encoding_and_its_gradient_are_bit_equal_for_any_thread_count(levels, generator):
+    points = points_in(levels, 3000, generator)
+    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    slope = torch.randn(3000, levels.width, generator=generator)
+    results = []
+    before = numba.get_num_threads()
+    try:
+        for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):
+            numba.set_num_threads(threads)
+            grad = torch.zeros(levels.entries, FEATURES)
+            NUMBA.encode_backward(points, slope, levels, grad)
+            results.append((NUMBA.encode(points, table, levels), grad))
+    finally:
+        numba.set_num_threads(before)
+    for features, grad in results[1:]:
+        assert torch.equal(features, results[0][0])
+        assert torch.equal(grad, results[0][1])
+
+
+def test_the_encodings_gradient_passes_gradcheck_in_double(levels, generator):
+    points = points_in(levels, 5, generator).double()
+    table = torch.randn(levels.entries, FEATURES, generator=generator, dtype=torch.float64)
+    entries = torch.unique(torch.randint(levels.entries, (50,), generator=generator))
+    part = table[entries].clone().requires_grad_()
+
+    def encode_with(values):
+        return reference.encode(points, table.index_put((entries,), values), levels)
+
+    assert torch.autograd.gradcheck(encode_with, (part,))
+
+
+@BACKENDS
+def test_a_uniform_fog_absorbs_as_beer_and_lambert_say(backend):
+    raw = torch.tensor([[50.0, -50.0, 0.0, math.log(3.0)]]).repeat(40, 1)
+    rendered = backend.composite(raw, packed([40]), 0.01)
+    alpha = 1.0 - math.exp(-3.0 * 0.4)
+    expected = torch.tensor([[alpha, 0.0, 0.5 * alpha, alpha]])
+    torch.testing.assert_close(rendered, expected, atol=1e-5, rtol=0)
+
+
+@BACKENDS
+def test_a_ray_without_samples_is_clear(backend):
+    rendered = backend.composite(torch.zeros(2, 4), packed([0, 2, 0]), 0.01)
+    assert torch.equal(rendered[[0, 2]], torch.zeros(2, 4))
+    assert rendered[1, 3] > 0
+
+
+def loss_case(generator, counts=(5, 0, 1, 30, 17)):
+    samples = packed(list(counts))
+    rays = len(counts)
+    raw = torch.randn(sum(counts), 4, generator=generator)
+    raw[:, 3] += 3.0
+    target = torch.rand(rays, 4, generator=generator)
+    target[:, :3] *= target[:, 3:]
+    background = torch.rand(rays, 3, generator=generator)
+    return raw, samples, 0.01, target, background, 0.1, 0.1
+
+
+def test_compiled_loss_and_gradient_agree_with_autograd(generator):
+    case = loss_case(generator)
+    for ours, theirs in zip(NUMBA.composite_loss(*case), TORCH.composite_loss(*case), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4)
+
+
+def test_the_density_of_a_saturated_sample_has_no_gradient(generator):
+    raw, *rest = loss_case(generator)
+    raw[3, 3] = reference.MAX_LOG_DENSITY + 1.0
+    for backend in (NUMBA, TORCH):
+        assert backend.composite_loss(raw, *rest)[2][3, 3] == 0.0
+
+
+def test_the_meaning_of_the_loss_passes_gradcheck_in_double(generator):
+    raw, samples, step_m, target, background, *weights = loss_case(generator)
+
+    def mean_loss(raw):
+        rendered = reference.composite(raw, samples.first, samples.count, step_m)
+        return reference.loss_per_ray(
+            rendered, target.double(), background.double(), *weights
+        ).mean()
+
+    assert torch.autograd.gradcheck(mean_loss, (raw.double().requires_grad_(),))
+
+
+@pytest.fixture(scope="module")
+def scene(rig):
+    """A bent body with a dense core, seen from all sides."""
+    rotations = np.zeros((23, 3))
+    rotations[15, 2], rotations[16, 2], rotations[17, 1] = -1.0, 0.8, -0.8
+    generator = torch.Generator().manual_seed(1)
+    grid = Occupancy(rig, torch.device("cpu")).grid
+    distance = torch.from_numpy(rig.distance)
+    grid.density.copy_(torch.where(distance < 0.02, 400.0, 0.5) * (distance < 0.05))
+    grid.occupied.copy_((distance < 0.05).to(torch.uint8))
+    cells = cell_tables(WarpCells.of(rig, rotations), torch.device("cpu"))
+    origins = torch.randn(300, 3, generator=generator)
+    origins = torch.nn.functional.normalize(origins, dim=1) * 3.0
+    aim = torch.rand(300, 3, generator=generator) * torch.tensor([0.8, 1.6, 0.3])
+    aim -= torch.tensor([0.4, 1.0, 0.15])
+    rays = Rays(
+        origins, torch.nn.functional.normalize(aim - origins, dim=1),
+        torch.zeros(300, dtype=torch.int32), torch.rand(300, generator=generator),
+    )  # fmt: skip
+    return rays, cells, grid
+
+
+@pytest.mark.parametrize("grace_m", [0.06, math.inf], ids=["training", "exact"])
+def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
+    how = Marching(0.01, grace_m, 96)
+    ours, theirs = NUMBA.march(*scene, how), TORCH.march(*scene, how)
+    agree = ours.count == theirs.count
+    assert agree.float().mean() > 0.97  # a lattice point on a wall may fall on either side
+    assert int(ours.count.sum()) > 2000
+    a, b = (samples.points[agree.repeat_interleave(samples.count)] for samples in (ours, theirs))
+    off = (a - b).norm(dim=1)
+    assert float((off < 1e-3).float().mean()) > 0.995
+
+
+@BACKENDS
+def test_rays_that_miss_have_no_samples(scene, backend):
+    rays, cells, grid = scene
+    away = rays._replace(directions=-rays.directions)
+    assert int(backend.march(away, cells, grid, Marching(0.01, 0.06, 96)).count.sum()) == 0
+
+
+@BACKENDS
+def test_nothing_is_sampled_where_nothing_is_occupied(scene, backend):
+    rays, cells, grid = scene
+    empty = Grid(torch.zeros_like(grid.occupied), *grid[1:])
+    assert int(backend.march(rays, cells, empty, Marching(0.01, 0.06, 96)).count.sum()) == 0
+
+
+@BACKENDS
+def test_a_ray_is_followed_for_its_grace_in_metres_whatever_the_step(scene, backend):
+    """A grace counted in samples shrinks with the step and cuts grazing rays: it cost 6 dB."""
+    rays, cells, grid = scene
+    solid = grid._replace(density=torch.full_like(grid.density, 1e6))
+    for step_m in (0.02, 0.01, 0.005):
+        count = backend.march(rays, cells, solid, Marching(step_m, 0.06, 512)).count
+        assert int(count.max()) * step_m == pytest.approx(0.06, abs=2.1 * step_m)
+
+
+@BACKENDS
+def test_densities_only_rise_and_to_the_highest_sample(scene, backend):
+    grid = scene[2]._replace(density=torch.full_like(scene[2].density, 2.0))
+    low, scale = grid.low, grid.cells_per_m
+    here = low + (torch.tensor([[4.3, 5.2, 6.9], [4.9, 5.9, 6.1], [7.5, 7.5, 7.5]])) / scale
+    outside = low - 1.0
+    points = torch.cat([here, outside[None]]).float()
+    log_density = torch.tensor([3.0, 2.0, -1.0, 5.0])
+    backend.keep_highest(points, log_density, grid)
+    assert float(grid.density[4, 5, 6]) == pytest.approx(math.exp(3.0), rel=1e-5)
+    assert float(grid.density[7, 7, 7]) == 2.0
+    assert int((grid.density != 2.0).sum()) == 1
+
+
+def test_the_backend_can_be_forced(monkeypatch):
+    cpu = torch.device("cpu")
+    monkeypatch.delenv("IA_BACKEND", raising=False)
+    assert backend_for(cpu).name == "numba"
+    monkeypatch.setenv("IA_BACKEND", "torch")
+    assert backend_for(cpu).name == "torch"
+    monkeypatch.setenv("IA_BACKEND", "abacus")
+    with pytest.raises(ValueError, match="abacus"):
+        backend_for(cpu)
