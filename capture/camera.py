@@ -79,11 +79,10 @@ class Camera:
         All rays start at `center_world`.
         """
         if self.distortion:
-            x, y = self._undistorted(pixels)
+            plane = self._undistorted(pixels)
         else:
-            x = (pixels[..., 0] - self.center_px[0]) / self.focal_px[0]
-            y = (pixels[..., 1] - self.center_px[1]) / self.focal_px[1]
-        in_camera = np.stack([x, y, np.ones_like(x)], axis=-1)
+            plane = (pixels - np.array(self.center_px)) / np.array(self.focal_px)
+        in_camera = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
         in_world = in_camera @ self.camera_from_world[:3, :3]
         return in_world / np.linalg.norm(in_world, axis=-1, keepdims=True)
 
@@ -91,31 +90,24 @@ class Camera:
         """Where points of the world land, as (x, y) in pixels; meaningless behind the camera."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         in_camera = points_world @ rotation.T + translation
-        x, y = in_camera[..., 0] / in_camera[..., 2], in_camera[..., 1] / in_camera[..., 2]
+        plane = in_camera[..., :2] / in_camera[..., 2:]
         if self.distortion:
-            x, y = self._distorted(x, y)
-        return np.stack(
-            [x * self.focal_px[0] + self.center_px[0], y * self.focal_px[1] + self.center_px[1]],
-            axis=-1,
-        )
+            plane = self._distorted(plane)
+        return plane * np.array(self.focal_px) + np.array(self.center_px)
 
-    def _undistorted(
-        self, pixels: Float[np.ndarray, "*batch 2"]
-    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    def _undistorted(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels as points of the plane at depth 1, as a lens without distortion sees them."""
         import cv2  # heavy, and only needed for lenses that bend
 
         flat = pixels.reshape(-1, 1, 2).astype(np.float64)
         plane = cv2.undistortPoints(flat, self.intrinsic, np.array(self.distortion))
-        plane = np.asarray(plane).reshape(*pixels.shape)
-        return plane[..., 0], plane[..., 1]
+        return np.asarray(plane).reshape(pixels.shape)
 
-    def _distorted(
-        self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]
-    ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
+    def _distorted(self, plane: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Points of the plane at depth 1, moved to where the lens bends them."""
         import cv2  # heavy, and only needed for lenses that bend
 
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 1, 3).astype(np.float64)
-        zero = np.zeros(3)
-        plane, _ = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(self.distortion))
-        plane = np.asarray(plane).reshape(*x.shape, 2)
-        return plane[..., 0], plane[..., 1]
+        rays = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
+        rays, zero = rays.reshape(-1, 1, 3).astype(np.float64), np.zeros(3)
+        bent, _ = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(self.distortion))
+        return np.asarray(bent).reshape(plane.shape)

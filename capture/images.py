@@ -34,13 +34,15 @@ def list_images(folder: Path) -> list[Path]:
 
 def read_image(
     path: Path,
-) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None, bool]:
-    """One upright picture as RGB, its alpha channel if it has one, and whether it is all there.
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
+    """One upright picture as RGB, and its alpha channel if it has one.
 
     Raises:
-        BadInput: If it cannot be decoded.
+        BadInput: If it cannot be decoded, or is not complete.
     """
     data = path.read_bytes()
+    if not _is_complete(data):
+        raise BadInput(f"{path} is cut off; the file is not complete.")
     encoded = np.frombuffer(data, np.uint8)
     picture = _decode(encoded, cv2.IMREAD_UNCHANGED)
     if picture is None:
@@ -51,10 +53,12 @@ def read_image(
         alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
         alpha = np.ascontiguousarray(alpha)
     picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
+    if picture is None:
+        raise BadInput(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
     rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     if alpha is not None and alpha.shape != rgb.shape[:2]:
         raise BadInput(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
-    return rgb, alpha, _is_complete(data)
+    return rgb, alpha
 
 
 def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
@@ -66,7 +70,7 @@ def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether a PNG or JPEG has its end (decoders fill the missing rest in silence)."""
+    """Whether a PNG or JPEG has its end (some decoders fill the missing rest in silence)."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" in data[-1024:]
     if data.startswith(b"\xff\xd8"):
@@ -105,7 +109,7 @@ class ImageFolder:
             if not self.selection.wants(index):
                 continue
             try:
-                rgb, alpha, complete = read_image(path)
+                rgb, alpha = read_image(path)
             except BadInput as cause:
                 self._warn(f"{cause} It was left out.")
                 continue
@@ -115,14 +119,9 @@ class ImageFolder:
                     f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
                 )
                 continue
-            flags = set() if complete else {"corrupt"}
-            if not complete:
-                self._warn(f"{path.name} is cut off; the file is not complete.")
-            if previous is not None and np.array_equal(rgb, previous):
-                flags.add("repeated")
-            yield Frame(
-                index=index, time_s=index / RATE, rgb=rgb, flags=frozenset(flags), alpha=alpha
-            )
+            repeated = previous is not None and np.array_equal(rgb, previous)
+            flags = frozenset({"repeated"} if repeated else ())
+            yield Frame(index=index, time_s=index / RATE, rgb=rgb, flags=flags, alpha=alpha)
             previous = rgb
 
     def count_frames(self) -> int:
@@ -133,7 +132,7 @@ class ImageFolder:
         """Size of the first picture that can be read, and whether it has an alpha channel."""
         for path in self._images:
             try:
-                rgb, alpha, _ = read_image(path)
+                rgb, alpha = read_image(path)
             except BadInput:
                 continue
             return (rgb.shape[1], rgb.shape[0]), alpha is not None

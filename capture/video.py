@@ -57,7 +57,7 @@ class VideoFile:
     def frames(self) -> Iterator[Frame]:
         """The wanted frames in order; every call starts anew."""
         previous = None
-        for index, time_s, capture in self._pictures():
+        for index, time_s, capture, after_gap in self._pictures():
             if not self.selection.wants(index):
                 continue
             ok, picture = capture.retrieve()
@@ -65,7 +65,7 @@ class VideoFile:
                 self._warn(f"Frame {index} of {self.path.name} could not be decoded; left out.")
                 continue
             rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            yield Frame(index=index, time_s=time_s, rgb=rgb, flags=_flags(rgb, previous))
+            yield Frame(index=index, time_s=time_s, rgb=rgb, flags=_flags(rgb, previous, after_gap))
             previous = rgb
 
     def count_frames(self) -> int:
@@ -77,8 +77,8 @@ class VideoFile:
         capture.release()
         return count
 
-    def _pictures(self) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
-        """Number and time of every picture, while the decoder stands at it."""
+    def _pictures(self) -> Iterator[tuple[int, float, cv2.VideoCapture, bool]]:
+        """Number and time of every picture while the decoder stands at it; if it follows a gap."""
         capture, index, got, failures, even = self._open(), 0, 0, 0, True
         time_s = 0.0
         try:
@@ -91,7 +91,7 @@ class VideoFile:
                 if failures and even:  # pictures may be lost here; an even rate tells how many
                     index = max(index, round(place))
                 even = even and abs(place - index) < 0.3
-                yield index, time_s, capture
+                yield index, time_s, capture, failures > 0
                 index, got, failures = index + 1, got + 1, 0
         finally:
             capture.release()
@@ -126,7 +126,10 @@ class VideoFile:
 
 
 def _flags(
-    rgb: UInt8[np.ndarray, "height width 3"], previous: UInt8[np.ndarray, "height width 3"] | None
+    rgb: UInt8[np.ndarray, "height width 3"],
+    previous: UInt8[np.ndarray, "height width 3"] | None,
+    after_gap: bool,
 ) -> frozenset[str]:
+    """A picture after a gap was predicted from one that is lost."""
     same = previous is not None and np.array_equal(rgb, previous)
-    return frozenset({"repeated"} if same else ())
+    return frozenset({"repeated"} if same else ()) | frozenset({"corrupt"} if after_gap else ())

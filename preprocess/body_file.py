@@ -14,7 +14,7 @@ from preprocess.skeleton import PARENTS
 ALWAYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 KEYS = (*ALWAYS, "J_regressor", "J", "J_shapedirs", "posedirs")
 
-Arrays = dict[str, Shaped[np.ndarray, "..."] | str]
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
 def read_body(path: Path) -> Body:
@@ -30,7 +30,7 @@ def read_body(path: Path) -> Body:
     if not path.is_file():
         raise BadInput(f"There is no body file {path}. Leave --body out for the embedded body.")
     if path.suffix == ".npz":
-        arrays: Arrays = dict(read_npz(path, KEYS))
+        arrays = read_npz(path, KEYS)
     elif path.suffix == ".pkl":
         arrays = read_pickled_arrays(path, KEYS)
     else:
@@ -80,7 +80,7 @@ def _numbers(
 ) -> Float64[np.ndarray, "..."]:
     """One array as float64, of the shape given (-1: any length)."""
     array = arrays[key]
-    if isinstance(array, str) or array.dtype.kind not in "biuf":
+    if array.dtype.kind not in "biuf":
         raise BadInput(f"`{key}` in {path} holds no numbers.")
     fits = array.ndim == len(shape) and all(
         wanted in (-1, length) for wanted, length in zip(shape, array.shape, strict=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -97,15 +97,14 @@ def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None
         )
     if motion.frames is not None:
         rows = {int(frame): row for row, frame in enumerate(motion.frames)}
-        total = source.frames_in_file
-        if not any(source.selection.wants(f) and f >= 0 and (not total or f < total) for f in rows):
+        if not any(source.selection.wants(f) and 0 <= f < source.frames_in_file for f in rows):
             raise BadInput(
                 f"The poses belong to the frames {min(rows)} to {max(rows)}, and none of those is "
                 f"among the {source.frame_count} wanted frames of {source.path}."
             )
         return lambda frame: rows.get(frame.index)
     if motion.times_s is not None:
-        return _row_by_time(motion)
+        return _row_by_time(motion.times_s)
     by_order = row_by_order(len(motion), source, "poses")
     return lambda frame: by_order(frame.index)
 
@@ -151,11 +150,11 @@ def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
-def _row_by_time(motion: Motion) -> Callable[[Frame], int | None]:
+def _row_by_time(times_s: Float[np.ndarray, "poses"]) -> Callable[[Frame], int | None]:
     """The row nearest in time, if it is nearer than half the usual step."""
-    finite = np.flatnonzero(np.isfinite(motion.times_s))
-    rows = finite[np.argsort(motion.times_s[finite], kind="stable")]
-    times = motion.times_s[rows]
+    finite = np.flatnonzero(np.isfinite(times_s))
+    rows = finite[np.argsort(times_s[finite], kind="stable")]
+    times = times_s[rows]
     steps = np.diff(times)
     reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
 

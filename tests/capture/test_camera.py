@@ -1,0 +1,93 @@
+"""The camera against closed forms and itself."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from capture.camera import Camera
+
+
+def camera_at(seed: int, distortion: tuple[float, ...] = ()) -> Camera:
+    rng = np.random.default_rng(seed)
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    camera_from_world[:3, 3] = rng.normal(size=3)
+    return Camera(
+        focal_px=(210.0, 190.0),
+        center_px=(101.0, 77.5),
+        size_px=(200, 150),
+        camera_from_world=camera_from_world,
+        distortion=distortion,
+    )
+
+
+@given(seed=st.integers(0, 1000), depth=st.floats(0.1, 50.0))
+@pytest.mark.parametrize("distortion", [(), (0.05, -0.02, 0.001, -0.001)])
+def test_a_point_on_a_ray_projects_back_to_its_pixel(seed, depth, distortion):
+    camera = camera_at(seed, distortion)
+    pixels = np.random.default_rng(seed).uniform((0, 0), (200, 150), size=(20, 2))
+    points = camera.center_world + depth * camera.directions(pixels)
+    np.testing.assert_allclose(camera.project(points), pixels, atol=2e-2 if distortion else 1e-8)
+
+
+def test_directions_are_unit_and_start_at_the_camera_center():
+    camera = camera_at(3)
+    directions = camera.directions(camera.pixel_centers())
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
+    center = camera.camera_from_world @ np.append(camera.center_world, 1.0)
+    np.testing.assert_allclose(center[:3], 0.0, atol=1e-12)
+
+
+def test_the_camera_looks_along_z_with_x_right_and_y_down():
+    camera = Camera(
+        focal_px=(100.0, 100.0),
+        center_px=(50.0, 50.0),
+        size_px=(100, 100),
+        camera_from_world=np.eye(4),
+    )
+    np.testing.assert_allclose(camera.directions(np.array([50.0, 50.0])), [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(camera.project(np.array([1.0, 2.0, 4.0])), [75.0, 100.0])
+
+
+def test_the_first_pixel_has_its_center_at_a_half():
+    centers = camera_at(0).pixel_centers()
+    assert centers.shape == (150, 200, 2)
+    np.testing.assert_array_equal(centers[0, 0], [0.5, 0.5])
+    np.testing.assert_array_equal(centers[-1, -1], [199.5, 149.5])
+
+
+def test_a_resized_camera_sees_the_same_directions():
+    camera = camera_at(5)
+    half = camera.resized((100, 75))
+    pixels = np.array([[0.0, 0.0], [13.0, 99.0], [200.0, 150.0]])
+    np.testing.assert_allclose(half.directions(pixels / 2), camera.directions(pixels), atol=1e-12)
+    np.testing.assert_allclose(half.resized((200, 150)).intrinsic, camera.intrinsic)
+
+
+def test_the_intrinsic_matrix_goes_round():
+    camera = camera_at(7, (0.1, 0.0, 0.0, 0.0))
+    again = Camera.from_intrinsic(
+        camera.intrinsic, camera.size_px, camera.camera_from_world, camera.distortion
+    )
+    np.testing.assert_array_equal(again.intrinsic, camera.intrinsic)
+    assert again.distortion == camera.distortion
+
+
+def test_without_distortion_the_lens_model_changes_nothing():
+    pixels = np.random.default_rng(0).uniform(0, 150, size=(9, 2))
+    bent = camera_at(1, (0.0, 0.0, 0.0, 0.0)).directions(pixels)
+    np.testing.assert_allclose(bent, camera_at(1).directions(pixels), atol=1e-9)
+
+
+def test_barrel_distortion_pulls_points_inwards():
+    point = np.array([1.0, 0.0, 1.0])  # r = 1: r (1 + k1 r²) = 0.9
+    camera = Camera(
+        focal_px=(100.0, 100.0),
+        center_px=(50.0, 50.0),
+        size_px=(100, 100),
+        camera_from_world=np.eye(4),
+        distortion=(-0.1, 0.0, 0.0, 0.0),
+    )
+    np.testing.assert_allclose(camera.project(point), [50.0 + 90.0, 50.0])

@@ -1,0 +1,124 @@
+"""Folders of pictures, whole and damaged."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture.errors import BadInput
+from capture.images import list_images, read_image
+from capture.source import open_source
+
+
+def test_pictures_come_in_natural_order_and_exactly(write_images):
+    source = open_source(write_images(12))
+    frames = list(source.frames())
+    assert [frame.index for frame in frames] == list(range(12))
+    assert [int(frame.rgb[0, 0, 0]) for frame in frames] == [20 + 11 * i for i in range(12)]
+    assert frames[0].rgb[0, 60].tolist() == [220, 0, 0]
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(12) / 30)
+    assert source.frame_count == source.count_frames() == 12
+    assert not source.warnings
+
+
+def test_a_selection_of_pictures_keeps_their_numbers(write_images):
+    source = open_source(write_images(12), frames=slice(1, 10, 3))
+    assert [frame.index for frame in source.frames()] == [1, 4, 7]
+    assert source.frame_count == 3
+
+
+def test_an_alpha_channel_comes_along(tmp_path):
+    rgba = np.random.default_rng(0).integers(0, 255, (8, 6, 4), dtype=np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "0.png")
+    source = open_source(tmp_path)
+    (frame,) = source.frames()
+    assert source.has_alpha
+    np.testing.assert_array_equal(frame.rgb, rgba[..., :3])
+    np.testing.assert_array_equal(frame.alpha, rgba[..., 3])
+
+
+def test_a_picture_is_turned_upright_by_its_exif_tag(tmp_path):
+    upright = np.zeros((40, 20, 3), np.uint8)
+    upright[:20] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying: to be turned 90° clockwise
+    lying = Image.fromarray(np.ascontiguousarray(np.rot90(upright)))
+    lying.save(tmp_path / "0.jpg", exif=exif, quality=95)
+    rgb, alpha = read_image(tmp_path / "0.jpg")
+    assert rgb.shape == upright.shape
+    assert alpha is None
+    assert np.abs(rgb.astype(int) - upright).mean() < 3
+
+
+def test_grey_and_16_bit_pictures_become_8_bit_rgb(tmp_path):
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    cv2.imwrite(str(tmp_path / "0.png"), grey)
+    cv2.imwrite(str(tmp_path / "1.png"), grey.astype(np.uint16) * 257)
+    for frame in open_source(tmp_path).frames():
+        np.testing.assert_array_equal(frame.rgb, np.repeat(grey[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_cut_off_picture_is_left_out_and_told(write_images, suffix, capfd):
+    folder = write_images(3, suffix=suffix)
+    path = folder / f"shot_1{suffix}"
+    path.write_bytes(path.read_bytes()[:-40])
+    source = open_source(folder)
+    assert [frame.index for frame in source.frames()] == [0, 2]
+    assert "shot_1" in source.warnings[0]
+    assert "cut off" in source.warnings[0]
+    assert capfd.readouterr().err == ""
+
+
+def test_a_picture_that_cannot_be_read_or_has_another_size_is_left_out(write_images, capfd):
+    folder = write_images(5)
+    (folder / "shot_1.png").write_bytes(b"no picture")
+    (folder / "shot_2.png").write_bytes(b"")
+    cv2.imwrite(str(folder / "shot_3.png"), np.zeros((10, 10, 3), np.uint8))
+    source = open_source(folder)
+    assert [frame.index for frame in source.frames()] == [0, 4]
+    assert len(source.warnings) == 3
+    assert "10x10 px, the first picture 64x48" in source.warnings[2]
+    assert len(list(source.frames())) == 2
+    assert len(source.warnings) == 3
+    assert capfd.readouterr().err == ""
+
+
+def test_a_repeated_picture_is_flagged(tmp_path):
+    for index, grey in enumerate((10, 10, 30)):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((6, 8, 3), grey, np.uint8))
+    flags = [frame.flags for frame in open_source(tmp_path).frames()]
+    assert flags == [frozenset(), {"repeated"}, frozenset()]
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(BadInput, match="found neither"):
+        open_source(tmp_path)
+
+
+def test_a_folder_of_damaged_pictures_is_refused(tmp_path):
+    for index in range(3):
+        (tmp_path / f"{index}.png").write_bytes(b"\x89PNG")
+    with pytest.raises(BadInput, match="None of the 3 pictures"):
+        open_source(tmp_path)
+
+
+def test_a_capture_folder_gives_its_images_or_its_only_video(write_images, write_video, tmp_path):
+    video = write_video("video.mp4", frames=3)
+    assert open_source(tmp_path).path == video
+    folder = write_images(4, name="images")
+    assert open_source(tmp_path).path == folder
+
+
+def test_two_videos_in_a_folder_are_too_many(write_video, tmp_path):
+    write_video("a.mp4", frames=2)
+    write_video("b.mp4", frames=2)
+    with pytest.raises(BadInput, match=r"a\.mp4, b\.mp4"):
+        open_source(tmp_path)
+
+
+def test_hidden_files_are_no_pictures(write_images):
+    folder = write_images(2)
+    (folder / "._shot_0.png").write_bytes(b"a file of another system")
+    assert [path.name for path in list_images(folder)] == ["shot_0.png", "shot_1.png"]

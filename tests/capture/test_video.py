@@ -1,0 +1,143 @@
+"""Videos as they come from phones: whole, turned, cut off, rotten, or none at all."""
+
+import numpy as np
+import pytest
+
+from capture.errors import BadInput
+from capture.source import open_source
+
+
+def greys(frames) -> list[int]:
+    return [round((float(frame.rgb[:, :28].mean()) - 20) / 11) for frame in frames]
+
+
+def test_frames_come_in_order_with_their_timestamps_and_in_rgb(write_video):
+    source = open_source(write_video(frames=20))
+    frames = list(source.frames())
+    assert source.frame_count == source.frames_in_file == 20
+    assert source.size_px == (64, 48)
+    assert not source.live
+    assert [frame.index for frame in frames] == list(range(20))
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(20) / 25, atol=1e-6)
+    assert greys(frames) == list(range(20))
+    red, blue = frames[0].rgb[10, 50], frames[0].rgb[40, 50]
+    assert red[0] > 150 > 80 > red[2]
+    assert blue[2] > 150 > 80 > blue[0]
+    assert not source.warnings
+
+
+def test_reading_again_starts_anew(write_video):
+    source = open_source(write_video(frames=5))
+    iterator = source.frames()
+    next(iterator)
+    assert greys(source.frames()) == [0, 1, 2, 3, 4]
+    assert greys(iterator) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "chosen", [slice(3, 12, 4), slice(None, None, 7), slice(15, None), slice(0, 4), slice(2, 99)]
+)
+def test_a_selection_keeps_numbers_and_times(write_video, chosen):
+    source = open_source(write_video(frames=20), frames=chosen)
+    frames = list(source.frames())
+    expected = list(range(20))[chosen]
+    assert [frame.index for frame in frames] == greys(frames) == expected
+    assert source.frame_count == len(expected)
+    assert source.frames_in_file == 20
+    np.testing.assert_allclose([f.time_s for f in frames], np.array(expected) / 25, atol=1e-6)
+    assert not source.warnings
+
+
+@pytest.mark.parametrize("chosen", [slice(-3, None), slice(4, 4), slice(0, 5, 0), slice(50, None)])
+def test_a_selection_of_nothing_is_refused(write_video, chosen):
+    with pytest.raises(BadInput, match=r"nothing|none of them"):
+        open_source(write_video(frames=20), frames=chosen)
+
+
+def test_a_turned_video_comes_upright(write_video, turned_clockwise):
+    path = write_video(frames=4)
+    path.write_bytes(turned_clockwise(path.read_bytes()))
+    source = open_source(path)
+    frames = list(source.frames())
+    assert source.size_px == (48, 64) == frames[0].size_px
+    upper_right_is_now_lower_right = frames[0].rgb[50, 40]
+    assert upper_right_is_now_lower_right[0] > 150 > 80 > upper_right_is_now_lower_right[2]
+
+
+def test_a_truncated_video_gives_what_is_there_and_says_so(write_video, index_first):
+    path = write_video(frames=40)
+    data = index_first(path.read_bytes())
+    path.write_bytes(data[: len(data) * 2 // 3])
+    source = open_source(path)
+    frames = list(source.frames())
+    assert 5 < len(frames) < 40
+    assert greys(frames[:-1]) == [
+        i % 20 for i in range(len(frames) - 1)
+    ]  # the last one is cut itself
+    (warning,) = source.warnings
+    assert f"only {len(frames)} of 40 frames" in warning
+    assert "truncated" in warning
+    assert source.count_frames() == len(frames)
+
+
+def test_a_selection_before_the_damage_needs_no_warning(write_video, index_first):
+    path = write_video(frames=40)
+    data = index_first(path.read_bytes())
+    path.write_bytes(data[: len(data) * 2 // 3])
+    source = open_source(path, frames=slice(0, 4))
+    assert len(list(source.frames())) == 4
+    assert not source.warnings
+
+
+def test_a_recording_without_its_index_is_refused_with_advice(write_video):
+    path = write_video()
+    data = path.read_bytes()
+    path.write_bytes(data[: data.find(b"moov") - 4])
+    with pytest.raises(BadInput, match="cut off before it was finished"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", bytes(range(256)) * 40])
+def test_what_is_no_video_is_refused(tmp_path, content, capfd):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(content)
+    with pytest.raises(BadInput, match="no video that can be opened"):
+        open_source(path)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="does not exist"):
+        open_source(tmp_path / "video.mp4")
+
+
+def test_a_repeated_picture_is_flagged(write_video):
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    path = write_video("still.avi", pictures=[noise, noise, 255 - noise], codec="MJPG")
+    frames = list(open_source(path).frames())
+    assert ["repeated" in frame.flags for frame in frames] == [False, True, False]
+
+
+def test_damaged_bytes_in_the_middle_lose_no_place(write_video, index_first, rng):
+    noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(30)]
+    path = write_video(pictures=noise)
+    whole = {frame.index: frame.rgb for frame in open_source(path).frames()}
+    data = bytearray(index_first(path.read_bytes()))
+    middle = len(data) // 2
+    data[middle : middle + 400] = bytes(400)
+    path.write_bytes(data)
+    source = open_source(path)
+    frames = list(source.frames())
+    assert len(frames) == 30 or source.warnings
+    assert [f.index for f in frames] == [round(f.time_s * 25) for f in frames]
+    np.testing.assert_array_equal(frames[3].rgb, whole[frames[3].index])
+
+
+def test_a_container_that_does_not_count_is_counted_and_checked_by_time(write_video):
+    path = write_video("video.webm", frames=60, codec="VP80")
+    assert not list(open_source(path).warnings)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    source = open_source(path)
+    assert 0 < len(list(source.frames())) < 60
+    assert "truncated" in source.warnings[0]
