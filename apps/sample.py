@@ -30,7 +30,7 @@ class SampleConfig:
     at all.
     """
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder to write."""
     shoot: Annotated[ShootConfig, tyro.conf.arg(name="")] = field(default_factory=ShootConfig)
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -1,6 +1,6 @@
 """The person in front of the camera: the embedded body, dressed, lit and drawn in any pose."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -62,7 +62,9 @@ class Actor:
         source = np.concatenate([layer.source for layer in layers])
         shape = body.shape_directions[source] @ betas
         rest = np.concatenate([layer.rest for layer in layers]) + shape
-        faces = np.concatenate([layer.faces + start for layer, start in zip(layers, starts, strict=False)])
+        faces = np.concatenate(
+            [layer.faces + start for layer, start in zip(layers, starts, strict=False)]
+        )
         kinds = np.concatenate([np.full(len(layer.faces), layer.kind) for layer in layers])
         undone = cls(
             betas=betas,
@@ -132,8 +134,7 @@ class Actor:
         return over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
 
     def _lit(self) -> "Actor":
-        from dataclasses import replace
-
+        """The same actor with the light of the A-pose painted on."""
         pose = BodyPose(
             root_rotation=np.zeros(3),
             root_translation=np.zeros(3),

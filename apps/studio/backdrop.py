@@ -61,17 +61,17 @@ def _furnish(
     large: UInt8[np.ndarray, "height width 3"], horizon: int, generator: np.random.Generator
 ) -> None:
     """Planks, a shelf of books, pictures, a window, a plant, a lamp."""
-    height, width = large.shape[:2]
+    width = large.shape[1]
     _planks(large, horizon, generator)
     unit = width / 100.0
+    cv2.rectangle(large, (0, horizon - int(2 * unit)), (width, horizon), (226, 222, 212), -1)
     _shelf(large, (int(2 * unit), int(horizon - 58 * unit)), int(24 * unit), horizon, generator)
     _window(large, (int(66 * unit), int(8 * unit)), (int(25 * unit), int(36 * unit)))
-    for _ in range(4):
-        x, y = int(generator.uniform(30, 52) * unit), int(generator.uniform(5, 40) * unit)
-        size = (int(generator.uniform(7, 12) * unit), int(generator.uniform(8, 13) * unit))
-        _picture(large, (x, y), size, generator)
+    for left, top, wide, tall in ((29, 6, 11, 14), (42, 4, 9, 11), (31, 24, 8, 10), (54, 7, 8, 12)):
+        x, y = left + generator.uniform(-0.6, 0.6), top + generator.uniform(-0.6, 0.6)
+        size = (int(wide * unit), int(tall * unit))
+        _picture(large, (int(x * unit), int(y * unit)), size, generator)
     _plant(large, (int(86 * unit), horizon), unit, generator)
-    cv2.rectangle(large, (0, horizon - int(2 * unit)), (width, horizon), (226, 222, 212), -1)
 
 
 def _planks(
@@ -102,7 +102,9 @@ def _shelf(
     tall = (floor - top) // rows
     for row in range(rows):
         y0, y1 = top + row * tall + wide // 20, top + (row + 1) * tall
-        cv2.rectangle(large, (left + wide // 24, y0), (left + wide - wide // 24, y1), (58, 42, 32), -1)
+        cv2.rectangle(
+            large, (left + wide // 24, y0), (left + wide - wide // 24, y1), (58, 42, 32), -1
+        )
         x = left + wide // 20
         while x < left + wide - wide // 7:
             thick = int(generator.uniform(0.05, 0.12) * wide)
@@ -141,7 +143,9 @@ def _picture(
     (x, y), (wide, tall) = corner, size
     cv2.rectangle(large, (x, y), (x + wide, y + tall), (52, 46, 44), -1)
     edge = max(wide // 12, 1)
-    cv2.rectangle(large, (x + edge, y + edge), (x + wide - edge, y + tall - edge), (236, 230, 218), -1)
+    cv2.rectangle(
+        large, (x + edge, y + edge), (x + wide - edge, y + tall - edge), (236, 230, 218), -1
+    )
     for _ in range(6):
         radius = int(generator.uniform(0.08, 0.26) * wide)
         middle = (
@@ -166,6 +170,8 @@ def _plant(
         size = (max(int(3.4 * unit), 1), max(int(1.5 * unit), 1))
         cv2.line(large, (x, floor - int(9 * unit)), tip, (72, 96, 52), max(int(0.4 * unit), 1))
         cv2.ellipse(large, tip, size, float(np.rad2deg(angle) + 60), 0, 360, green, -1)
-    pot = np.array([(x - 5, floor - 11), (x + 5, floor - 11), (x + 4, floor + 3), (x - 4, floor + 3)])
+    pot = np.array(
+        [(x - 5, floor - 11), (x + 5, floor - 11), (x + 4, floor + 3), (x - 4, floor + 3)]
+    )
     scaled = [x, floor] + (pot - [x, floor]) * unit
     cv2.fillPoly(large, [scaled.astype(np.int32)], (190, 98, 66))

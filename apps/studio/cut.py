@@ -5,6 +5,7 @@ cut; `x` is the body's left, `y` up, `z` out of the chest.
 """
 
 import numpy as np
+from jaxtyping import Float32
 
 from avatar.kernels.jit import compile_kernel
 
@@ -18,22 +19,24 @@ BELT_Y = -0.15
 
 
 @compile_kernel(nogil=True, inline="always")
-def ramp(value, low, high):  # noqa: ANN001, ANN201
+def ramp(value: float, low: float, high: float) -> float:
     """0 below `low`, 1 above `high`, smooth between."""
     share = min(max((value - low) / (high - low), 0.0), 1.0)
     return share * share * (3.0 - 2.0 * share)
 
 
 @compile_kernel(nogil=True, inline="always")
-def neckline(x, z, cut):  # noqa: ANN001, ANN201
+def neckline(x: float, z: float, cut: Float32[np.ndarray, "cuts"]) -> float:
     """Height of the collar's edge: a scoop, deeper in front, that ends on the shoulders."""
     front = ramp(z, 0.01, 0.09)
     side = abs(x + 0.002)
-    return 0.350 - cut[NECK_DEPTH] * front + 14.0 * max(side - 0.06, 0.0) ** 2 + max(side - 0.1, 0.0)
+    return (
+        0.350 - cut[NECK_DEPTH] * front + 14.0 * max(side - 0.06, 0.0) ** 2 + max(side - 0.1, 0.0)
+    )
 
 
 @compile_kernel(nogil=True, inline="always")
-def inside_hair(x, y, z, cut):  # noqa: ANN001, ANN201
+def inside_hair(x: float, y: float, z: float, cut: Float32[np.ndarray, "cuts"]) -> float:
     """How far above the hairline a place of the head is, in metres (negative: bare)."""
     side = abs(x + 0.002)
     edge = cut[NAPE] + (0.478 - cut[NAPE]) * ramp(z, 0.02, 0.075)
@@ -47,7 +50,7 @@ def inside_hair(x, y, z, cut):  # noqa: ANN001, ANN201
 
 
 @compile_kernel(nogil=True)
-def keeps(kind, x, y, z, cut):  # noqa: ANN001, ANN201
+def keeps(kind: int, x: float, y: float, z: float, cut: Float32[np.ndarray, "cuts"]) -> bool:
     """Whether a place of a garment is there, and a place of the skin is bare."""
     side = abs(x)
     if kind == SHIRT:

@@ -11,9 +11,9 @@ from preprocess.pose import BodyPose
 DISTANCE_M = 3.2
 HEIGHT_M = 1.2
 
-PERSON_SHARE = 0.815
+PERSON_SHARE = 0.825
 """Height of the standing person as a share of the picture's."""
-ABOVE_SHARE = 0.115
+ABOVE_SHARE = 0.110
 """Share of the picture above the head: room for raised arms."""
 
 
@@ -25,7 +25,7 @@ def framed(actor: Actor, size: int) -> Camera:
     for _ in range(12):
         rows = camera.project(points)[:, 1] / size
         focal *= PERSON_SHARE / float(np.ptp(rows))
-        target -= (ABOVE_SHARE - float(rows.min())) * size * DISTANCE_M / focal * -1.0
+        target += (ABOVE_SHARE - float(rows.min())) * size * DISTANCE_M / focal
         camera = _aimed(size, focal, target)
     return camera
 

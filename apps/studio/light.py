@@ -46,7 +46,7 @@ def bake(
         near_lamp = max(float(toward @ LAMP_FROM) - 0.55, 0.0)
         lamp += facing * near_lamp
         lamp_weight += near_lamp
-    light = 0.30 + 0.52 * sky / weight + 0.50 * LAMP_RGB * (lamp / lamp_weight)[:, None]
+    light = 0.32 + 0.58 * sky / weight + 0.42 * LAMP_RGB * (lamp / lamp_weight)[:, None]
     return light.astype(np.float32)
 
 

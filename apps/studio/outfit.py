@@ -62,7 +62,7 @@ class Outfit:
     def trouser_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices"]:
-        """How far the trousers stand off: 7 mm at the hip, 2 cm at the cuff, creased at the knee."""
+        """How far the trousers stand off: 7 mm at the hip, 2 cm at the cuff."""
         x, y, z = place.T
         down = _ramp(-y, -BELT_Y, 1.1)
         knee = np.exp(-(((y + 0.70) / 0.10) ** 2)) + np.exp(-(((y + 1.08) / 0.07) ** 2))

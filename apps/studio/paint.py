@@ -5,13 +5,30 @@ to the body in every pose and are as sharp as the picture can show.
 """
 
 import numpy as np
+from jaxtyping import Float32
 
-from apps.studio.cut import BELT_Y, CUFF, EYE, HAIR, HEM, SHIRT, SHOE, SLEEVE, neckline, ramp
-from apps.studio.cut import TROUSERS
+from apps.studio.cut import (
+    BELT_Y,
+    CUFF,
+    EYE,
+    HAIR,
+    HEM,
+    SHIRT,
+    SHOE,
+    SLEEVE,
+    TROUSERS,
+    neckline,
+    ramp,
+)
 from avatar.kernels.jit import compile_kernel
 
 # What each row of a palette colours.
-TONE, LIPS, HAIR_TONE, IRIS, CLOTH, STRIPE, TRIM, DENIM, DENIM_STRIPE, THREAD, UPPER, SOLE = range(12)
+TONE, LIPS, HAIR_TONE, IRIS, CLOTH, STRIPE, TRIM, DENIM, DENIM_STRIPE, THREAD, UPPER, SOLE = range(
+    12
+)
+
+Colour = tuple[float, float, float]
+"""sRGB in [0, 1]."""
 
 MIDDLE_X = -0.002
 """The template's plane of symmetry."""
@@ -21,17 +38,19 @@ STRIPE_M = 0.04
 
 
 @compile_kernel(nogil=True, inline="always")
-def _hash(i, j, k, seed):  # noqa: ANN001, ANN202
+def _hash(i: int, j: int, k: int, seed: int) -> float:
     """A number in [-1, 1) that depends on all its bits."""
     h = np.uint32(i) * np.uint32(374761393) + np.uint32(j) * np.uint32(668265263)
-    h = np.uint32(h + np.uint32(k) * np.uint32(2246822519) + np.uint32(seed) * np.uint32(3266489917))
+    h = np.uint32(
+        h + np.uint32(k) * np.uint32(2246822519) + np.uint32(seed) * np.uint32(3266489917)
+    )
     h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(1274126177))
     h = np.uint32(h ^ (h >> np.uint32(16)))
     return np.float32(h) * np.float32(2.0 / 4294967296.0) - np.float32(1.0)
 
 
 @compile_kernel(nogil=True)
-def noise(x, y, z, cell, seed):  # noqa: ANN001, ANN201
+def noise(x: float, y: float, z: float, cell: float, seed: int) -> float:
     """Smooth noise in [-1, 1] with a grain of `cell` metres."""
     x, y, z = x / cell + 500.0, y / cell + 500.0, z / cell + 500.0
     i, j, k = int(x), int(y), int(z)
@@ -45,7 +64,7 @@ def noise(x, y, z, cell, seed):  # noqa: ANN001, ANN201
 
 
 @compile_kernel(nogil=True, inline="always")
-def _mix(a, b, share):  # noqa: ANN001, ANN202
+def _mix(a: Colour, b: Colour, share: float) -> Colour:
     return (
         a[0] + (b[0] - a[0]) * share,
         a[1] + (b[1] - a[1]) * share,
@@ -54,17 +73,17 @@ def _mix(a, b, share):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True, inline="always")
-def _times(a, factor):  # noqa: ANN001, ANN202
+def _times(a: Colour, factor: float) -> Colour:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
 @compile_kernel(nogil=True, inline="always")
-def _swatch(palette, row):  # noqa: ANN001, ANN202
+def _swatch(palette: Float32[np.ndarray, "colours 3"], row: int) -> Colour:
     return palette[row, 0], palette[row, 1], palette[row, 2]
 
 
 @compile_kernel(nogil=True, inline="always")
-def _band(value, width, blur):  # noqa: ANN001, ANN202
+def _band(value: float, width: float, blur: float) -> float:
     """Square wave in [0, 1]: stripes of one width, edges `blur` metres soft."""
     phase = value / (2.0 * width)
     fold = abs(phase - np.floor(phase) - 0.5) * 2.0 * width  # 0 … width, one period = 2 widths
@@ -72,7 +91,14 @@ def _band(value, width, blur):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _shirt(x, y, z, palette, cut, checked):  # noqa: ANN001, ANN202
+def _shirt(
+    x: float,
+    y: float,
+    z: float,
+    palette: Float32[np.ndarray, "colours 3"],
+    cut: Float32[np.ndarray, "cuts"],
+    checked: bool,
+) -> Colour:
     side = abs(x - MIDDLE_X)
     on_sleeve = side > 0.172 and y > 0.08
     along = side if on_sleeve else y
@@ -103,7 +129,13 @@ def _shirt(x, y, z, palette, cut, checked):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _trousers(x, y, z, palette, cut):  # noqa: ANN001, ANN202
+def _trousers(
+    x: float,
+    y: float,
+    z: float,
+    palette: Float32[np.ndarray, "colours 3"],
+    cut: Float32[np.ndarray, "cuts"],
+) -> Colour:
     side = abs(x - MIDDLE_X)
     axis_x = 0.118 + 0.040 * ramp(-y, 0.25, 1.1)
     axis_z = 0.020 - 0.055 * ramp(-y, 0.3, 1.1)
@@ -124,7 +156,7 @@ def _trousers(x, y, z, palette, cut):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _skin(x, y, z, palette):  # noqa: ANN001, ANN202
+def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
     tone = _swatch(palette, TONE)
     side = abs(x - MIDDLE_X)
     warm = 0.0
@@ -141,7 +173,9 @@ def _skin(x, y, z, palette):  # noqa: ANN001, ANN202
     socket = np.exp(-(((side - 0.030) / 0.020) ** 2) - ((y - 0.506) / 0.011) ** 2)
     flank = np.exp(-(((side - 0.013) / 0.006) ** 2) - ((y - 0.480) / 0.020) ** 2)
     nostril = np.exp(-(((side - 0.008) / 0.0045) ** 2) - ((y - 0.4525) / 0.0030) ** 2)
-    colour = _times(colour, 1.0 - 0.16 * socket - 0.12 * flank - 0.45 * nostril * ramp(z, 0.165, 0.175))
+    colour = _times(
+        colour, 1.0 - 0.16 * socket - 0.12 * flank - 0.45 * nostril * ramp(z, 0.165, 0.175)
+    )
     if z > 0.12:
         colour = _mouth(colour, side, y, palette)
         colour = _brow_and_lashes(colour, side, y, palette)
@@ -149,21 +183,27 @@ def _skin(x, y, z, palette):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _mouth(colour, side, y, palette):  # noqa: ANN001, ANN202
+def _mouth(
+    colour: Colour, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
+) -> Colour:
     share = side / 0.027
     if share >= 1.0:
         return colour
     round_ = 1.0 - share * share
-    upper = 0.4290 + 0.0030 * share * share + 0.0100 * round_ - 0.0025 * np.exp(-((side / 0.004) ** 2))
-    lower = 0.4290 + 0.0030 * share * share - 0.0120 * np.sqrt(round_)
+    upper = (
+        0.4290 + 0.0045 * share * share + 0.0100 * round_ - 0.0025 * np.exp(-((side / 0.004) ** 2))
+    )
+    lower = 0.4290 + 0.0045 * share * share - 0.0120 * np.sqrt(round_)
     inside = ramp(upper - y, -0.0008, 0.0012) * ramp(y - lower, -0.0008, 0.0015)
     colour = _mix(colour, _swatch(palette, LIPS), 0.80 * inside)
-    parting = ramp(0.0019 - abs(y - 0.4290 - 0.0030 * share * share), 0.0, 0.0012)
+    parting = ramp(0.0019 - abs(y - 0.4290 - 0.0045 * share * share), 0.0, 0.0012)
     return _times(colour, 1.0 - 0.55 * parting)
 
 
 @compile_kernel(nogil=True)
-def _brow_and_lashes(colour, side, y, palette):  # noqa: ANN001, ANN202
+def _brow_and_lashes(
+    colour: Colour, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
+) -> Colour:
     dark = _times(_swatch(palette, HAIR_TONE), 0.75)
     along = (side - 0.012) / 0.042
     if 0.0 < along < 1.0:
@@ -178,7 +218,7 @@ def _brow_and_lashes(colour, side, y, palette):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _eye(x, y, palette):  # noqa: ANN001, ANN202
+def _eye(x: float, y: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
     from_iris = np.hypot(abs(x - MIDDLE_X) - 0.0300, y - 0.5035)
     iris = _times(_swatch(palette, IRIS), 0.75 + 40.0 * from_iris)
     colour = _mix(iris, (0.94, 0.93, 0.90), ramp(from_iris, 0.0058, 0.0068))
@@ -188,7 +228,7 @@ def _eye(x, y, palette):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _hair(x, y, z, palette):  # noqa: ANN001, ANN202
+def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
     along = np.arctan2(x - MIDDLE_X, z - 0.05)
     strand = noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, 7)
     strand += 0.6 * noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, 8)
@@ -196,7 +236,7 @@ def _hair(x, y, z, palette):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def _shoe(x, y, z, palette):  # noqa: ANN001, ANN202
+def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
     side = abs(abs(x - MIDDLE_X) - 0.162)
     upper = _swatch(palette, UPPER)
     lace = ramp(0.022 - side, 0.0, 0.002) * ramp(z, 0.035, 0.040) * ramp(0.105 - z, 0.0, 0.004)
@@ -208,7 +248,15 @@ def _shoe(x, y, z, palette):  # noqa: ANN001, ANN202
 
 
 @compile_kernel(nogil=True)
-def colour_of(kind, x, y, z, palette, cut, checked):  # noqa: ANN001, ANN201
+def colour_of(
+    kind: int,
+    x: float,
+    y: float,
+    z: float,
+    palette: Float32[np.ndarray, "colours 3"],
+    cut: Float32[np.ndarray, "cuts"],
+    checked: bool,
+) -> Colour:
     """sRGB colour of a place before any light falls on it; may leave [0, 1] by a little."""
     if kind == SHIRT:
         return _shirt(x, y, z, palette, cut, checked)

@@ -78,7 +78,16 @@ def rasterise(
 
 
 @compile_kernel(nogil=True, error_model="numpy")
-def _draw(screen, faces, texture, kinds, cut, face_out, share_out, depth_out):  # noqa: ANN001, ANN202
+def _draw(
+    screen: Float32[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    texture: Float32[np.ndarray, "places 3"],
+    kinds: Int32[np.ndarray, "kinds"],
+    cut: Float32[np.ndarray, "cuts"],
+    face_out: Int32[np.ndarray, "rows columns"],
+    share_out: Float32[np.ndarray, "rows columns 2"],
+    depth_out: Float32[np.ndarray, "rows columns"],
+) -> None:
     rows, columns = face_out.shape
     for face in range(faces.shape[0]):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]

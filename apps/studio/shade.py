@@ -49,9 +49,20 @@ def over(
 
 
 @compile_kernel(nogil=True, error_model="numpy")
-def _shade(  # noqa: ANN202
-    face_of, share_of, fine, faces, kinds, place, light, palette, cut, checked, rgb, alpha  # noqa: ANN001
-):  # fmt: skip
+def _shade(
+    face_of: Int32[np.ndarray, "rows columns"],
+    share_of: Float32[np.ndarray, "rows columns 2"],
+    fine: int,
+    faces: Int32[np.ndarray, "faces 3"],
+    kinds: Int32[np.ndarray, "kinds"],
+    place: Float32[np.ndarray, "vertices 3"],
+    light: Float32[np.ndarray, "vertices 3"],
+    palette: Float32[np.ndarray, "colours 3"],
+    cut: Float32[np.ndarray, "cuts"],
+    checked: bool,
+    rgb: Float32[np.ndarray, "height width 3"],
+    alpha: Float32[np.ndarray, "height width"],
+) -> None:
     for i in range(alpha.shape[0]):
         for j in range(alpha.shape[1]):
             red, green, blue, covered = 0.0, 0.0, 0.0, 0

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int32
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
@@ -194,11 +194,11 @@ def _hung(
     body: Body,
     kind: int,
     points: Float[np.ndarray, "vertices 3"],
-    faces: Int32[np.ndarray, "faces 3"],
+    faces: Int[np.ndarray, "faces 3"],
     *,
     grown: float,
     refined: int,
-    among: Float[np.ndarray, "chosen"],
+    among: Int[np.ndarray, "chosen"],
 ) -> Layer:
     """A surface of its own, each vertex hung from the nearest of the body vertices `among`."""
     layer = Layer(

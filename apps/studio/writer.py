@@ -19,9 +19,11 @@ from apps.studio.actor import Actor
 from apps.studio.framing import framed
 from apps.studio.roughen import roughened
 from apps.studio.shade import over
+from apps.studio.tracker import tracked
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose, Motion
+from preprocess.pose_file import write_motion
 
 Progress = Callable[[int, int], None]
 """Called after each picture with how many are done and how many there will be."""
@@ -158,26 +160,22 @@ class _Studio:
 def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:
     actor = Actor.of(config.subject, config.seed)
     camera = framed(actor, config.size)
-    background = backdrop.paint(
-        config.background, camera, np.random.default_rng([config.seed, 4])
-    )
+    background = backdrop.paint(config.background, camera, np.random.default_rng([config.seed, 4]))
     studio = _Studio(actor=actor, camera=camera, background=background)
     act = motions.turn if config.motion == "turn" else motions.dance
-    truth = act(
-        actor, frames=config.frames, fps=config.fps, turns=config.turns, seed=config.seed
-    )
+    truth = act(actor, frames=config.frames, fps=config.fps, turns=config.turns, seed=config.seed)
     novel = motions.novel(actor)
     total = len(truth) + len(novel)
     _write_video(folder, studio, truth, config, lambda done: progress(done, total))
     _write_novel(
         folder / "truth" / "novel", studio, novel, lambda done: progress(len(truth) + done, total)
     )
-    given = motions.tracked(
+    given = tracked(
         truth, degrees=config.pose_noise_deg, centimetres=config.pose_noise_cm, seed=config.seed
     )
-    _write_motion(folder / "poses.npz", given)
-    _write_motion(folder / "truth" / "poses.npz", truth)
-    _write_motion(folder / "dance.npz", motions.clip(actor))
+    write_motion(folder / "poses.npz", given)
+    write_motion(folder / "truth" / "poses.npz", truth)
+    write_motion(folder / "dance.npz", motions.clip(actor))
     np.savez(
         folder / "cameras.npz",
         intrinsic=camera.intrinsic,
@@ -227,20 +225,7 @@ def _write_novel(
         _write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
         _write_png(folder / "masks" / f"{index:04d}.png", _eight_bit(alpha))
         done(index + 1)
-    _write_motion(folder / "poses.npz", motion)
-
-
-def _write_motion(path: Path, motion: Motion) -> None:
-    np.savez(
-        path,
-        betas=motion.betas,
-        global_orient=motion.root_rotations,
-        body_pose=motion.joint_rotations.reshape(len(motion), 69),
-        transl=motion.root_translations,
-        time=motion.times_s,
-        frame=motion.frames,
-        model=motion.model,
-    )
+    write_motion(folder / "poses.npz", motion)
 
 
 def _eight_bit(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:

@@ -1,0 +1,46 @@
+"""Poses as a tracker gives them: the truth, and an error that wanders."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from preprocess.pose import Motion
+
+NOISE_FRAMES = 3.0
+"""A tracker wanders rather than flickers: its error is smooth over about this many frames."""
+
+
+def tracked(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
+    """What a tracker would have said: the motion with smooth noise on rotations and place.
+
+    Args:
+        motion: The truth.
+        degrees: Standard deviation of each component of each axis-angle.
+        centimetres: Standard deviation of each component of the root's place.
+        seed: Of the noise.
+    """
+    if degrees == 0.0 and centimetres == 0.0:
+        return motion
+    generator = np.random.default_rng([seed, 3])
+    frames = len(motion)
+    turned = _smooth_noise(generator, (frames, 24, 3)) * np.deg2rad(degrees)
+    moved = _smooth_noise(generator, (frames, 3)) * centimetres / 100.0
+    return replace(
+        motion,
+        root_rotations=motion.root_rotations + turned[:, 0],
+        root_translations=motion.root_translations + moved,
+        joint_rotations=motion.joint_rotations + turned[:, 1:],
+    )
+
+
+def _smooth_noise(
+    generator: np.random.Generator, shape: tuple[int, ...]
+) -> Float[np.ndarray, "frames *rest"]:
+    """Gaussian noise of unit variance, smooth over `NOISE_FRAMES` frames."""
+    margin = int(4 * NOISE_FRAMES)
+    white = generator.standard_normal((shape[0] + 2 * margin, *shape[1:]))
+    smooth = gaussian_filter1d(white, NOISE_FRAMES, axis=0)[margin:-margin]
+    # The power of a Gaussian filter: its variance falls to 1 / (2 √π σ).
+    return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * NOISE_FRAMES)
