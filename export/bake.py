@@ -9,7 +9,7 @@ from scipy import ndimage
 from avatar.rig import Rig
 from capture.errors import BadInput
 from export.hull import DEEPEST_M, Hull, find_hull
-from export.lattice import FieldAt, Lattice, read_field
+from export.lattice import FAINTEST, FieldAt, Lattice, read_field
 from export.tables import (
     BRICK,
     GRADIENT_LIMIT,
@@ -25,6 +25,8 @@ from preprocess.kinematics import body_from_rest
 
 GRADIENT_STEP_M = 0.01
 """Half the distance over which the skinning weights are differentiated."""
+FAINT_SHARE = 0.1
+"""The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.016
 """Bricks reach this far outside of the hull."""
 
@@ -36,12 +38,12 @@ class BakeConfig:
     Attributes:
         voxel_m: Distance between brick voxels.
         surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
-        hull_density: Density of the hull's level set, 1/m.
+        hull_density: Density of the hull's level set, 1/m; less where the whole field is faint.
     """
 
     voxel_m: float = 0.004
     surfel_spacing_m: float = 0.005
-    hull_density: float = 3.0
+    hull_density: float = 20.0
 
 
 def bake(
@@ -77,17 +79,19 @@ def bake(
 
 def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
     """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
-    if not (lattice.density > config.hull_density).any():
+    visible = lattice.density[lattice.density > FAINTEST]
+    if visible.size == 0:
         raise BadInput(
-            "The avatar is empty: its density is nowhere above "
-            f"{config.hull_density:g} per metre. Train it longer, or check the masks."
+            f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
+            "Train it longer, or check the masks."
         )
+    level = min(config.hull_density, FAINT_SHARE * float(np.percentile(visible, 99)))
     spacing_m = config.surfel_spacing_m
     while True:
-        hull = find_hull(lattice, level=config.hull_density, spacing_m=spacing_m)
+        hull = find_hull(lattice, level=level, spacing_m=spacing_m)
         if 0 < len(hull.positions) < 1 << SURFEL_BITS:
             return hull
-        spacing_m *= 1.1
+        spacing_m *= 1.02 * max(1.0, len(hull.positions) / (1 << SURFEL_BITS)) ** 0.5
 
 
 def _reach(rig: Rig) -> float:
@@ -187,8 +191,8 @@ def _near_hull(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:
     stride = 2  # a coarse distance is good enough here
     inside = hull.inside[::stride, ::stride, ::stride]
     cell_m = stride * hull.spacing_m
-    near = ndimage.distance_transform_edt(inside) * cell_m < DEEPEST_M
-    near &= ndimage.distance_transform_edt(~inside) * cell_m < MARGIN_M
+    near = ndimage.distance_transform_edt(inside) * cell_m < DEEPEST_M + cell_m
+    near &= ndimage.distance_transform_edt(~inside) * cell_m < MARGIN_M + cell_m
     axes = [
         np.clip(np.round(np.arange(n) * lattice.voxel_m / cell_m).astype(int), 0, m - 1)
         for n, m in zip(lattice.density.shape, near.shape, strict=True)

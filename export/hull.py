@@ -8,14 +8,16 @@ from scipy import ndimage
 
 from export.lattice import Lattice
 
-FAINT, DENSE = 0.3, 100.0
-"""Densities (1/m) between which the log-density makes the level set; the rest is clipped."""
+CONTRAST = 16.0
+"""Densities beyond this factor from the level count as the factor: emptiness has no log."""
 SMOOTHING_M = 0.004
 """Deviation of the blur before the level is taken: a trained field is never quite smooth."""
 SMALLEST_PART = 0.01
 """Parts of less volume than this share of the largest are floaters."""
-OPAQUE = 4.6
-"""Optical depth behind which nothing is seen (1 %)."""
+OPAQUE = 7.0
+"""Optical depth behind which nothing is seen (0.1 %)."""
+MARGIN_M = 0.004
+"""Added to the thickness, for what lies deeper beside the normal than along it."""
 DEEPEST_M = 0.1
 """Nothing is looked for deeper than this under the hull."""
 
@@ -46,10 +48,11 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
 
     Args:
         lattice: The field.
-        level: Density in 1/m; low, so that the hull lies outside of the visible fuzz.
+        level: Density in 1/m. Lower, and haze that nobody sees shapes the hull; higher, and it
+            cuts into what is seen.
         spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
     """
-    logs = np.log(np.clip(lattice.density, FAINT, DENSE)) - np.float32(np.log(level))
+    logs = np.log(np.clip(lattice.density / np.float32(level), 1.0 / CONTRAST, CONTRAST))
     logs = _resampled(logs, spacing_m / lattice.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
     inside = _largest_parts(logs > 0.0)
@@ -133,7 +136,8 @@ def _thickness(
 ) -> Float32[np.ndarray, "surfels"]:
     """Depth along the normal at which all that can be seen has been seen.
 
-    That is where the optical depth reaches `OPAQUE`, or 99 % of all there is within `DEEPEST_M`.
+    That is where the optical depth reaches `OPAQUE`, or 99.9 % of all there is within
+    `DEEPEST_M`; and `MARGIN_M`.
     """
     step = np.float32(0.5 * lattice.voxel_m)
     depths = np.arange(0.5, DEEPEST_M / step, dtype=np.float32) * step
@@ -145,6 +149,6 @@ def _thickness(
         nearest = np.clip(nearest, 0, np.array(lattice.density.shape) - 1)
         total = total + lattice.density[tuple(nearest.T)] * step
         optical[row] = total
-    enough = np.minimum(OPAQUE, 0.99 * total)
+    enough = np.minimum(OPAQUE, 0.999 * total)
     seen = (optical < enough).sum(axis=0)
-    return ((seen + 1) * step).astype(np.float32)
+    return ((seen + 1) * step + MARGIN_M).astype(np.float32)

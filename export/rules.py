@@ -32,7 +32,7 @@ class DrawingRules:
     largest_footprint_px: int = 16
     footprint_spacings: float = 1.4
     behind: float = 0.35
-    lead_m: float = 0.0
+    lead_m: float = 0.006
     slack_m: float = 0.012
     grazing: float = 1.5
     steepest: float = 0.1
