@@ -29,7 +29,7 @@ class TrainConfig:
     """Entries of a hashed level."""
     finest_m: float = 0.008
     """Cells of the finest level, metres."""
-    learning_rate: float = 2e-2
+    learning_rate: float = 2.5e-2
     """Of the table; the network's is 0.3 of it."""
     alpha_weight: float = 0.1
     """Of the L1 loss on alpha."""

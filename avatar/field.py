@@ -11,8 +11,8 @@ from avatar.kernels.backend import Backend
 from avatar.levels import FEATURES, HashLevels
 
 HIDDEN = 64
-FIRST_LOG_DENSITY = 1.5
-"""Raw density of an untrained field: exp(1.5) = 4.5 per metre, a thin fog to start from."""
+FIRST_LOG_DENSITY = 0.0
+"""Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 CHUNK = 1 << 17
 
 

@@ -19,6 +19,8 @@ from avatar.rig import Rig
 
 DECAY = 0.9
 """What a cell keeps of its density when a probe finds nothing. At 0.6 thin surfaces vanish."""
+FIRST_DECAY = 0.7
+"""The same while the first fog clears and half of the band is probed at each update."""
 OPACITY = 0.02
 """A cell counts as empty when a step through it would be less opaque than this."""
 FIRST_DENSITY = 1e-3
@@ -52,6 +54,7 @@ class Occupancy:
         log_density_at: Callable[[Float32[Tensor, "points 3"]], Float32[Tensor, "points"]],
         *,
         share: float,
+        decay: float = DECAY,
         step_m: float,
         generator: torch.Generator,
     ) -> None:
@@ -60,13 +63,14 @@ class Occupancy:
         Args:
             log_density_at: Log density at canonical points.
             share: How much of the band is probed, in (0, 1].
+            decay: What a probed cell keeps of its density.
             step_m: Distance between samples along a ray.
             generator: Chooses cells and places.
         """
         chosen = self._draw(self.band, int(len(self.band) * share), generator)
         density = torch.exp(log_density_at(self._somewhere_in(chosen, generator)).clamp(max=9.0))
         flat = self.grid.density.view(-1)
-        flat[chosen] = torch.maximum(flat[chosen] * DECAY, density)
+        flat[chosen] = torch.maximum(flat[chosen] * decay, density)
         bar = min(OPACITY / step_m, float(flat[self.band].mean()))
         self.grid.occupied.copy_(grown((self.grid.density > bar).to(torch.uint8)) & self._in_band)
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from typing import final
 
 import torch
-from preprocess.observe import Dropped
 
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.events import Evaluated, Finished, Score, Stepped, TrainEvent, Warned
@@ -14,17 +13,18 @@ from avatar.hold import SCORED_AT_A_MARK, HeldOut, score, spread
 from avatar.kernels.backend import Backend, backend_for
 from avatar.levels import HashLevels
 from avatar.model import Avatar
-from avatar.occupancy import Occupancy
+from avatar.occupancy import DECAY, FIRST_DECAY, Occupancy
 from avatar.prepare import PreparedFrame
 from avatar.replay import Replay
 from avatar.rig import Rig
 from avatar.step import StepResult, cosine, gradients
 from capture.inbox import Inbox
+from preprocess.observe import Dropped
 
 NETWORK_RATE = 0.3
 """The network's learning rate as a share of the table's."""
-FULL_PROBING_STEPS = 300
-"""Steps during which half of the band is probed at each update of the occupancy, not a quarter."""
+CLEARING_STEPS = 300
+"""Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 """When the curve is measured, in seconds of training; then every 30 s."""
 
@@ -95,9 +95,11 @@ class Trainer:
         field.table.grad.zero_()
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
+            clearing = self.steps < CLEARING_STEPS
             occupancy.update(
                 lambda points: field.raw_at(points)[:, 3],
-                share=0.5 if self.steps < FULL_PROBING_STEPS else 0.25,
+                share=0.5 if clearing else 0.25,
+                decay=FIRST_DECAY if clearing else DECAY,
                 step_m=config.step_m,
                 generator=self._generator,
             )
