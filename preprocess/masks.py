@@ -15,6 +15,9 @@ from preprocess.npz import read_npz
 SAMPLED = 9
 """How many masks are looked at to find out which side is the person."""
 
+Reader = Callable[[int], Float32[np.ndarray, "height width"]]
+"""From a row to the mask as it is stored."""
+
 
 class Masks:
     """One mask a frame, in order.
@@ -27,15 +30,26 @@ class Masks:
     """
 
     def __init__(
-        self, path: Path, count: int, read: Callable[[int], Float32[np.ndarray, "height width"]]
+        self,
+        path: Path,
+        count: int,
+        read: Reader,
+        *,
+        invert: bool | None,
     ) -> None:
-        """Takes the masks as stored; `open_masks` finds out about their polarity."""
+        """Looks at a few of the masks that `read` gives as they are stored.
+
+        Raises:
+            BadInput: If none of them can be read or, with `invert` None, told from the background.
+        """
         self.path = path
         self.count = count
-        self.inverted = False
         self._read = read
-        height, width = read(0).shape
+        rows = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int))
+        samples = _readable(read, [int(row) for row in rows])
+        height, width = samples[0].shape
         self.size_px = (int(width), int(height))
+        self.inverted = _show_background(samples, path) if invert is None else invert
 
     def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         """The mask in one row, scaled to a picture's size.
@@ -72,27 +86,30 @@ def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
     """
     if not path.exists():
         raise BadInput(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
-    masks = _masks_of_folder(path) if path.is_dir() else _masks_of_file(path)
-    masks.inverted = _shows_background(masks) if invert is None else invert
-    return masks
+    count, read = _folder_of_masks(path) if path.is_dir() else _file_of_masks(path)
+    return Masks(path, count, read, invert=invert)
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether two pictures have one aspect ratio, up to the rounding of their sizes."""
-    tolerance = max(0.01, 1.0 / min(*a, *b))
-    return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) <= tolerance
+    """Whether two pictures have one aspect ratio: the larger shrinks to the smaller within 1 px."""
+    large, small = sorted((a, b), key=max, reverse=True)
+    scale = max(small) / max(large)
+    return all(
+        abs(side * scale - wanted) <= max(1.0, 0.01 * wanted)
+        for side, wanted in zip(large, small, strict=True)
+    )
 
 
-def _masks_of_folder(path: Path) -> Masks:
+def _folder_of_masks(path: Path) -> tuple[int, Reader]:
     suffixes = IMAGE_SUFFIXES | {".npy"}
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes]
     files = sorted((file for file in files if not file.name.startswith(".")), key=natural_key)
     if not files:
         raise BadInput(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
-    return Masks(path, len(files), lambda row: _read_file(files[row]))
+    return len(files), lambda row: _read_file(files[row])
 
 
-def _masks_of_file(path: Path) -> Masks:
+def _file_of_masks(path: Path) -> tuple[int, Reader]:
     if path.suffix == ".npz":
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
@@ -105,7 +122,7 @@ def _masks_of_file(path: Path) -> Masks:
         )
     if stack is None or stack.ndim != 3 or not stack.size:
         raise BadInput(f"{path} holds no array of masks (N, height, width).")
-    return Masks(path, len(stack), lambda row: _as_alpha(stack[row], path))
+    return len(stack), lambda row: _as_alpha(stack[row], path)
 
 
 def _load(path: Path) -> Shaped[np.ndarray, "..."]:
@@ -121,9 +138,10 @@ def _read_file(path: Path) -> Float32[np.ndarray, "height width"]:
     try:
         with Image.open(path) as picture:
             picture.load()
-            return _as_alpha(_channel(picture), path)
+            channel = _channel(picture)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
         raise BadInput(f"{path} is no mask that can be decoded ({cause}).") from cause
+    return _as_alpha(channel, path)
 
 
 def _channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
@@ -161,24 +179,36 @@ def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
     return np.float32(65535.0 if stored.dtype == np.uint16 else 255.0)
 
 
-def _shows_background(masks: Masks) -> bool:
-    """Whether the masks are 1 where the person is not: most of the picture and of its rim."""
-    rows = np.unique(np.linspace(0, masks.count - 1, SAMPLED).round().astype(int))
-    shares = np.array([_shares(masks._read(int(row))) for row in rows])
+def _readable(read: Reader, rows: list[int]) -> list[Float32[np.ndarray, "height width"]]:
+    """Those of the masks that can be read, if any can."""
+    masks, refused = [], []
+    for row in rows:
+        try:
+            masks.append(read(row))
+        except BadInput as cause:
+            refused.append(cause)
+    if not masks:
+        raise refused[0]
+    return masks
+
+
+def _show_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
+    """Whether masks are 1 where the person is not: on most of the picture and of its rim."""
+    shares = np.array([_shares(mask) for mask in samples])
     told = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
     if not len(told):
         raise BadInput(
-            f"The masks in {masks.path} show nothing: all {len(rows)} that were looked at are "
-            "empty or full. Expected the person at 255 and the rest at 0."
+            f"The masks in {path} show nothing: all {len(samples)} that were looked at are empty "
+            "or full. Expected the person at 255 and the rest at 0."
         )
-    area, rim = told.mean(axis=0) > 0.5
-    if area != rim:
+    area, rim = told.mean(axis=0)
+    if (area > 0.5) != (rim > 0.5):
         raise BadInput(
-            f"It cannot be seen which side of the masks in {masks.path} is the person: they cover "
-            f"{told[:, 0].mean():.0%} of the pictures and {told[:, 1].mean():.0%} of the rims. "
-            "Say so with --mask-invert (the person is 0) or --no-mask-invert (the person is 255)."
+            f"It cannot be seen which side of the masks in {path} is the person: they cover "
+            f"{area:.0%} of the pictures and {rim:.0%} of the rims. Say so with --mask-invert (the "
+            "person is 0) or --no-mask-invert (the person is 255)."
         )
-    return bool(area)
+    return bool(area > 0.5)
 
 
 def _shares(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:

@@ -1,6 +1,7 @@
 """Arrays out of .npz archives, with a message for everything that can be wrong with the file."""
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,12 @@ from capture.errors import BadInput
 
 MAX_BYTES = 4 << 30
 """Archives that would unpack to more are refused."""
+
+FAILURES = (
+    OSError, ValueError, KeyError, EOFError, MemoryError, RuntimeError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What numpy and zipfile raise for damaged, encrypted or oddly packed archives."""
 
 
 def read_npz(
@@ -31,11 +38,13 @@ def read_npz(
                 f"{path} unpacks to {size >> 20} MiB; more than {MAX_BYTES >> 20} MiB are not read."
             )
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in (keys or archive.files) if key in archive.files}
+            wanted = [key for key in (keys or archive.files) if key in archive.files]
+            found = {key: archive[key] for key in wanted}
     except BadInput:
         raise
-    except (OSError, ValueError, MemoryError, EOFError, zipfile.BadZipFile, KeyError) as cause:
+    except FAILURES as cause:
         raise BadInput(
             f"{path} is no readable .npz of plain arrays ({cause}). "
             "Is the file complete, and written without pickled objects?"
         ) from cause
+    return {key: array for key, array in found.items() if isinstance(array, np.ndarray)}

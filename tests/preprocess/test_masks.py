@@ -1,0 +1,172 @@
+"""Masks in every container and polarity."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from capture.errors import BadInput
+from preprocess.masks import open_masks, same_shape
+
+SIZE = (30, 40)
+
+
+def person(shift: int = 0) -> np.ndarray:
+    """8-bit: a soft-edged rectangle of 20 % of the picture, off its rim."""
+    mask = np.zeros((40, 30), np.uint8)
+    mask[8:32, 10 + shift : 20 + shift] = 255
+    mask[8:32, 10 + shift] = 77
+    return mask
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(masks, name="masks", suffix=".png"):
+        folder = tmp_path / name
+        folder.mkdir()
+        for index, mask in enumerate(masks):
+            path = folder / f"{index}{suffix}"
+            if suffix == ".npy":
+                np.save(path, mask)
+            else:
+                Image.fromarray(mask).save(path)
+        return folder
+
+    return write
+
+
+def test_alpha_is_the_value_over_255_and_never_thresholded(write):
+    masks = open_masks(write([person(), person(3)]))
+    np.testing.assert_array_equal(masks.alpha(1, SIZE), person(3).astype(np.float32) / 255)
+    assert np.float32(77 / 255) in masks.alpha(0, SIZE)
+    assert masks.count == 2
+    assert masks.size_px == SIZE
+    assert not masks.inverted
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        person() // 200,
+        person() > 200,
+        (person() > 200).astype(np.float32),
+        ((person() > 200) * 255.0).astype(np.float64),
+        (person() // 200).astype(np.int64) * 255,
+    ],
+    ids=["0 and 1", "bool", "float", "float to 255", "int to 255"],
+)
+def test_every_scale_of_a_hard_mask_is_one_mask(write, stored):
+    alpha = open_masks(write([stored], suffix=".npy")).alpha(0, SIZE)
+    np.testing.assert_array_equal(alpha, (person() > 200).astype(np.float32))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "1", "P", "I;16"])
+def test_every_kind_of_picture_is_one_mask(tmp_path, mode):
+    hard = np.where(person() > 200, 255, 0).astype(np.uint8)
+    grey = Image.fromarray(hard)
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    if mode == "RGBA":
+        picture = Image.fromarray(np.dstack([np.full((40, 30, 3), 9, np.uint8), hard]))
+    elif mode == "P":
+        picture = Image.fromarray(hard // 255)
+        picture.putpalette([0, 0, 0, 128, 0, 0])
+    elif mode == "I;16":
+        picture = Image.fromarray(hard.astype(np.uint16) * 257)
+    else:
+        picture = grey.convert(mode)
+    picture.save(folder / "0.png")
+    np.testing.assert_allclose(open_masks(folder).alpha(0, SIZE), hard / 255.0)
+
+
+def test_one_archive_or_array_is_read_like_a_folder(write, tmp_path):
+    stack = np.stack([person(), person(4)])
+    np.savez(tmp_path / "m.npz", masks=stack, note=np.zeros(3))
+    np.save(tmp_path / "m.npy", stack)
+    expected = open_masks(write(stack))
+    for name in ("m.npz", "m.npy"):
+        masks = open_masks(tmp_path / name)
+        assert masks.count == 2
+        np.testing.assert_array_equal(masks.alpha(1, SIZE), expected.alpha(1, SIZE))
+
+
+def test_masks_come_in_natural_order(write):
+    folder = write([person(i - 5) for i in range(12)])
+    np.testing.assert_array_equal(open_masks(folder).alpha(11, SIZE), person(6) / np.float32(255))
+
+
+def test_inverted_masks_are_turned_unless_told_otherwise(write):
+    folder = write([255 - person(), 255 - person(2)])
+    upright = person() / np.float32(255)
+    found = open_masks(folder)
+    assert found.inverted
+    np.testing.assert_allclose(found.alpha(0, SIZE), upright, atol=1e-6)
+    told = open_masks(folder, invert=False)
+    np.testing.assert_allclose(told.alpha(0, SIZE), 1 - upright, atol=1e-6)
+    assert open_masks(write([person()], "other"), invert=True).inverted
+
+
+def test_an_empty_mask_among_others_does_not_decide(write):
+    nothing = np.zeros((40, 30), np.uint8)
+    assert not open_masks(write([nothing, person(), nothing])).inverted
+    assert open_masks(write([255 - nothing, 255 - person()], "turned")).inverted
+
+
+def test_masks_that_do_not_tell_which_side_is_the_person_are_refused(write):
+    framed = np.full((40, 30), 255, np.uint8)
+    framed[2:-2, 2:-2] = 0
+    with pytest.raises(BadInput, match="--mask-invert"):
+        open_masks(write([framed]))
+
+
+def test_masks_that_show_nothing_are_refused(write):
+    with pytest.raises(BadInput, match="empty or full"):
+        open_masks(write([np.zeros((40, 30), np.uint8)] * 3))
+
+
+def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
+    masks = open_masks(write([person()]))
+    with pytest.raises(BadInput, match=r"30x40 px, its picture 40x30"):
+        masks.alpha(0, (40, 30))
+    half = masks.alpha(0, (15, 20))
+    by_hand = (person() / np.float32(255)).reshape(20, 2, 15, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(half, by_hand, atol=1e-6)
+    assert masks.alpha(0, (60, 80)).shape == (80, 60)
+
+
+@given(st.integers(8, 4000), st.integers(8, 4000), st.integers(8, 512))
+def test_shapes_agree_after_any_shrinking(width, height, longer):
+    scale = min(1.0, longer / max(width, height))
+    small = max(1, round(width * scale)), max(1, round(height * scale))
+    assert same_shape((width, height), small)
+    assert not same_shape((width, height), (width, 2 * height))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("masks.npz", b"junk", "readable"),
+        ("masks.npy", b"junk", "readable"),
+        ("masks.mp4", b"junk", "not read yet"),
+        ("masks/0.png", b"junk", "cannot|can be decoded"),
+        ("masks/0.npy", b"junk", "readable"),
+        ("masks/notes.txt", b"junk", "no masks"),
+    ],
+)
+def test_what_holds_no_masks_is_refused(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    with pytest.raises(BadInput, match=message):
+        open_masks(tmp_path / name.split("/")[0])
+
+
+def test_arrays_that_are_no_masks_are_refused(tmp_path, write):
+    np.savez(tmp_path / "m.npz", masks=np.zeros((3, 40)))
+    with pytest.raises(BadInput, match="no array of masks"):
+        open_masks(tmp_path / "m.npz")
+    with pytest.raises(BadInput, match="NaN"):
+        open_masks(write([np.full((40, 30), np.nan)], suffix=".npy"))
+    with pytest.raises(BadInput, match="There are no masks"):
+        open_masks(tmp_path / "nowhere")
