@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
@@ -18,11 +19,11 @@ from avatar.rig import Rig
 from capture.camera import Camera
 from capture.errors import BadInput
 from export.bake import BakeConfig, bake
+from export.codec import Layout
 from export.errors import ExportRefused
 from export.graph import build_graph
 from export.lattice import FieldAt
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
-from export.codec import Layout
 from export.package import AvatarPackage, write_package
 from export.player import ALIKE, Likeness, Player, premultiplied
 from export.rules import DrawingRules
@@ -93,7 +94,9 @@ def export_avatar(
     occupied = avatar.rendering_grid().occupied.cpu().numpy()
     device = avatar.field.table.device
 
-    def field_at(points):  # noqa: ANN001, ANN202
+    def field_at(
+        points: Float32[torch.Tensor, "points 3"],
+    ) -> tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]]:
         rgb, density = avatar.field_at(points.to(device))
         return rgb.cpu(), density.cpu()
 

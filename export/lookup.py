@@ -35,7 +35,8 @@ def read_bricks(
         other = tables["voxel_green_density"].take(place) * weight
         red_blue = pair if red_blue is None else red_blue + pair
         green_density = other if green_density is None else green_density + other
-    assert red_blue is not None and green_density is not None
+    assert red_blue is not None
+    assert green_density is not None
     low, high = LOG_DENSITY
     code = _upper(green_density)
     density = (code * ((high - low) / (255.0 * FULL)) + low).exp()

@@ -17,10 +17,11 @@ FORMAT = 1
 GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""
 JOINTS = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 "
-    "left_foot right_foot neck left_collar right_collar head left_shoulder right_shoulder "
-    "left_elbow right_elbow left_wrist right_wrist left_hand right_hand"
-).split()
+    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee"),
+    *("spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot"),
+    *("neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
+    *("left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand"),
+)
 CONVENTIONS = {
     "units": "metres, radians, density in 1/m",
     "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",

@@ -1,11 +1,11 @@
-"""The `.iavatar` file: a zip of manifest, graph and compact streams, written whole or not at all."""
+"""The `.iavatar` file: manifest, graph and compact streams in a zip, whole or not at all."""
 
 import hashlib
 import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -182,7 +182,7 @@ def _read(archive: _Archive, tier: str) -> AvatarPackage:
     )
 
 
-def _streams(checked, tier: str, layout: Layout) -> dict[str, bytes]:  # noqa: ANN001
+def _streams(checked: Callable[[str, int], bytes], tier: str, layout: Layout) -> dict[str, bytes]:
     streams = {}
     for name, (dtype, shape) in layout.streams().items():
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize

@@ -13,7 +13,8 @@ class DrawingRules:
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
         footprint_spacings: A footprint's size in surfel spacings at the nearest surfel's depth.
         behind: Cosine up to which a surfel that faces away still covers what is behind it.
-        lead_m: How far in front of the hull a ray's segment begins.
+        lead_m, most_lead_m: How far in front of the hull a ray's segment begins, along the
+            normal, and at most along the ray.
         slack_m: How far the segment's begin may lie from the surfel, along the ray.
         grazing: How much longer a segment is where the ray grazes the hull (× sin²).
         steepest: Least cosine between ray and normal that lengthens a segment.
@@ -28,11 +29,12 @@ class DrawingRules:
     """
 
     layers: int = 2
-    samples: int = 6
+    samples: int = 8
     largest_footprint_px: int = 16
     footprint_spacings: float = 1.4
     behind: float = 0.35
-    lead_m: float = 0.006
+    lead_m: float = 0.005
+    most_lead_m: float = 0.025
     slack_m: float = 0.012
     grazing: float = 1.5
     steepest: float = 0.1

@@ -152,10 +152,12 @@ def _extent(
     shallow = -0.5 * rules.steepest
     hit = dot(normal, to_surfel) / falling.minimum(shallow)
     begin = graph.where(falling < shallow, hit, along)
-    begin = begin.minimum(along + rules.slack_m).maximum(along - rules.slack_m) - rules.lead_m
+    begin = begin.minimum(along + rules.slack_m).maximum(along - rules.slack_m)
+    cosine = (-falling).maximum(rules.steepest)
+    lead = (rules.lead_m / cosine).minimum(rules.most_lead_m)
     sine = 1.0 - falling * falling / dot(direction, direction)
-    length = thickness * (sine * rules.grazing + 1.0) / (-falling).maximum(rules.steepest)
-    return begin, (length + rules.lead_m).minimum(rules.longest_m)
+    length = thickness * (sine * rules.grazing + 1.0) / cosine
+    return begin - lead, (length + lead).minimum(rules.longest_m)
 
 
 def march(

@@ -120,7 +120,7 @@ def initialisers(tables: Tables) -> dict[str, Shaped[np.ndarray, "..."]]:
     """The tables as the graph reads them: one-dimensional columns, two channels to an integer."""
     surfels, bricks = tables.surfels, tables.bricks
     voxels = bricks.voxels.reshape(-1, 4).astype(np.int32)
-    columns: dict[str, Shaped[np.ndarray, "..."]] = {
+    columns = {
         "voxel_red_blue": voxels[:, 0] | voxels[:, 2] << 16,
         "voxel_green_density": voxels[:, 1] | voxels[:, 3] << 16,
         "brick_offset": bricks.index.ravel() * np.int32(NODES**3),

@@ -7,7 +7,7 @@ shares no code with the graph.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Float32, Int64
 
 from export.rules import DrawingRules
 from export.tables import BRICK, DEPTH_STEPS, LOG_DENSITY, NODES, SURFEL_BITS, Bricks, Tables
@@ -143,10 +143,13 @@ def _shade(
     shallow = np.float32(-0.5 * rules.steepest)
     hit = (normal * to_surfel).sum(axis=1) / np.minimum(falling, shallow)
     begin = np.where(falling < shallow, hit, along)
-    begin = np.clip(begin, along - rules.slack_m, along + rules.slack_m) - rules.lead_m
+    begin = np.clip(begin, along - rules.slack_m, along + rules.slack_m)
+    cosine = np.maximum(-falling, rules.steepest)
+    lead = np.minimum(rules.lead_m / cosine, rules.most_lead_m)
+    begin = begin - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
-    length = thickness * (1.0 + rules.grazing * sine) / np.maximum(-falling, rules.steepest)
-    length = np.minimum(length + rules.lead_m, rules.longest_m)
+    length = thickness * (1.0 + rules.grazing * sine) / cosine
+    length = np.minimum(length + lead, rules.longest_m)
 
     picture = np.zeros((len(pixel), 4), dtype=np.float32)
     step = length / shot.samples
@@ -175,7 +178,7 @@ def _derivative(
     gradient = tables.surfels.weight_gradients[surfel]
     full = blended + np.einsum("nki,nak->nia", offset, gradient)
     volume = np.linalg.det(full)
-    sound: Bool[np.ndarray, "pixels"] = (volume > 1 / rules.stretch) & (volume < rules.stretch)
+    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
     return np.where(sound[:, None, None], full, blended)
 
 
@@ -198,7 +201,7 @@ def read(
         [np.ones((len(part), 1)), sorted_part, np.zeros((len(part), 1))], axis=1
     )
     brick = bricks.index[tuple((voxel // BRICK).T)]
-    corner: Int32[np.ndarray, "points 3"] = (voxel % BRICK).astype(np.int32)
+    corner = (voxel % BRICK).astype(np.int32)
     assert corner.max(initial=0) < NODES - 1
     codes = np.zeros((len(points), 4), dtype=np.float32)
     for turn in range(4):
