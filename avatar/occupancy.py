@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 import torch
 from jaxtyping import Float32, Int64, UInt8
+from scipy.ndimage import label
 from torch import Tensor
 
 from avatar.cells import BAND_M
@@ -24,6 +25,8 @@ FIRST_DECAY = 0.7
 OPACITY = 0.02
 """A cell counts as empty when a step through it would be less opaque than this."""
 FIRST_DENSITY = 1e-3
+SPECK = 0.02
+"""Connected pieces smaller than this share of the largest are no part of the person."""
 
 
 @final
@@ -55,6 +58,7 @@ class Occupancy:
         *,
         share: float,
         decay: float = DECAY,
+        drop_specks: bool = False,
         step_m: float,
         generator: torch.Generator,
     ) -> None:
@@ -64,6 +68,8 @@ class Occupancy:
             log_density_at: Log density at canonical points.
             share: How much of the band is probed, in (0, 1].
             decay: What a probed cell keeps of its density.
+            drop_specks: Whether small pieces without contact to the rest are dropped (the paper's
+                code keeps the largest piece alone).
             step_m: Distance between samples along a ray.
             generator: Chooses cells and places.
         """
@@ -72,7 +78,8 @@ class Occupancy:
         flat = self.grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
         bar = min(OPACITY / step_m, float(flat[self.band].mean()))
-        self.grid.occupied.copy_(grown((self.grid.density > bar).to(torch.uint8)) & self._in_band)
+        occupied = grown((self.grid.density > bar).to(torch.uint8)) & self._in_band
+        self.grid.occupied.copy_(without_specks(occupied) if drop_specks else occupied)
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
@@ -105,3 +112,14 @@ def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
         out.narrow(axis, 1, length).bitwise_or_(occupied.narrow(axis, 0, length))
         out.narrow(axis, 0, length).bitwise_or_(occupied.narrow(axis, 1, length))
     return out
+
+
+def without_specks(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+    """The cells without those connected pieces that are small beside the largest."""
+    pieces, count = label(occupied.cpu().numpy())
+    if count < 2:
+        return occupied
+    sizes = np.bincount(pieces.ravel())
+    sizes[0] = 0
+    kept = sizes >= SPECK * sizes.max()
+    return torch.from_numpy(kept[pieces].astype(np.uint8)).to(occupied.device)

@@ -100,6 +100,7 @@ class Trainer:
                 lambda points: field.raw_at(points)[:, 3],
                 share=0.5 if clearing else 0.25,
                 decay=FIRST_DECAY if clearing else DECAY,
+                drop_specks=not clearing,
                 step_m=config.step_m,
                 generator=self._generator,
             )

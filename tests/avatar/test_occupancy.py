@@ -1,0 +1,93 @@
+"""Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten."""
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.occupancy import OPACITY, Occupancy, grown, without_specks
+
+CPU = torch.device("cpu")
+STEP_M = 0.01
+
+
+@pytest.fixture
+def occupancy(rig):
+    return Occupancy(rig, CPU)
+
+
+def shell_at(rig, *, thickness_m):
+    """A log density that is high in a thin sheet across the chest and nothing elsewhere."""
+    middle = float(rig.rest_joints[6, 2]) + 0.05
+
+    def log_density_at(points):
+        return torch.where((points[:, 2] - middle).abs() < thickness_m / 2, 6.0, -20.0)
+
+    return log_density_at, middle
+
+
+def run(occupancy, log_density_at, generator, updates, **kwargs):
+    for _ in range(updates):
+        occupancy.update(
+            log_density_at, share=0.25, step_m=STEP_M, generator=generator, **kwargs
+        )
+
+
+def test_everything_near_the_skin_is_occupied_at_first(rig, occupancy):
+    assert torch.equal(occupancy.grid.occupied.bool(), torch.from_numpy(rig.distance <= 0.08))
+
+
+def test_empty_space_is_given_up(occupancy, generator):
+    run(occupancy, lambda points: torch.full_like(points[:, 0], -20.0), generator, 40)
+    dense = occupancy.grid.density > OPACITY / STEP_M
+    assert not dense.any()
+
+
+def test_a_sheet_thinner_than_a_cell_is_never_forgotten(rig, occupancy, generator):
+    """One probe a cell often misses it; an EMA that decays fast lost it (15 dB)."""
+    log_density_at, middle = shell_at(rig, thickness_m=0.005)
+    run(occupancy, log_density_at, generator, 100)
+    cell = int((middle - rig.box_low[2]) * occupancy.grid.cells_per_m[2])
+    sheet = (rig.distance <= 0.08)[:, :, cell]
+    for _ in range(100):
+        run(occupancy, log_density_at, generator, 1)
+        held = occupancy.grid.occupied[:, :, cell].bool().numpy()[sheet]
+        assert held.mean() > 0.99
+
+
+def test_nothing_is_occupied_far_from_the_skin(rig, occupancy, generator):
+    run(occupancy, lambda points: torch.full_like(points[:, 0], 5.0), generator, 30)
+    assert not occupancy.grid.occupied[torch.from_numpy(rig.distance > 0.08)].any()
+
+
+def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
+    log_density_at, _ = shell_at(rig, thickness_m=0.05)
+    run(occupancy, log_density_at, generator, 60)
+    points = occupancy.empty_points(500, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 500
+    assert not occupancy.grid.occupied[tuple(cell.T)].any()
+    assert (rig.distance[tuple(cell.T.numpy())] <= 0.08).all()
+
+
+def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, generator):
+    assert len(occupancy.empty_points(100, generator)) == 0
+
+
+def test_growing_adds_the_six_neighbours():
+    one = torch.zeros(5, 5, 5, dtype=torch.uint8)
+    one[2, 2, 2] = 1
+    assert int(grown(one).sum()) == 7
+    corner = torch.zeros(3, 3, 3, dtype=torch.uint8)
+    corner[0, 0, 0] = 1
+    assert int(grown(corner).sum()) == 4
+
+
+def test_specks_go_and_large_pieces_stay():
+    occupied = torch.zeros(30, 30, 30, dtype=torch.uint8)
+    occupied[:10] = 1
+    occupied[20:22, 20:30, 20:30] = 1  # a foot without contact: 200 of 9,000 cells
+    occupied[15, 15, 15] = 1
+    kept = without_specks(occupied)
+    assert int(kept.sum()) == int(occupied.sum()) - 1
+    assert kept[15, 15, 15] == 0
+    assert np.isin(kept.numpy(), (0, 1)).all()
