@@ -1,6 +1,7 @@
 """The person in front of the camera: the embedded body, dressed, lit and drawn in any pose."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -80,7 +81,12 @@ class Actor:
         )
         return undone._lit()
 
-    @property
+    @cached_property
+    def _weights(self) -> Float[np.ndarray, "vertices 24"]:
+        """Skinning weights of all layers: those of the body vertices they hang from."""
+        return self.shaped.body.weights[self.source].astype(np.float64)
+
+    @cached_property
     def soles(self) -> Int[np.ndarray, "chosen"]:
         """The vertices of the shoes."""
         return np.unique(self.faces[self.kinds == SHOE])
@@ -89,7 +95,7 @@ class Actor:
         self, pose: BodyPose, chosen: Int[np.ndarray, "chosen"] | slice = slice(None)
     ) -> Float[np.ndarray, "chosen 3"]:
         """Vertices of all layers in the world, metres, skinned with the body's own weights."""
-        weights = self.shaped.body.weights[self.source[chosen]]
+        weights = self._weights[chosen]
         transforms = self.shaped.with_pose(pose).world_from_rest()[:, :3, :].reshape(24, 12)
         blended = (weights @ transforms).reshape(-1, 3, 4)
         return np.einsum("vab,vb->va", blended[..., :3], self.rest[chosen]) + blended[..., 3]

@@ -17,7 +17,7 @@ GROOVE = Gesture(
     shift=(0.07, 0.0),
 )
 WAVE = Gesture(
-    left=Arm(lift=22, forward=12, twist=70, elbow=70),
+    left=Arm(lift=14, forward=12, twist=62, elbow=66),
     right=Arm(lift=-30, forward=10, elbow=20),
     left_leg=STEP,
     right_leg=STEP,
@@ -41,7 +41,7 @@ OPEN = Gesture(
     nod=-8,
 )
 POINT = Gesture(
-    left=Arm(lift=44, forward=10, elbow=6),
+    left=Arm(lift=38, forward=10, elbow=6),
     right=Arm(lift=-46, forward=12, twist=-40, elbow=80),
     left_leg=STEP,
     right_leg=Leg(out=18, forward=4, knee=8),

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+Degrees = float | int
+
 # Rows of `joint_rotations` (joint number - 1).
 HIPS, KNEES, ANKLES = (0, 1), (3, 4), (6, 7)
 SPINE, NECK, HEAD = (2, 5, 8), 11, 14
@@ -28,11 +30,11 @@ class Arm:
         wrist: How far the hand is bent down.
     """
 
-    lift: float = -50.0
-    forward: float = 0.0
-    twist: float = 0.0
-    elbow: float = 12.0
-    wrist: float = 0.0
+    lift: Degrees = -50.0
+    forward: Degrees = 0.0
+    twist: Degrees = 0.0
+    elbow: Degrees = 12.0
+    wrist: Degrees = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +49,11 @@ class Leg:
         heel: Heel lifted; else the sole stays level.
     """
 
-    forward: float = 0.0
-    out: float = 6.0
-    knee: float = 0.0
-    turn: float = 4.0
-    heel: float = 0.0
+    forward: Degrees = 0.0
+    out: Degrees = 6.0
+    knee: Degrees = 0.0
+    turn: Degrees = 4.0
+    heel: Degrees = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,13 +74,13 @@ class Gesture:
     right: Arm = field(default_factory=Arm)
     left_leg: Leg = field(default_factory=Leg)
     right_leg: Leg = field(default_factory=Leg)
-    bow: float = 0.0
-    lean: float = 0.0
-    turn: float = 0.0
-    nod: float = 0.0
-    tilt: float = 0.0
-    look: float = 0.0
-    yaw: float = 0.0
+    bow: Degrees = 0.0
+    lean: Degrees = 0.0
+    turn: Degrees = 0.0
+    nod: Degrees = 0.0
+    tilt: Degrees = 0.0
+    look: Degrees = 0.0
+    yaw: Degrees = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
     hop: float = 0.0
 
@@ -127,6 +129,6 @@ def _put_leg(vectors: Float[np.ndarray, "23 3"], leg: Leg, side: int, sign: floa
     vectors[ANKLES[side]] = _vector("xz", leg.forward - leg.knee + leg.heel, -sign * leg.out)
 
 
-def _vector(axes: str, *degrees: float) -> Float[np.ndarray, "3"]:
+def _vector(axes: str, *degrees: Degrees) -> Float[np.ndarray, "3"]:
     """Axis-angle of turns about the world's axes; the first named is the outermost."""
     return Rotation.from_euler(axes.upper(), degrees, degrees=True).as_rotvec().reshape(3)

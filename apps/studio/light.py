@@ -27,7 +27,7 @@ def bake(
     place: Float32[np.ndarray, "vertices 3"],
     kinds: Int32[np.ndarray, "faces"],
     cut: Float32[np.ndarray, "cuts"],
-    directions: int = 48,
+    directions: int = 32,
 ) -> Float32[np.ndarray, "vertices 3"]:
     """Light on each vertex as a factor of its colour, about 0.45 in folds to 1.15 in the lamp."""
     sky = np.zeros((len(points), 3))

@@ -23,6 +23,6 @@ def roughened(
     )
     away -= np.where(inside > 0, 0.5, -0.5)  # from pixel centres to the border between them
     white = generator.standard_normal(alpha.shape).astype(np.float32)
-    wander = cv2.GaussianBlur(white, (0, 0), GRAIN_PX, borderType=cv2.BORDER_WRAP)
+    wander = cv2.GaussianBlur(white, (0, 0), GRAIN_PX, borderType=cv2.BORDER_REFLECT_101)
     wander *= noise_px * 2.0 * np.sqrt(np.pi) * GRAIN_PX  # a blur leaves 1 / (2 √π σ)
     return np.clip(away + wander + 0.5, 0.0, 1.0).astype(np.float32)
