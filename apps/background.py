@@ -1,0 +1,59 @@
+"""What stands behind an avatar: a colour by its name, or a picture."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import ImageColor
+
+from capture.errors import BadInput
+from capture.images import read_image
+
+Blend = Callable[[UInt8[np.ndarray, "height width 4"]], UInt8[np.ndarray, "height width 3"]]
+
+
+def background(wish: str) -> Blend:
+    """A function that puts pictures with straight alpha on a background.
+
+    Args:
+        wish: A colour ("white", "#203040", "rgb(10, 20, 30)") or the path of a picture, which is
+            cropped in the middle to the shape that is needed.
+
+    Raises:
+        BadInput: If it is neither.
+    """
+    try:
+        color = np.array(ImageColor.getrgb(wish)[:3], dtype=np.uint8)
+    except ValueError:
+        color = None
+    if color is not None:
+        return lambda rgba: _over(rgba, np.broadcast_to(color, (*rgba.shape[:2], 3)))
+    path = Path(wish)
+    if not path.is_file():
+        raise BadInput(
+            f"--background {wish} is neither a colour (white, #203040) nor a picture that is there."
+        )
+    picture, _ = read_image(path)
+    return lambda rgba: _over(rgba, _covering(picture, rgba.shape[1], rgba.shape[0]))
+
+
+def _over(
+    rgba: UInt8[np.ndarray, "height width 4"], behind: UInt8[np.ndarray, "height width 3"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    alpha = rgba[..., 3:].astype(np.uint16)
+    mixed = rgba[..., :3] * alpha + behind * (255 - alpha) + 127
+    return (mixed // 255).astype(np.uint8)
+
+
+def _covering(
+    picture: UInt8[np.ndarray, "_ _ 3"], width: int, height: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    rows, columns = picture.shape[:2]
+    scale = max(width / columns, height / rows)
+    wide, high = max(width, round(columns * scale)), max(height, round(rows * scale))
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    scaled = cv2.resize(picture, (wide, high), interpolation=how)
+    left, top = (wide - width) // 2, (high - height) // 2
+    return scaled[top : top + height, left : left + width]

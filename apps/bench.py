@@ -1,0 +1,113 @@
+"""How fast the player draws, beside a fixed little graph that says how fast the machine is."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import onnxruntime
+from onnx import TensorProto, helper
+
+from capture.camera import Camera
+from export.player import Player
+from preprocess.pose import BodyPose
+
+WARM_UP = 3
+FEWEST = 10
+"""Pictures that are timed at least; short motions are repeated."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Cost of a picture: kinematics, graph and 8-bit output, without decoding or encoding.
+
+    Attributes:
+        tier: Of the package.
+        size: Longer side, pixels.
+        frames: How many were timed.
+        pixels_covered: Share of the picture with any alpha, mean.
+        cpu_ms_per_frame, wall_ms_per_frame: Mean.
+        load_ms: Opening the package, wall.
+        reference_ms: CPU time of one run of the reference graph, median.
+        provider: onnxruntime's execution provider.
+        format: Of this record.
+    """
+
+    tier: str
+    size: int
+    frames: int
+    pixels_covered: float
+    cpu_ms_per_frame: float
+    wall_ms_per_frame: float
+    load_ms: float
+    reference_ms: float
+    provider: str = "CPUExecutionProvider"
+    format: int = 1
+
+    def to_json(self) -> str:
+        """The figures, rounded."""
+        content = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
+        return json.dumps({"format": content.pop("format"), **content}, indent=1) + "\n"
+
+
+def benchmark(
+    player: Player, shots: Sequence[tuple[BodyPose, Camera]], *, load_ms: float
+) -> Benchmark:
+    """Draws every shot, after a few to warm up."""
+    shots = list(shots) * -(-FEWEST // len(shots))
+    for pose, camera in shots[:WARM_UP]:
+        player.render(pose, camera)
+    covered = 0.0
+    wall, cpu = time.perf_counter(), time.process_time()
+    for pose, camera in shots:
+        picture = player.render(pose, camera)
+        covered += float(np.count_nonzero(picture[..., 3])) / picture[..., 3].size
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return Benchmark(
+        tier="hq",
+        size=max(shots[0][1].size_px),
+        frames=len(shots),
+        pixels_covered=covered / len(shots),
+        cpu_ms_per_frame=1000.0 * cpu / len(shots),
+        wall_ms_per_frame=1000.0 * wall / len(shots),
+        load_ms=load_ms,
+        reference_ms=_reference_ms(_reference_graph()),
+    )
+
+
+def _reference_graph() -> onnxruntime.InferenceSession:
+    """GatherElements, MatMul and ScatterElements of fixed sizes; its numbers are meaningless."""
+    nodes = [
+        helper.make_node("GatherElements", ["table", "places"], ["taken"], axis=0),
+        helper.make_node("MatMul", ["taken", "matrix"], ["product"]),
+        helper.make_node(
+            "ScatterElements", ["table", "places", "product"], ["out"], axis=0, reduction="min"
+        ),
+    ]
+    shapes = {"table": [1 << 15, 16], "matrix": [16, 16]}
+    inputs = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items()]
+    inputs.append(helper.make_tensor_value_info("places", TensorProto.INT64, [1 << 15, 16]))
+    outputs = [helper.make_tensor_value_info("out", TensorProto.FLOAT, [1 << 15, 16])]
+    graph = helper.make_graph(nodes, "reference", inputs, outputs)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def _reference_ms(session: onnxruntime.InferenceSession, runs: int = 9) -> float:
+    rng = np.random.default_rng(0)
+    inputs = {
+        "table": rng.standard_normal((1 << 15, 16)).astype(np.float32),
+        "matrix": rng.standard_normal((16, 16)).astype(np.float32),
+        "places": rng.integers(0, 1 << 15, (1 << 15, 16)),
+    }
+    times = []
+    for _ in range(runs + 1):
+        started = time.process_time()
+        session.run(None, inputs)
+        times.append(time.process_time() - started)
+    return 1000.0 * float(np.median(times[1:]))  # the first one warms up

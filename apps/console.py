@@ -1,0 +1,118 @@
+"""What a command says while it works: a live line on a terminal, plain lines in a log."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import final
+
+from rich.console import Console as RichConsole
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+MOST_WARNINGS = 5
+"""Warnings that are printed; the rest are counted, and all stand in the report."""
+LOG_EVERY_S = 10.0
+
+
+@final
+class Console:
+    """Messages on stderr, so that stdout stays free for what was made.
+
+    Attributes:
+        warnings: Every warning so far.
+    """
+
+    def __init__(self, console: RichConsole | None = None) -> None:
+        """A console on stderr, unless another is given."""
+        self._rich = console or RichConsole(stderr=True, soft_wrap=True)
+        self.warnings: list[str] = []
+
+    @property
+    def live(self) -> bool:
+        """Whether somebody watches."""
+        return self._rich.is_terminal
+
+    def say(self, message: str) -> None:
+        """A line."""
+        self._rich.print(escape(message), highlight=False)
+
+    def made(self, what: str, path: object) -> None:
+        """A line that names a file that is there now."""
+        self._rich.print(f"  [green]{escape(what):<12}[/] {escape(str(path))}", highlight=False)
+
+    def warn(self, message: str) -> None:
+        """Something the user should know; the same is never said twice."""
+        if message in self.warnings:
+            return
+        self.warnings.append(message)
+        if len(self.warnings) <= MOST_WARNINGS:
+            self._rich.print(f"[yellow]warning:[/] {escape(message)}", highlight=False)
+
+    def count_the_rest(self) -> None:
+        """Says how many warnings were kept back."""
+        rest = len(self.warnings) - MOST_WARNINGS
+        if rest > 0:
+            self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report")
+
+    @contextmanager
+    def waiting(self, message: str) -> Iterator[None]:
+        """Something that takes a moment: a spinner on a terminal, a line in a log."""
+        if not self.live:
+            self.say(message)
+            yield
+            return
+        with self._rich.status(escape(message)):
+            yield
+
+    def bar(self, label: str, total: float) -> "Bar":
+        """A progress bar; use it in a `with` block."""
+        return Bar(self._rich, label, total)
+
+
+@final
+class Bar:
+    """How far something has come: a bar on a terminal, now and then a line in a log."""
+
+    def __init__(self, console: RichConsole, label: str, total: float) -> None:
+        """Called by `Console.bar`."""
+        self._console, self._label, self._total = console, label, total
+        self._progress: Progress | None = None
+        self._task = TaskID(0)
+        self._said_at = time.perf_counter()
+        self._drawn_at = 0.0
+
+    def __enter__(self) -> "Bar":
+        """Shows it."""
+        if self._console.is_terminal:
+            self._progress = Progress(
+                TextColumn("[bold]{task.description}"),
+                BarColumn(bar_width=28),
+                TextColumn("{task.fields[note]}"),
+                console=self._console,
+                transient=True,
+            )
+            self._progress.start()
+            self._task = self._progress.add_task(self._label, total=self._total, note="")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Takes it away."""
+        if self._progress is not None:
+            self._progress.stop()
+
+    def move(self, done: float, note: str) -> None:
+        """So far, and a few words; cheap enough to call at every step."""
+        now = time.perf_counter()
+        if self._progress is not None:
+            if now - self._drawn_at > 0.1:
+                self._drawn_at = now
+                self._progress.update(self._task, completed=done, note=escape(note))
+        elif now - self._said_at >= LOG_EVERY_S:
+            self._said_at = now
+            self._console.print(f"{self._label}: {escape(note)}", highlight=False)

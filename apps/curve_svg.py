@@ -1,0 +1,81 @@
+"""The learning curve as an SVG that takes its colours from the page."""
+
+from collections.abc import Callable, Sequence
+
+from apps.report import CurvePoint
+
+WIDTH, HEIGHT = 720, 300
+LEFT, RIGHT, TOP, BOTTOM = 46, 16, 14, 34
+"""Room around the plot for its labels."""
+
+Place = Callable[[float], float]
+
+
+def curve_svg(curve: Sequence[CurvePoint]) -> str:
+    """PSNR of held-out frames over seconds of training: whole picture, and inside the mask.
+
+    An empty string if nothing was measured.
+    """
+    whole = [(p.wall_seconds, p.psnr) for p in curve if p.psnr is not None]
+    masked = [(p.wall_seconds, p.psnr_mask) for p in curve if p.psnr_mask is not None]
+    if not whole:
+        return ""
+    values = [value for _, value in whole + masked]
+    low, high = 5.0 * (min(values) // 5.0), 5.0 * (max(values) // 5.0 + 1.0)
+    end = max(seconds for seconds, _ in whole)
+
+    def x(seconds: float) -> float:
+        return LEFT + (WIDTH - LEFT - RIGHT) * seconds / max(end, 1e-6)
+
+    def y(decibels: float) -> float:
+        return TOP + (HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low)
+
+    parts = [
+        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
+        'aria-label="PSNR of held-out frames over seconds of training">',
+        *_axes(x, y, low, high, end),
+        *_line(masked, x, y, "masked", "inside the mask"),
+        *_line(whole, x, y, "whole", "whole picture"),
+        "</svg>",
+    ]
+    return "\n".join(parts)
+
+
+def _axes(x: Place, y: Place, low: float, high: float, end: float) -> list[str]:
+    parts = [
+        f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y(decibels):.1f}" '
+        f'y2="{y(decibels):.1f}"/>'
+        f'<text class="tick" x="{LEFT - 8}" y="{y(decibels) + 4:.1f}" text-anchor="end">'
+        f"{decibels}</text>"
+        for decibels in range(int(low), int(high) + 1, 5)
+    ]
+    parts += [
+        f'<text class="tick" x="{x(seconds):.1f}" y="{HEIGHT - 12}" text-anchor="middle">'
+        f"{seconds:g}</text>"
+        for seconds in _ticks(end)
+    ]
+    parts.append(f'<text class="unit" x="{LEFT}" y="{TOP - 3}" text-anchor="middle">dB</text>')
+    parts.append(
+        f'<text class="unit" x="{WIDTH - RIGHT}" y="{HEIGHT - 1}" text-anchor="end">'
+        "seconds of training</text>"
+    )
+    return parts
+
+
+def _ticks(end: float) -> list[float]:
+    step = next((s for s in (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0) if end / s <= 8.0), 300.0)
+    return [step * i for i in range(int(end / step) + 1)]
+
+
+def _line(
+    points: list[tuple[float, float]], x: Place, y: Place, kind: str, label: str
+) -> list[str]:
+    if not points:
+        return []
+    path = " ".join(f"{x(seconds):.1f},{y(value):.1f}" for seconds, value in points)
+    dots = [
+        f'<circle class="{kind}" cx="{x(seconds):.1f}" cy="{y(value):.1f}" r="4">'
+        f"<title>{seconds:.1f} s: {value:.2f} dB {label}</title></circle>"
+        for seconds, value in points
+    ]
+    return [f'<polyline class="{kind}" points="{path}"/>', *dots]

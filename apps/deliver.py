@@ -1,0 +1,221 @@
+"""What a trained avatar leaves on disk: the package, report.json and report.html."""
+
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from apps.console import Console
+from apps.follow import FollowingCamera
+from apps.learn import Learnt
+from apps.novel import novel_motion
+from apps.pictures import data_uri, eight_bit, moving_data_uri
+from apps.recording import Recording
+from apps.report import (
+    FramesNote,
+    HeldOutNote,
+    MachineNote,
+    PackageNote,
+    Report,
+    StreamNote,
+    TrainingNote,
+)
+from apps.report_page import Pair, report_page
+from apps.run_folder import RunFolder
+from apps.whole import write_text
+from avatar.hold import on_white, spread, truth_on_white
+from avatar.render import render
+from capture.camera import Camera
+from export.build import ExportReport, export_avatar
+from export.errors import ExportRefused
+from export.player import Player
+from preprocess.observe import shrunk
+from preprocess.pose import BodyPose
+
+CHECKED_VIEWS = 4
+SHOWN_PAIRS = 6
+NOVEL_PX = 320
+NOVEL_FPS = 16.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunNote:
+    """What only the command knows.
+
+    Attributes:
+        command: The arguments, as given.
+        startup_seconds: From the start of the command to the first frame.
+        threads: Of torch and numba.
+    """
+
+    command: dict[str, Any]
+    startup_seconds: float
+    threads: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delivered:
+    """What was written.
+
+    Attributes:
+        report: As in report.json.
+        refused: Why there is no package, if there is none.
+    """
+
+    report: Report
+    refused: str | None
+
+
+def deliver(
+    learnt: Learnt, recording: Recording, run: RunFolder, note: RunNote, console: Console
+) -> Delivered:
+    """Writes the package, then the report, then the page; each whole or not at all.
+
+    Raises:
+        OSError: If the disk is full; what was written before stays.
+    """
+    held = HeldOutNote.of(learnt.scores, learnt.meter.size_px if learnt.scores else None)
+    package, refused, ready_at = None, None, None
+    try:
+        with console.waiting("baking the avatar and checking its player"):
+            metrics = {"held_out": asdict(held), "recipe": asdict(learnt.trainer.config)}
+            exported = export_avatar(
+                learnt.trainer.avatar, run.package, views=views(learnt, recording), metrics=metrics
+            )
+        ready_at = time.perf_counter()
+        for warning in exported.warnings:
+            console.warn(warning)
+        package = _package_note(exported, run)
+    except ExportRefused as error:
+        run.package.unlink(missing_ok=True)  # a resumed run's older avatar would contradict
+        refused = str(error)
+    report = _report(learnt, recording, note, held, package, ready_at)
+    write_text(run.report, report.to_json())
+    with console.waiting("drawing the report"):
+        page = report_page(
+            report,
+            name=recording.paths.video.name,
+            pairs=pairs(learnt),
+            novel=None if package is None else novel(Player.load(run.package)),
+            warnings=console.warnings if refused is None else [*console.warnings, refused],
+        )
+    write_text(run.page, page)
+    return Delivered(report=report, refused=refused)
+
+
+def views(learnt: Learnt, recording: Recording) -> Sequence[tuple[BodyPose, Camera]]:
+    """Poses and cameras to check the player with: held-out frames, else the first valid pose."""
+    seen = [frame.observation for frame in spread(learnt.held, CHECKED_VIEWS)]
+    if seen:
+        return [(observation.pose, observation.camera) for observation in seen]
+    row = int(np.flatnonzero(recording.motion.valid)[0])
+    size = shrunk(recording.source.size_px, recording.size_px)
+    return [(recording.motion[row], recording.cameras[0].resized(size))]
+
+
+def pairs(learnt: Learnt) -> list[Pair]:
+    """Held-out frames beside what the avatar shows, for the page."""
+    shown = []
+    scores = {score.frame: score for score in learnt.scores}
+    for held in spread(learnt.held, SHOWN_PAIRS):
+        observation = held.observation
+        if observation.frame.index not in scores:
+            continue
+        picture = render(
+            learnt.trainer.avatar, observation.pose, observation.camera, cells=held.cells
+        )
+        shown.append(
+            Pair(
+                frame=observation.frame.index,
+                psnr=scores[observation.frame.index].psnr,
+                truth=data_uri(eight_bit(truth_on_white(observation))),
+                render=data_uri(eight_bit(on_white(picture))),
+            )
+        )
+    return shown
+
+
+def novel(player: Player) -> str:
+    """The avatar in a motion of our own, drawn by the player, as a moving picture."""
+    motion = novel_motion(fps=NOVEL_FPS)
+    camera = FollowingCamera.of(player, motion, NOVEL_PX)
+    poses = [motion[row] for row in range(len(motion))]
+    return moving_data_uri([player.render(p, camera.at(p)) for p in poses], fps=NOVEL_FPS)
+
+
+def _package_note(exported: ExportReport, run: RunFolder) -> PackageNote:
+    return PackageNote(
+        path=run.package.name,
+        bytes=exported.bytes,
+        seconds=exported.seconds,
+        psnr_to_renderer={"hq": None, "lite": None, **exported.psnr_to_renderer},
+    )
+
+
+def _report(
+    learnt: Learnt,
+    recording: Recording,
+    note: RunNote,
+    held: HeldOutNote,
+    package: PackageNote | None,
+    ready_at: float | None,
+) -> Report:
+    trainer, meter = learnt.trainer, learnt.meter
+    dropped = tuple(meter.dropped)
+    recipe = asdict(trainer.config) | {
+        "camera": recording.cameras.source,
+        "body": recording.shaped.body.family,
+        "pose_model": recording.motion.model,
+    }
+    ready = None
+    if ready_at is not None and meter.first_at is not None:
+        ready = ready_at - (meter.first_at + meter.last_time_s)
+    return Report(
+        command=note.command,
+        recipe=recipe,
+        machine=MachineNote(
+            device=trainer.avatar.field.table.device.type,
+            backend=trainer.backend.name,
+            threads=note.threads,
+        ),
+        frames=FramesNote(
+            read=learnt.added + len(learnt.held) + len(dropped),
+            used=learnt.added,
+            held_out=len(learnt.held),
+            dropped=dropped,
+            not_replayed=learnt.added - len(trainer.replay),
+        ),
+        training=_training_note(learnt, note),
+        held_out=held,
+        curve=learnt.curve,
+        stream=StreamNote(
+            realtime=False,
+            ingest_ms=meter.ingest_ms(),
+            inbox_dropped=0,
+            ready_after_last_frame_seconds=ready,
+        ),
+        package=package,
+    )
+
+
+def _training_note(learnt: Learnt, note: RunNote) -> TrainingNote:
+    trainer = learnt.trainer
+    return TrainingNote(
+        wall_seconds=trainer.wall_seconds,
+        cpu_seconds=trainer.cpu_seconds,
+        startup_seconds=note.startup_seconds,
+        steps=trainer.steps,
+        rays=trainer.rays,
+        rays_per_second=trainer.rays / max(trainer.wall_seconds, 1e-6),
+        samples_per_ray=trainer.samples / max(trainer.rays, 1),
+        peak_memory_mb=_peak_memory_mb(),
+    )
+
+
+def _peak_memory_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)

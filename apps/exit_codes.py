@@ -1,0 +1,85 @@
+"""How a command ends: one number for each kind of end, one message for each kind of failure."""
+
+import errno
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.markup import escape
+
+from capture.errors import BadInput
+
+DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM, INTERRUPTED = 0, 1, 2, 3, 130
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""The disk, the quota, or the largest size that a file may have."""
+FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR})
+BUSY = ("out of memory", "busy or unavailable", "not enough memory")
+"""What torch says of a device that cannot be used now."""
+
+
+class Stop(Exception):  # noqa: N818 - an end, not always an error
+    """Ends the command with a message and an exit code."""
+
+    def __init__(self, message: str, code: int) -> None:
+        """An end that is known and said."""
+        super().__init__(message)
+        self.code = code
+
+
+def exit_code(program: str, work: Callable[[], int]) -> int:
+    """Runs a command's work; what a user or a machine can cause becomes one message and a number.
+
+    Bad input is 2, a full disk or a busy device 3, Ctrl-C 130. Our own bugs keep their traceback.
+
+    Args:
+        program: The command's name, in front of the message.
+        work: Returns its own exit code.
+    """
+    try:
+        return work()
+    except Stop as end:
+        code, message = end.code, str(end)
+    except BadInput as error:
+        code, message = BAD_INPUT, str(error)
+    except KeyboardInterrupt as error:
+        code, message = INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
+    except (OSError, RuntimeError, MemoryError) as error:
+        failure = _of_the_machine(error)
+        if failure is None:
+            raise
+        code, message = failure[0], _with_notes(failure[1], error)
+    complain(program, message)
+    return code
+
+
+def complain(program: str, message: str) -> None:
+    """One message on stderr."""
+    console = Console(stderr=True, soft_wrap=True)
+    console.print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
+
+
+def is_full(error: OSError) -> bool:
+    """Whether a write failed for want of room."""
+    return error.errno in FULL
+
+
+def _of_the_machine(error: OSError | RuntimeError | MemoryError) -> tuple[int, str] | None:
+    """Exit code and message of what the machine could not do; None for everything else."""
+    if isinstance(error, OSError):
+        why = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+        if is_full(error):
+            return NO_ROOM, f"the disk is full ({why})."
+        if error.errno == errno.EBUSY:
+            return NO_ROOM, f"a device is busy ({why})."
+        if error.errno in FORBIDDEN:
+            return BAD_INPUT, f"cannot read or write there ({why}). Name another place."
+        return None
+    said = str(error).strip() or "out of memory"
+    if isinstance(error, MemoryError) or any(words in said.lower() for words in BUSY):
+        first = said.splitlines()[0]
+        return NO_ROOM, f"the device has no room or is busy ({first}). Try a smaller --size."
+    return None
+
+
+def _with_notes(message: str, error: BaseException) -> str:
+    return " ".join([message, *getattr(error, "__notes__", [])])

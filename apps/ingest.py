@@ -1,0 +1,167 @@
+"""ia-ingest: a recorded video of one person walks in, an avatar walks out."""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from apps.console import Console
+from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
+from apps.ingest_arguments import IngestArguments
+from apps.recording import Recording
+from apps.run_folder import RunFolder
+from capture.errors import BadInput
+
+if TYPE_CHECKING:  # torch is loaded after --help has been answered
+    import torch
+
+    from apps.deliver import Delivered
+    from apps.learn import Learnt
+    from avatar.train import Trainer
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    given = tyro.cli(IngestArguments, prog="ia-ingest", args=arguments)
+    return exit_code("ia-ingest", lambda: ingest(given, Console()))
+
+
+def ingest(given: IngestArguments, console: Console) -> int:
+    """Does what the arguments say.
+
+    Raises:
+        BadInput: If the input cannot be used; nothing was written then.
+        OSError: If the disk is full; the newest checkpoint is kept.
+        Stop: If there is no avatar to show.
+    """
+    started = time.perf_counter()
+    given.check()
+    run = given.run_folder()
+    run.check(resume=given.resume, overwrite=given.overwrite)
+    recording = given.recording()
+    console.say(_described(recording))
+    for note in recording.notes:
+        console.warn(note)
+    with console.waiting("loading torch"):
+        from apps.deliver import RunNote, deliver
+        from apps.interrupt import asked_to_stop
+        from apps.learn import Lesson
+        from apps.threads import use_threads
+
+    threads = use_threads(given.threads)
+    trainer, recall, notes = _trainer(given, recording, run, console)
+    _warm_up(trainer, console)
+    run.begin(resume=given.resume)
+    with asked_to_stop(console) as stop:
+        lesson = Lesson(trainer, recording, run, console, stop, notes)
+        learnt = lesson.learn(recall=recall)
+        _check_learnt(learnt, recording)
+        note = RunNote(
+            command=given.as_json(),
+            startup_seconds=(learnt.meter.first_at or started) - started,
+            threads=threads,
+        )
+        delivered = deliver(learnt, recording, run, note, console)
+        if given.json is not None:
+            from apps.whole import write_text
+
+            write_text(given.json, delivered.report.to_json())
+        return _conclude(delivered, run, console, interrupted=stop.is_set())
+
+
+def _described(recording: Recording) -> str:
+    source, size = recording.source, recording.source.size_px
+    count = "frames" if source.frame_count is None else f"{source.frame_count} frames"
+    return (
+        f"{recording.paths.video}: {count} of {size[0]}x{size[1]} px, {len(recording.motion)} "
+        f"poses, body {recording.shaped.body.family}, camera: {recording.cameras.source}"
+    )
+
+
+def _device(wish: str) -> "torch.device":
+    import torch
+
+    if wish == "cuda" and not torch.cuda.is_available():
+        raise BadInput(
+            "--device cuda was asked for, but torch sees no GPU here. Leave --device out, or "
+            "install torch with CUDA and check nvidia-smi."
+        )
+    wanted = wish != "cpu" and torch.cuda.is_available()
+    return torch.device("cuda" if wanted else "cpu")
+
+
+def _trainer(
+    given: IngestArguments, recording: Recording, run: RunFolder, console: Console
+) -> "tuple[Trainer, int, dict[str, Any]]":
+    """The trainer, how many frames it has seen of this video, and what checkpoints keep."""
+    from apps.learn import new_trainer
+    from avatar import checkpoint
+
+    device, video = _device(given.device), str(recording.source.path.resolve())
+    if given.resume and not run.has_checkpoint():
+        console.say(f"There is no checkpoint in {run.path}: starting afresh.")
+    if not (given.resume and run.has_checkpoint()):
+        trainer = new_trainer(recording, seconds=given.seconds, seed=given.seed, device=device)
+        return trainer, 0, {"video": video}
+    trainer, notes = checkpoint.load(run.checkpoint, device)
+    had = trainer.wall_seconds
+    if notes.get("video") == video:
+        console.say(f"Going on after {had:.0f} seconds of training.")
+        if had >= given.seconds:
+            console.warn(
+                f"The run has had {had:.0f} of {given.seconds:.0f} seconds; only its package and "
+                "report are written again. Give more --seconds to go on learning."
+            )
+        trainer.config = replace(trainer.config, seconds=given.seconds)
+        return trainer, trainer.frames_seen, notes
+    console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
+    trainer.config = replace(trainer.config, seconds=had + given.seconds)
+    return trainer, 0, {**notes, "video": video}
+
+
+def _warm_up(trainer: "Trainer", console: Console) -> None:
+    from avatar.warm import warm_up
+
+    with console.waiting("compiling kernels (slow on the first run only)"):
+        warm_up(trainer)
+
+
+def _check_learnt(learnt: "Learnt", recording: Recording) -> None:
+    """Raises if there is nothing to write."""
+    if learnt.trained:
+        return
+    if learnt.interrupted:
+        raise Stop("stopped before anything was learnt; nothing was written.", INTERRUPTED)
+    reasons = Counter(drop.reason for drop in learnt.meter.dropped)
+    told = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))
+    raise Stop(
+        f"no frame of {recording.source.path} could be used ({told or 'it has none'}); at least "
+        "two usable frames were expected. Nothing was written.",
+        BAD_INPUT,
+    )
+
+
+def _conclude(
+    delivered: "Delivered", run: RunFolder, console: Console, *, interrupted: bool
+) -> int:
+    """Names what was made."""
+    held = delivered.report.held_out
+    score = "nothing was held out" if held.psnr is None else f"held out {held.psnr:.2f} dB"
+    seconds = delivered.report.training.wall_seconds
+    console.say(f"Learnt for {seconds:.1f} s, {delivered.report.training.steps} steps; {score}.")
+    if delivered.refused is None:
+        console.made("package", run.package)
+    console.made("report", run.report)
+    console.made("look at it", run.page)
+    console.made("checkpoint", run.checkpoint)
+    if delivered.refused is not None:
+        raise Stop(delivered.refused, INTERRUPTED if interrupted else NO_PACKAGE)
+    return INTERRUPTED if interrupted else DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

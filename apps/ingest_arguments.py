@@ -1,0 +1,126 @@
+"""What ia-ingest can be told; the text under each field is its --help."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional
+
+from apps.recording import Recording, RecordingPaths
+from apps.run_folder import RunFolder
+from capture.errors import BadInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestArguments:
+    """Learns an avatar from a video of one person while the video is read.
+
+    Try it:
+
+        ia-ingest video.mp4 --poses poses.npz --out run
+
+    `run` then holds avatar.iavatar (play it: ia-play), report.json, report.html (look at it) and
+    checkpoint/. Masks and cameras are looked for beside the video, then beside the poses, as
+    masks/ and cameras.npz; of a capture folder everything is found inside.
+
+    Exit codes: 0 done; 1 learnt, but too blurred for a package; 2 bad input; 3 full disk or busy
+    device, the checkpoint is kept; 130 Ctrl-C, after checkpoint and package were written.
+    """
+
+    video: Positional[Path]
+    """Video file, folder of pictures, or capture folder."""
+    poses: Path | None = None
+    """SMPL poses, one a frame: an .npz with global_orient, body_pose, transl (or poses, trans)."""
+    masks: Path | None = None
+    """Masks, one a frame: a folder of pictures, or an .npz; 255 where the person is."""
+    mask_invert: Annotated[bool, FlagCreatePairsOff] = False
+    """The person is dark in the masks. Without either flag that is found out."""
+    no_mask_invert: Annotated[bool, FlagCreatePairsOff] = False
+    """The person is bright in the masks."""
+    cameras: str | None = None
+    """A cameras.npz (intrinsic, extrinsic: one, or one a frame), or `static`: it never moved and
+    nobody knows its focal length."""
+    body: Path | None = None
+    """Your own SMPL body, .npz or .pkl (nothing in it is executed); else the embedded body."""
+    out: Path | None = None
+    """Folder for the run; without it runs/NAME, after the video."""
+    resume: Annotated[bool, FlagCreatePairsOff] = False
+    """Go on with the run in --out: with the same video after an interruption, or with another."""
+    overwrite: Annotated[bool, FlagCreatePairsOff] = False
+    """Replace the run in --out."""
+    seconds: float = 60.0
+    """How long you will wait: seconds of training, after start-up."""
+    size: int | None = None
+    """Longer side of the pictures in pixels; they are never enlarged."""
+    frames: str = "::"
+    """Which frames, START:STOP:STEP, counted from 0."""
+    no_refine_poses: Annotated[bool, FlagCreatePairsOff] = False
+    """Keep the poses as they are given. (This version always does.)"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to train; auto takes a GPU if there is one."""
+    threads: int | None = None
+    """Threads of the trainer; without it one for each core."""
+    seed: int = 0
+    """Of everything random."""
+    json: Path | None = None
+    """Write a copy of report.json to this file."""
+
+    def check(self) -> None:
+        """Refuses numbers out of their range.
+
+        Raises:
+            BadInput: Naming the option.
+        """
+        if not 0.0 < self.seconds < float("inf"):
+            raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+        if self.size is not None and self.size < 16:
+            raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
+        if self.threads is not None and self.threads < 1:
+            raise BadInput(f"--threads is {self.threads}; at least 1 was expected.")
+        if self.seed < 0:
+            raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
+        if self.mask_invert and self.no_mask_invert:
+            raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
+
+    def run_folder(self) -> RunFolder:
+        """Where the run lies."""
+        name = self.video.resolve()
+        return RunFolder(
+            path=self.out or Path("runs") / (name.name if name.is_dir() else name.stem)
+        )
+
+    def recording(self) -> Recording:
+        """Opens what the arguments name."""
+        invert = True if self.mask_invert else False if self.no_mask_invert else None
+        wanted = RecordingPaths(
+            video=self.video,
+            poses=self.poses,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parsed_frames(self.frames),
+            mask_invert=invert,
+        )
+        return Recording.open(wanted, size_px=self.size)
+
+    def as_json(self) -> dict[str, Any]:
+        """The arguments as report.json keeps them."""
+        return {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in vars(self).items()
+        }
+
+
+def parsed_frames(text: str) -> slice | None:
+    """START:STOP:STEP as a slice; None for all frames.
+
+    Raises:
+        BadInput: If it is something else.
+    """
+    if not re.fullmatch(r"\d*(:\d*){0,2}", text) or ":" not in text:
+        raise BadInput(
+            f"--frames is {text!r}; expected START:STOP:STEP counted from 0, as in 0:120:2 or 30:."
+        )
+    parts = [int(part) if part else None for part in text.split(":")]
+    return None if not any(part is not None for part in parts) else slice(*parts)

@@ -1,0 +1,222 @@
+"""The walk from a recording to a trained avatar: feeds the trainer, listens, keeps checkpoints."""
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, final
+
+import torch
+
+from apps.console import Bar, Console
+from apps.exit_codes import is_full
+from apps.meter import Meter
+from apps.recording import Recording
+from apps.report import CurvePoint, mean
+from apps.run_folder import RunFolder
+from avatar import checkpoint
+from avatar.config import TrainConfig
+from avatar.events import Evaluated, Score, Stepped, TrainEvent, Warned
+from avatar.hold import HeldOut, prepared, score
+from avatar.prepare import PreparedFrame
+from avatar.rig import Rig
+from avatar.train import Trainer, train
+from capture.inbox import Inbox
+from preprocess.observe import Dropped
+
+CHECKPOINT_EVERY_S = 10.0
+
+Item = PreparedFrame | HeldOut | Dropped
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Learnt:
+    """What training leaves in memory.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        scores: Of each of them, at the end.
+        curve: Scores on the way, and at the end.
+        meter: What it saw of the stream.
+        added: Frames that were put into the trainer's memory in this run.
+        interrupted: Whether Ctrl-C ended it.
+    """
+
+    trainer: Trainer
+    held: list[HeldOut]
+    scores: tuple[Score, ...]
+    curve: tuple[CurvePoint, ...]
+    meter: Meter
+    added: int
+    interrupted: bool
+
+    @property
+    def trained(self) -> bool:
+        """Whether there is anything to show."""
+        return self.trainer.steps > 0 and self.added > 0
+
+
+def new_trainer(
+    recording: Recording, *, seconds: float, seed: int, device: torch.device
+) -> Trainer:
+    """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
+    config = TrainConfig.within(seconds, footprint_m=recording.footprint_m(), seed=seed)
+    return Trainer(Rig.of(recording.shaped), config, device)
+
+
+@final
+class Lesson:
+    """One recording taught to one trainer."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        recording: Recording,
+        run: RunFolder,
+        console: Console,
+        stop: threading.Event,
+        notes: dict[str, Any],
+    ) -> None:
+        """Nothing happens yet.
+
+        Args:
+            trainer: New, or from a checkpoint.
+            recording: Its frames are read anew.
+            run: Where checkpoints go.
+            console: Where progress is shown.
+            stop: Ends training as soon as it is set.
+            notes: Kept with each checkpoint.
+        """
+        self._trainer, self._recording, self._run = trainer, recording, run
+        self._console, self._stop, self._notes = console, stop, notes
+        self._curve: list[CurvePoint] = [CurvePoint(**point) for point in notes.get("curve", [])]
+        self._held: list[HeldOut] = []
+        self._saved_at = time.perf_counter()
+        self.meter = Meter(stop)
+
+    def learn(self, *, recall: int = 0) -> Learnt:
+        """Trains until the time is up or somebody stops it; then scores every held-out frame.
+
+        Args:
+            recall: Frames that the trainer has learnt from before: they are put back into its
+                memory before the clock starts.
+
+        Raises:
+            OSError: If a checkpoint cannot be written; the one before stays.
+        """
+        inbox = Inbox(self._frames())
+        try:
+            added = self._recall(inbox, recall) - self._trainer.frames_seen
+            self._saved_at = time.perf_counter()
+            with self._console.bar("learning", self._trainer.config.seconds) as bar:
+                for event in train(self._trainer, inbox, self._held):
+                    self._listen(event, bar)
+                    if self._stop.is_set():
+                        break
+        finally:
+            inbox.close()
+        interrupted = self._stop.is_set()
+        for warning in self._recording.source.warnings:
+            self._console.warn(warning)
+        self._console.count_the_rest()
+        if len(self._trainer.replay):
+            self._save()
+        scores = self._final_scores()
+        return Learnt(
+            trainer=self._trainer,
+            held=self._held,
+            scores=scores,
+            curve=tuple(self._curve),
+            meter=self.meter,
+            added=added + self._trainer.frames_seen,
+            interrupted=interrupted,
+        )
+
+    def _frames(self) -> Iterator[Item]:
+        """Frames as they become ready; runs on the inbox's thread."""
+        observations = self.meter.watched(self._recording.observations())
+        rig, every = self._trainer.avatar.rig, self._trainer.config.hold_every
+        total = self._recording.source.frame_count
+        return self.meter.timed(prepared(observations, rig, every=every, total=total))
+
+    def _recall(self, inbox: Inbox[Item], count: int) -> int:
+        """Puts frames back into the memory of a trainer that has learnt from them before."""
+        seen = 0
+        if not count:
+            return seen
+        with self._console.waiting(f"reading back {count} frames"):
+            while seen < count and not (inbox.finished or self._stop.is_set()):
+                for item in inbox.take(wait_s=0.1):
+                    if isinstance(item, HeldOut):
+                        self._held.append(item)
+                    elif isinstance(item, PreparedFrame):
+                        self._trainer.replay.add(item)
+                        seen += 1
+        return seen
+
+    def _listen(self, event: TrainEvent, bar: Bar) -> None:
+        match event:
+            case Stepped():
+                bar.move(event.wall_seconds, self._progress(event))
+                if time.perf_counter() - self._saved_at > CHECKPOINT_EVERY_S:
+                    self._save()
+            case Evaluated():
+                point = self._mark(event.scores)
+                if point.psnr is not None:
+                    self._console.say(f"{event.wall_seconds:6.1f} s   {point.psnr:.2f} dB")
+            case Warned(message=message):
+                self._console.warn(message)
+
+    def _progress(self, event: Stepped) -> str:
+        config = self._trainer.config
+        psnr = self._curve[-1].psnr if self._curve else None
+        rays = self._trainer.rays / max(event.wall_seconds, 1e-6)
+        parts = [
+            f"{event.wall_seconds:.0f}/{config.seconds:.0f} s",
+            f"{event.frames_seen} frames",
+            f"step {event.step}",
+            f"{rays / 1000.0:.0f}k rays/s",
+        ]
+        return " · ".join(parts if psnr is None else [*parts, f"held out {psnr:.1f} dB"])
+
+    def _mark(self, scores: tuple[Score, ...]) -> CurvePoint:
+        trainer = self._trainer
+        point = CurvePoint(
+            wall_seconds=trainer.wall_seconds,
+            cpu_seconds=trainer.cpu_seconds,
+            frames_seen=trainer.frames_seen,
+            psnr=mean([s.psnr for s in scores]),
+            psnr_mask=mean([s.psnr_mask for s in scores]),
+        )
+        self._curve.append(point)
+        return point
+
+    def _final_scores(self) -> tuple[Score, ...]:
+        if not (self._held and len(self._trainer.replay)):
+            return ()
+        with self._console.waiting(f"scoring {len(self._held)} held-out frames"):
+            scores = tuple(score(self._trainer.avatar, held) for held in self._held)
+        last = self._curve[-1].wall_seconds if self._curve else -1.0
+        if self._trainer.wall_seconds > last:
+            self._mark(scores)
+        return scores
+
+    def _save(self) -> None:
+        notes = {**self._notes, "curve": [vars(point) for point in self._curve]}
+        try:
+            checkpoint.save(self._trainer, self._run.checkpoint, notes=notes)
+        except OSError as error:
+            if error.errno is None or is_full(error):
+                error.add_note(_what_is_kept(self._run))
+            raise
+        self._saved_at = time.perf_counter()
+
+
+def _what_is_kept(run: RunFolder) -> str:
+    if not run.has_checkpoint():
+        return "Nothing could be saved. Make room and start again."
+    return (
+        f"The checkpoint of a few seconds ago is kept in {run.checkpoint}: make room, then run "
+        "the same command with --resume."
+    )

@@ -1,0 +1,137 @@
+"""All that is known about a video before its first frame is read, checked together."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capture.errors import BadInput
+from capture.source import Source, open_source
+from preprocess.body import Body, ShapedBody
+from preprocess.camera_file import CameraTrack, default_cameras, read_cameras
+from preprocess.capture_folder import CapturePaths, find_capture
+from preprocess.masks import Masks, open_masks
+from preprocess.observation import Observation
+from preprocess.observe import Dropped, observe
+from preprocess.pose import Motion
+from preprocess.pose_file import read_motion
+from preprocess.shape import betas_for
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingPaths:
+    """What the user named; the rest is looked for (see `find_capture`).
+
+    Attributes:
+        video: Video file, folder of pictures, or capture folder.
+        poses, masks: Files or folders, or None.
+        cameras: A file, "static", or None.
+        body: A body file; None for the embedded body.
+        frames: Which frames are wanted.
+        mask_invert: Whether the person is dark in the masks; None finds out.
+    """
+
+    video: Path
+    poses: Path | None = None
+    masks: Path | None = None
+    cameras: str | None = None
+    body: Path | None = None
+    frames: slice | None = None
+    mask_invert: bool | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """A video of one person, with everything that belongs to it.
+
+    Attributes:
+        paths: Where its parts lie.
+        source: The frames.
+        motion: The poses.
+        masks: The masks; None if the pictures have an alpha channel.
+        cameras: The cameras, of the frames' size.
+        shaped: The person's body.
+        size_px: Longer side that training sees; None for the frames' own.
+        notes: What a user should know about how the parts were read.
+    """
+
+    paths: CapturePaths
+    source: Source
+    motion: Motion
+    masks: Masks | None
+    cameras: CameraTrack
+    shaped: ShapedBody
+    size_px: int | None
+    notes: tuple[str, ...]
+
+    @classmethod
+    def open(cls, wanted: RecordingPaths, *, size_px: int | None = None) -> "Recording":
+        """Finds, opens and checks the parts.
+
+        Raises:
+            BadInput: If one is missing or unreadable, or they do not fit together.
+        """
+        paths = find_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
+        source = open_source(paths.video, frames=wanted.frames)
+        body = Body.load(wanted.body)
+        motion = read_motion(paths.poses, default_model=body.family)
+        masks = None
+        if paths.masks is not None:
+            masks = open_masks(paths.masks, invert=wanted.mask_invert)
+        if paths.cameras is not None:
+            cameras = read_cameras(paths.cameras, source.size_px)
+        else:
+            cameras = default_cameras(motion, source.size_px)
+        recording = cls(
+            paths=paths,
+            source=source,
+            motion=motion,
+            masks=masks,
+            cameras=cameras,
+            shaped=body.with_shape(betas_for(body, motion)),
+            size_px=size_px,
+            notes=tuple(_notes(body, motion, masks, cameras)),
+        )
+        recording.observations()  # the parts are checked together, and no frame is read yet
+        recording.footprint_m()
+        return recording
+
+    def observations(self) -> Iterator[Observation | Dropped]:
+        """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
+        return observe(self.source, self.motion, self.masks, self.cameras, size_px=self.size_px)
+
+    def footprint_m(self) -> float:
+        """What one pixel covers on the body: the dial of the field's resolution.
+
+        Raises:
+            BadInput: If the person is behind the camera.
+        """
+        pelvis = self.shaped.joints[0] + self.motion.root_translations[self.motion.valid]
+        camera = self.cameras[0]
+        depths = pelvis @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        depth = float(np.median(depths))
+        if depth <= 0.0:
+            raise BadInput(
+                f"The person is {-depth:.2f} m behind the camera; poses were expected in the "
+                "camera's world, in metres, with OpenCV axes (x right, y down, z forward). "
+                "Do poses and cameras come from the same run?"
+            )
+        longer = max(camera.size_px)
+        shrinking = min(1.0, (self.size_px or longer) / longer)
+        return depth / (max(camera.focal_px) * shrinking)
+
+
+def _notes(body: Body, motion: Motion, masks: Masks | None, cameras: CameraTrack) -> Iterator[str]:
+    if cameras.note is not None:
+        yield cameras.note
+    if masks is not None and masks.inverted:
+        yield f"The masks in {masks.path} show the background; they were turned."
+    if motion.model != body.family:
+        yield (
+            f"The poses were made for the body model {motion.model!r}, but {body.family!r} is used "
+            "(--body): the shape is the mean one, and the joints sit a few centimetres off."
+        )
+    lost = len(motion) - int(motion.valid.sum())
+    if lost:
+        yield f"{lost} of {len(motion)} poses are not valid; their frames are left out."

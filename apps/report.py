@@ -1,0 +1,195 @@
+"""report.json: what a run was given, what it did and how well it came out."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from avatar.events import Score
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineNote:
+    """What it ran on: device ("cpu", "cuda"), backend of the kernels, threads."""
+
+    device: str
+    backend: str
+    threads: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class DroppedNote:
+    """A frame that was left out, and why."""
+
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesNote:
+    """What became of the frames.
+
+    Attributes:
+        read: Frames that came out of the video.
+        used: Trained on.
+        held_out: Scored, and never trained on.
+        dropped: Left out.
+        not_replayed: Trained on when they came, but not among the key frames that stayed.
+    """
+
+    read: int
+    used: int
+    held_out: int
+    dropped: tuple[DroppedNote, ...]
+    not_replayed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingNote:
+    """What training cost.
+
+    Attributes:
+        wall_seconds: From the first frame handed to the trainer to the last step.
+        cpu_seconds: CPU time of the whole process in that time.
+        startup_seconds: Before it: imports, reading and checking, kernels.
+        steps, rays: How much was done.
+        rays_per_second: By the wall clock.
+        samples_per_ray: Mean.
+        peak_memory_mb: Of the process, so far.
+    """
+
+    wall_seconds: float
+    cpu_seconds: float
+    startup_seconds: float
+    steps: int
+    rays: int
+    rays_per_second: float
+    samples_per_ray: float
+    peak_memory_mb: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutNote:
+    """How well frames are rendered that were never trained on, on white.
+
+    Attributes:
+        frames: Their numbers in the video.
+        size: Width and height in pixels.
+        psnr: Mean of the frames' PSNR over the whole picture, dB; null if nothing was scored.
+        psnr_mask: The same over alpha > 0.5.
+        ssim: Mean.
+        lpips: Not measured.
+        background: What alpha was blended with.
+        poses: Which poses the frames were rendered in.
+    """
+
+    frames: tuple[int, ...]
+    size: tuple[int, int] | None
+    psnr: float | None
+    psnr_mask: float | None
+    ssim: float | None
+    lpips: float | None = None
+    background: str = "white"
+    poses: str = "given"
+
+    @classmethod
+    def of(cls, scores: tuple[Score, ...], size: tuple[int, int] | None) -> "HeldOutNote":
+        """From the scores of the single frames."""
+        return cls(
+            frames=tuple(score.frame for score in scores),
+            size=size,
+            psnr=mean([score.psnr for score in scores]),
+            psnr_mask=mean([score.psnr_mask for score in scores]),
+            ssim=mean([score.ssim for score in scores]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurvePoint:
+    """How well held-out frames were rendered at some second of training."""
+
+    wall_seconds: float
+    cpu_seconds: float
+    frames_seen: int
+    psnr: float | None
+    psnr_mask: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Milliseconds:
+    """A spread of durations."""
+
+    p50: float
+    p95: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamNote:
+    """How the video kept pace.
+
+    Attributes:
+        realtime: Whether it was played at its own speed.
+        ingest_ms: From decoding to ready for training, per frame.
+        inbox_dropped: Frames that gave way in the inbox.
+        ready_after_last_frame_seconds: From the end of the video, had it been filmed from the
+            first frame on, to the finished package; null without a package.
+    """
+
+    realtime: bool
+    ingest_ms: Milliseconds
+    inbox_dropped: int
+    ready_after_last_frame_seconds: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackageNote:
+    """The package, beside the report, and how close its player is to the volume renderer."""
+
+    path: str
+    bytes: int
+    seconds: float
+    psnr_to_renderer: dict[str, float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """All of it. `package` is None if none was written."""
+
+    command: dict[str, Any]
+    recipe: dict[str, Any]
+    machine: MachineNote
+    frames: FramesNote
+    training: TrainingNote
+    held_out: HeldOutNote
+    curve: tuple[CurvePoint, ...]
+    stream: StreamNote
+    package: PackageNote | None
+    held_out_refined: HeldOutNote | None = None
+    format: int = FORMAT
+
+    def to_json(self) -> str:
+        """The text of report.json; what is not a number is null."""
+        content = _plain(dataclasses.asdict(self))
+        order = ("format", "command", "recipe", "machine", "frames", "training", "held_out")
+        order += ("held_out_refined", "curve", "stream", "package")
+        return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
+
+
+def mean(values: list[float]) -> float | None:
+    """The mean of the finite ones; None if there are none."""
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of a sensible length, and null for NaN and infinity."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return round(value, 6) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,172 @@
+"""report.html: one page without a second file, that shows what report.json says."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+from apps.curve_svg import curve_svg
+from apps.report import Report
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """A held-out frame: what the video shows, and what the avatar shows.
+
+    Attributes:
+        frame: Its number in the video.
+        psnr: Of the whole picture, dB.
+        truth, render: Pictures as addresses.
+    """
+
+    frame: int
+    psnr: float
+    truth: str
+    render: str
+
+
+def report_page(
+    report: Report,
+    *,
+    name: str,
+    pairs: Sequence[Pair] = (),
+    novel: str | None = None,
+    warnings: Sequence[str] = (),
+) -> str:
+    """The page.
+
+    Args:
+        report: The figures.
+        name: Of the video, for the heading.
+        pairs: Held-out frames, to look at.
+        novel: A moving picture of poses that the video does not show, as an address.
+        warnings: What the user was told.
+    """
+    style = (files("apps") / "report_page.css").read_text(encoding="utf-8")
+    body = "\n".join(
+        [
+            f"<h1>{escape(name)}</h1>",
+            f'<p class="lead">{escape(_lead(report))}</p>',
+            _tiles(report),
+            _section("How it learnt", _curve(report)),
+            _section("Frames it was never trained on", _pairs(pairs)),
+            _section("Poses that the video does not show", _novel(novel)),
+            _section("Worth knowing", _warnings(report, warnings)),
+            _section("All figures", _figures(report)),
+            "<footer>Written by ia-ingest of instant-avatar-stream. The same figures for machines: "
+            "report.json. Play the avatar: <code>ia-play avatar.iavatar --poses P</code></footer>",
+        ]
+    )
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(name)}: avatar</title>\n<style>\n{style}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _lead(report: Report) -> str:
+    training = report.training
+    return (
+        f"An avatar from {report.frames.used} frames, learnt in {training.wall_seconds:.0f} "
+        f"seconds on {report.machine.threads} thread(s) of this {report.machine.device}."
+    )
+
+
+def _tiles(report: Report) -> str:
+    held, package = report.held_out, report.package
+    tiles = [
+        (_number(held.psnr, "dB"), "held-out PSNR, on white"),
+        (_number(held.psnr_mask, "dB"), "inside the mask"),
+        (_number(held.ssim, "", digits=3), "SSIM"),
+        (f"{report.training.steps:,}", "steps"),
+        (f"{report.training.rays_per_second / 1000.0:,.0f} k", "rays a second"),
+        (f"{package.bytes / 1e6:.1f} MB" if package else "none", "package"),
+    ]
+    cells = (
+        f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles
+    )
+    return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _number(value: float | None, unit: str, *, digits: int = 2) -> str:
+    return "n/a" if value is None else f"{value:.{digits}f} {unit}".strip()
+
+
+def _section(heading: str, content: str) -> str:
+    return f"<h2>{heading}</h2>\n{content}" if content else ""
+
+
+def _curve(report: Report) -> str:
+    svg = curve_svg(report.curve)
+    if not svg:
+        return ""
+    return (
+        f'<div class="card">{svg}<p class="legend">PSNR of held-out frames'
+        '<i style="background:var(--whole)"></i>whole picture'
+        '<i style="background:var(--masked)"></i>inside the mask</p></div>'
+    )
+
+
+def _pairs(pairs: Sequence[Pair]) -> str:
+    figures = (
+        f'<figure><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
+        f'<img src="{pair.render}" alt="frame {pair.frame} rendered"></div>'
+        f"<figcaption>frame {pair.frame}: video | avatar, {pair.psnr:.2f} dB</figcaption></figure>"
+        for pair in pairs
+    )
+    return f'<div class="pairs">{"".join(figures)}</div>' if pairs else ""
+
+
+def _novel(novel: str | None) -> str:
+    if novel is None:
+        return ""
+    return (
+        f'<figure class="novel"><img src="{novel}" alt="the avatar in poses of its own">'
+        "<figcaption>Drawn by the player, from the package</figcaption></figure>"
+    )
+
+
+def _warnings(report: Report, warnings: Sequence[str]) -> str:
+    told = list(warnings)
+    reasons: dict[str, list[int]] = {}
+    for drop in report.frames.dropped:
+        reasons.setdefault(drop.reason, []).append(drop.index)
+    told = [w for w in told if not w.startswith("Frame ")]
+    for reason, frames in reasons.items():
+        told.append(f"Left out, {reason}: frame {', '.join(str(frame) for frame in frames)}.")
+    items = "".join(f"<li>{escape(message)}</li>" for message in told)
+    return f'<ul class="warnings">{items}</ul>' if items else ""
+
+
+def _figures(report: Report) -> str:
+    content = asdict(report)
+    shown = ("frames", "training", "held_out", "stream", "package", "machine")
+    tables = [f'<div class="card"><table>{_rows({key: content[key] for key in shown})}</table>']
+    for key, heading in (("recipe", "The recipe"), ("command", "The command")):
+        rows = _rows(content[key])
+        tables.append(f"<details><summary>{heading}</summary><table>{rows}</table></details>")
+    return "".join(tables) + "</div>"
+
+
+def _rows(content: Mapping[str, Any]) -> str:
+    return "".join(
+        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
+        for name, value in _flat(content)
+    )
+
+
+def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Names with dots and what they hold, in words; lists of records are left out."""
+    for key, value in content.items():
+        name = f"{before}{key}".replace("_", " ")
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{key}.")
+        elif isinstance(value, list | tuple):
+            if not (value and isinstance(value[0], Mapping)):
+                yield name, ", ".join(str(item) for item in value) or "none"
+        elif isinstance(value, float):
+            yield name, f"{value:,.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+        else:
+            yield name, "n/a" if value is None else str(value)
