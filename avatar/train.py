@@ -143,7 +143,8 @@ def train(
         What happens, on the caller's thread: what the caller does with an event takes training
         time.
     """
-    config, clock = trainer.config, None
+    config = trainer.config
+    clock = Clock(trainer) if len(trainer.replay) else None  # a resumed run remembers frames
     arrived_at: float | None = None
     marks = _marks(after=trainer.wall_seconds)
     mark = next(marks)
