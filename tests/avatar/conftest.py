@@ -1,11 +1,19 @@
 """Stand-ins for the avatar's tests: a rig, poses, and small hash levels."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import torch
 
+from apps.studio import motions
+from apps.studio.actor import Actor
+from apps.studio.framing import framed
 from avatar.levels import HashLevels
 from avatar.rig import Rig
+from capture.frame import Frame
+from preprocess.observation import Observation
+from preprocess.pose import BodyPose
 
 
 @pytest.fixture(scope="session")
@@ -38,3 +46,31 @@ def bent_pose() -> np.ndarray:
     rotations[0] = -0.6, 0.0, 0.1
     rotations[3] = 0.9, 0.0, 0.0
     return rotations
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clip:
+    """The studio's actor, turning once: observations, and a pose that was never filmed."""
+
+    observations: list[Observation]
+    novel: Observation
+
+
+@pytest.fixture(scope="session")
+def clip() -> Clip:
+    actor = Actor.of(1, 0)
+    camera = framed(actor, 72)
+
+    def observed(index: int, pose: BodyPose) -> Observation:
+        rgb, alpha = actor.picture(pose, camera)
+        frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
+        return Observation(
+            frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera
+        )
+
+    filmed = motions.turn(actor, frames=24, fps=30.0, turns=1.0, seed=0)
+    novel = motions.novel(actor)
+    return Clip(
+        observations=[observed(i, filmed[i]) for i in range(len(filmed))],
+        novel=observed(100, novel[0]),
+    )

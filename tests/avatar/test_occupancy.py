@@ -27,9 +27,7 @@ def shell_at(rig, *, thickness_m):
 
 def run(occupancy, log_density_at, generator, updates, **kwargs):
     for _ in range(updates):
-        occupancy.update(
-            log_density_at, share=0.25, step_m=STEP_M, generator=generator, **kwargs
-        )
+        occupancy.update(log_density_at, share=0.25, step_m=STEP_M, generator=generator, **kwargs)
 
 
 def test_everything_near_the_skin_is_occupied_at_first(rig, occupancy):

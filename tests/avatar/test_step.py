@@ -1,0 +1,117 @@
+"""The step's hand-written gradient against autograd of its meaning, and against differences."""
+
+import math
+
+import pytest
+import torch
+
+from avatar import step as step_module
+from avatar.config import TrainConfig
+from avatar.kernels import reference
+from avatar.kernels.backend import Marching, Samples, TorchBackend
+from avatar.kernels.cpu import NumbaBackend
+from avatar.prepare import prepare
+from avatar.step import cosine, gradients
+from avatar.train import Trainer
+
+CONFIG = TrainConfig(
+    rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
+    empty_weight=0.3, hard_weight=0.1, most_samples=256,
+)  # fmt: skip
+
+
+@pytest.fixture
+def trainer(rig, clip):
+    trainer = Trainer(rig, CONFIG, torch.device("cpu"))
+    for observation in clip.observations[:4]:
+        trainer.add(prepare(observation, rig))
+    for _ in range(40):
+        trainer.step(rate=1.0, hard_share=1.0)
+    return trainer
+
+
+def mean_loss(trainer, parameters, samples, empty, batch, background):
+    """The whole loss of a step, differentiable, in whatever precision the parameters have."""
+    table, first, first_bias, second, second_bias = parameters
+    points = torch.cat([samples.points, empty]).to(table.dtype)
+    features = reference.encode(points, table, trainer.avatar.field.levels)
+    hidden = torch.relu(features @ first + first_bias)
+    raw = hidden @ second + second_bias
+    count = len(samples.points)
+    rendered = reference.composite(raw[:count], samples.first, samples.count, CONFIG.step_m)
+    loss = reference.loss_per_ray(
+        rendered, batch.target.to(table.dtype), background.to(table.dtype),
+        CONFIG.alpha_weight, CONFIG.hard_weight,
+    ).mean()  # fmt: skip
+    density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
+    emptiness = 1.0 - torch.exp(-density * step_module.EMPTY_STEP_M)
+    return loss + CONFIG.empty_weight * emptiness.mean()
+
+
+def one_step(trainer, backend):
+    """Gradients of a step, and everything random that went into it."""
+    field, occupancy = trainer.avatar.field, trainer.avatar.occupancy
+    field.backend = backend
+    batch = trainer.replay.draw(CONFIG.rays, torch.Generator().manual_seed(3))
+    generator = torch.Generator().manual_seed(4)
+    field.table.grad.zero_()
+    gradients(
+        field, occupancy, trainer.replay.cells, batch, CONFIG,
+        hard_share=1.0, remember=False, generator=generator,
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(4)
+    how = Marching(CONFIG.step_m, CONFIG.grace_m, CONFIG.most_samples)
+    samples = NumbaBackend().march(batch.rays, trainer.replay.cells, occupancy.grid, how)
+    empty = occupancy.empty_points(CONFIG.empty_points, generator)
+    background = torch.rand(len(batch.target), 3, generator=generator)
+    grads = [parameter.grad.clone() for parameter in field.parameters()]
+    return grads, (samples, empty, batch, background)
+
+
+@pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
+def test_the_steps_gradient_is_that_of_autograd(trainer, backend):
+    grads, drawn = one_step(trainer, backend)
+    parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
+    expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
+    if backend.name == "torch":  # its own samples may differ on a cell's wall
+        tolerance = 2e-3
+    else:
+        tolerance = 1e-5
+    for ours, theirs in zip(grads, expected, strict=True):
+        assert float((ours - theirs).abs().max()) <= tolerance * float(theirs.abs().max())
+
+
+def test_the_whole_loss_changes_as_its_gradient_says(trainer):
+    """Central differences in double precision, along random directions in every parameter."""
+    grads, drawn = one_step(trainer, NumbaBackend())
+    parameters = [p.detach().double() for p in trainer.avatar.field.parameters()]
+    generator = torch.Generator().manual_seed(5)
+    for place in range(len(parameters)):
+        direction = torch.randn(parameters[place].shape, generator=generator).double()
+        size = 1e-5 / float(direction.norm())
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = list(parameters)
+            moved[place] = parameters[place] + sign * size * direction
+            sides.append(float(mean_loss(trainer, moved, *drawn)))
+        measured = (sides[0] - sides[1]) / (2.0 * size)
+        predicted = float((grads[place].double() * direction).sum())
+        scale = float(grads[place].norm() * direction.norm()) / math.sqrt(direction.numel())
+        assert measured == pytest.approx(predicted, abs=2e-2 * scale)
+
+
+def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
+    """Rays that miss everything: no crash, and no gradient but that of emptiness."""
+    trainer.avatar.occupancy.grid.occupied.zero_()
+    (_, first, *_), (samples, empty, batch, background) = one_step(trainer, NumbaBackend())
+    assert isinstance(samples, Samples)
+    assert len(samples.points) == 0
+    assert torch.isfinite(first).all()
+    assert len(batch.target) == CONFIG.rays == len(background)
+    assert len(empty) == CONFIG.empty_points
+
+
+def test_the_learning_rate_falls_from_one_to_a_twentieth():
+    assert cosine(-1.0) == cosine(0.0) == 1.0
+    assert cosine(0.5) == pytest.approx(0.5)
+    assert cosine(1.0) == cosine(2.0) == 0.05
