@@ -55,11 +55,12 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
-    except (OSError, RuntimeError) as error:
+    except RuntimeError as error:  # torch stumbles once more after the disk has failed
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
+    finally:
         part.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise
-        raise OSError(f"The checkpoint could not be written to {folder}: {error}") from error
     return path
 
 
