@@ -1,7 +1,10 @@
 """The one way in which this project compiles Python to machine code."""
 
+import functools
+import hashlib
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -11,10 +14,26 @@ def compile_kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..
     """A decorator: `numba.njit(**options)` with the machine code kept on disk (`cache=True`).
 
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
-    wrapper; so the function is unwrapped first.
+    wrapper; so the function is unwrapped first. Numba recompiles when the function's own file has
+    changed, but not when a kernel that it calls lies in another; so here the kept code belongs to
+    the sources of the whole folder.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        return numba.njit(**{"cache": True, **options})(inspect.unwrap(function))
+        plain = inspect.unwrap(function)
+        kernel = numba.njit(**{"cache": True, **options})(plain)
+        file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+        if hasattr(file, "_source_stamp"):
+            file._source_stamp = _sources(Path(plain.__code__.co_filename).parent)
+        return kernel
 
     return decorate
+
+
+@functools.cache
+def _sources(folder: Path) -> str:
+    """A digest of every source in a folder."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
