@@ -1,8 +1,11 @@
 """Pictures to a clip or a folder of frames, whole or not at all."""
 
 import errno
+import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -92,6 +95,7 @@ def _write_gif(path: Path, pictures: Iterator[Rgb], fps: float) -> int:
 
 def _write_video(path: Path, pictures: Iterator[Rgb], fps: float, code: str) -> int:
     silence_opencv()
+    path.write_bytes(bytes(1 << 16))  # OpenCV does not say that there is no room; Python does
     writer, count = None, 0
     try:
         for picture in pictures:
@@ -99,9 +103,13 @@ def _write_video(path: Path, pictures: Iterator[Rgb], fps: float, code: str) -> 
             if writer is None:
                 size_px = (even.shape[1], even.shape[0])
                 fourcc = cv2.VideoWriter.fourcc(*code)
-                writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size_px)
+                with _quiet():
+                    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size_px)
                 if not writer.isOpened():
-                    raise OSError(errno.EIO, f"OpenCV cannot write {code}", str(path))
+                    raise BadInput(
+                        f"This OpenCV cannot write {code} video. Choose another of "
+                        f"{', '.join(CLIPS)}, or a folder of frames."
+                    )
             writer.write(np.ascontiguousarray(even[..., ::-1]))
             count += 1
     finally:
@@ -109,6 +117,20 @@ def _write_video(path: Path, pictures: Iterator[Rgb], fps: float, code: str) -> 
             writer.release()
     _check_video(path, count)
     return count
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps FFmpeg from saying on stderr that WebM names its codecs in another way."""
+    sys.stderr.flush()
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 def _even(picture: Rgb) -> Rgb:

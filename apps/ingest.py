@@ -12,8 +12,10 @@ import tyro
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
 from apps.ingest_arguments import IngestArguments
+from apps.interrupt import asked_to_stop
 from apps.recording import Recording
 from apps.run_folder import RunFolder
+from apps.whole import write_text
 from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
@@ -48,29 +50,29 @@ def ingest(given: IngestArguments, console: Console) -> int:
         console.warn(note)
     with console.waiting("loading torch"):
         from apps.deliver import RunNote, deliver
-        from apps.interrupt import asked_to_stop
         from apps.learn import Lesson
         from apps.threads import use_threads
 
-    threads = use_threads(given.threads)
+        threads = use_threads(given.threads)
     trainer, recall, notes = _trainer(given, recording, run, console)
     _warm_up(trainer, console)
     run.begin(resume=given.resume)
-    with asked_to_stop(console) as stop:
-        lesson = Lesson(trainer, recording, run, console, stop, notes)
-        learnt = lesson.learn(recall=recall)
-        _check_learnt(learnt, recording)
-        note = RunNote(
-            command=given.as_json(),
-            startup_seconds=(learnt.meter.first_at or started) - started,
-            threads=threads,
-        )
-        delivered = deliver(learnt, recording, run, note, console)
-        if given.json is not None:
-            from apps.whole import write_text
-
-            write_text(given.json, delivered.report.to_json())
-        return _conclude(delivered, run, console, interrupted=stop.is_set())
+    try:
+        with asked_to_stop(console) as stop:
+            lesson = Lesson(trainer, recording, run, console, stop, notes)
+            learnt = lesson.learn(recall=recall)
+            _check_learnt(learnt, recording)
+            startup = (learnt.meter.first_at or started) - started
+            note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
+            delivered = deliver(learnt, recording, run, note, console)
+            if given.json is not None:
+                write_text(given.json, delivered.report.to_json())
+            return _conclude(delivered, run, console, interrupted=stop.is_set())
+    except (OSError, KeyboardInterrupt) as error:
+        error.add_note(run.what_is_kept())
+        raise
+    finally:
+        run.tidy()
 
 
 def _described(recording: Recording) -> str:

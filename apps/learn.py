@@ -9,7 +9,6 @@ from typing import Any, final
 import torch
 
 from apps.console import Bar, Console
-from apps.exit_codes import is_full
 from apps.meter import Meter
 from apps.recording import Recording
 from apps.report import CurvePoint, mean
@@ -204,19 +203,5 @@ class Lesson:
 
     def _save(self) -> None:
         notes = {**self._notes, "curve": [vars(point) for point in self._curve]}
-        try:
-            checkpoint.save(self._trainer, self._run.checkpoint, notes=notes)
-        except OSError as error:
-            if error.errno is None or is_full(error):
-                error.add_note(_what_is_kept(self._run))
-            raise
+        checkpoint.save(self._trainer, self._run.checkpoint, notes=notes)
         self._saved_at = time.perf_counter()
-
-
-def _what_is_kept(run: RunFolder) -> str:
-    if not run.has_checkpoint():
-        return "Nothing could be saved. Make room and start again."
-    return (
-        f"The checkpoint of a few seconds ago is kept in {run.checkpoint}: make room, then run "
-        "the same command with --resume."
-    )

@@ -1,6 +1,7 @@
 """Where a run lies on disk, and whether there is one already."""
 
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,3 +74,18 @@ class RunFolder:
             file.unlink(missing_ok=True)
         if self.checkpoint.is_dir():
             shutil.rmtree(self.checkpoint)
+
+    def what_is_kept(self) -> str:
+        """What a user can do after a run has failed half-way."""
+        if not self.has_checkpoint():
+            return f"Nothing was written to {self.path}."
+        return (
+            f"The newest checkpoint is kept in {self.checkpoint}: run the same command with "
+            "--resume to go on from it."
+        )
+
+    def tidy(self) -> None:
+        """Removes folders that nothing was written to."""
+        for folder in (self.checkpoint, self.path):
+            with suppress(OSError):  # it is not empty, or not there
+                folder.rmdir()
