@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Float32, Int8, Int32, UInt8, UInt16
 from scipy import ndimage
 
 from avatar.rig import Rig
-from capture.errors import BadInput
-from export.hull import DEEPEST_M, Hull, find_hull
+from export.errors import ExportRefused
+from export.hull import Hull, find_hull
 from export.lattice import FAINTEST, FieldAt, Lattice, read_field
 from export.tables import (
     BRICK,
@@ -27,7 +27,7 @@ GRADIENT_STEP_M = 0.01
 """Half the distance over which the skinning weights are differentiated."""
 FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
-MARGIN_M = 0.016
+MARGIN_M = 0.012
 """Bricks reach this far outside of the hull."""
 
 
@@ -62,7 +62,7 @@ def bake(
         config: How finely.
 
     Raises:
-        BadInput: If there is nothing to be seen in the field.
+        ExportRefused: If there is nothing to be seen in the field.
     """
     config = config or BakeConfig()
     lattice = read_field(field_at, rig, occupied, config.voxel_m)
@@ -81,9 +81,9 @@ def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
     """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
     visible = lattice.density[lattice.density > FAINTEST]
     if visible.size == 0:
-        raise BadInput(
+        raise ExportRefused(
             f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
-            "Train it longer, or check the masks."
+            "Nothing was written. Train it longer (--resume), or check the masks."
         )
     level = min(config.hull_density, FAINT_SHARE * float(np.percentile(visible, 99)))
     spacing_m = config.surfel_spacing_m
@@ -171,7 +171,7 @@ def _bricks(lattice: Lattice, hull: Hull) -> Bricks:
     """The visible part of the lattice near the hull, cut into bricks."""
     counts = np.array(lattice.density.shape) // BRICK
     codes = density_codes(lattice.density)
-    codes[~_near_hull(lattice, hull)] = 0
+    codes[~_within_reach(lattice, hull)] = 0
     visible = ndimage.maximum_filter(codes, size=3) > 0
     blocks = np.lib.stride_tricks.sliding_window_view(visible, (NODES,) * 3)
     used = blocks[::BRICK, ::BRICK, ::BRICK].any(axis=(3, 4, 5))
@@ -186,15 +186,15 @@ def _bricks(lattice: Lattice, hull: Hull) -> Bricks:
     return Bricks(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
 
 
-def _near_hull(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:
-    """Nodes that a ray's segment can reach: from a little outside of the hull to deep inside."""
-    stride = 2  # a coarse distance is good enough here
-    inside = hull.inside[::stride, ::stride, ::stride]
-    cell_m = stride * hull.spacing_m
-    near = ndimage.distance_transform_edt(inside) * cell_m < DEEPEST_M + cell_m
-    near &= ndimage.distance_transform_edt(~inside) * cell_m < MARGIN_M + cell_m
-    axes = [
-        np.clip(np.round(np.arange(n) * lattice.voxel_m / cell_m).astype(int), 0, m - 1)
-        for n, m in zip(lattice.density.shape, near.shape, strict=True)
-    ]
-    return near[np.ix_(*axes)]
+def _within_reach(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:
+    """Nodes that rays see: from a little outside of the hull as deep as its thickness."""
+    reached = np.zeros(lattice.density.shape, dtype=bool)
+    last = np.array(reached.shape) - 1
+    depths = np.arange(-MARGIN_M, hull.thickness.max(), lattice.voxel_m, dtype=np.float32)
+    for depth in depths:
+        there = depth <= hull.thickness
+        points = hull.positions[there] - hull.normals[there] * depth
+        nodes = np.round((points - lattice.low) / lattice.voxel_m).astype(int)
+        reached[tuple(np.clip(nodes, 0, last).T)] = True
+    gap = 1 + 2 * int(np.ceil(hull.spacing_m / lattice.voxel_m))  # between neighbouring surfels
+    return ndimage.maximum_filter(reached, size=gap)

@@ -87,8 +87,8 @@ def export_avatar(
         config: How finely to bake.
 
     Raises:
-        ExportRefused: If the player would not draw what the avatar looks like.
-        BadInput: If there is nothing in the avatar.
+        ExportRefused: If the player would not draw what the avatar looks like, or there is nothing
+            to draw.
         OSError: If it cannot be written.
     """
     occupied = avatar.rendering_grid().occupied.cpu().numpy()

@@ -1,4 +1,4 @@
-"""Tables to compact streams and back, without loss: differences of neighbours deflate well."""
+"""Tables to compact streams and back, without loss: what neighbours predict deflates well."""
 
 from dataclasses import dataclass
 
@@ -77,7 +77,7 @@ class Layout:
         x, y, z = self.brick_counts
         return {
             "blocks": ("u1", ((x * y * z + 7) // 8,)),
-            "voxels": ("u1", (4, self.bricks, BRICK**3)),
+            "voxels": ("u1", (4, self.bricks, BRICK, BRICK, BRICK)),
             "positions": ("<u2", (3, self.surfels)),
             "normals": ("i1", (3, self.surfels)),
             "thickness": ("u1", (self.surfels,)),
@@ -94,11 +94,11 @@ def _triple(vector: Shaped[np.ndarray, "3"]) -> tuple[float, float, float]:
 def encode(tables: Tables) -> dict[str, bytes]:
     """The streams, ready to be deflated; `Layout.of(tables).streams()` says how to read them."""
     surfels, bricks = tables.surfels, tables.bricks
-    core = bricks.voxels[1:, :BRICK, :BRICK, :BRICK].reshape(-1, BRICK**3, 4)
+    core = _against_green(np.moveaxis(bricks.voxels[1:, :BRICK, :BRICK, :BRICK], -1, 0))
     arrays = {
         "blocks": np.packbits(bricks.index.ravel() > 0),
-        "voxels": _differences(np.moveaxis(core, -1, 0)),
-        "positions": _differences(surfels.position_codes.T),
+        "voxels": _differences(core, axes=(-3, -2, -1)),
+        "positions": _differences(surfels.position_codes.T, axes=(-1,)),
         "normals": surfels.normal_codes.T,
         "thickness": surfels.thickness_codes,
         "weights": surfels.weight_codes,
@@ -123,7 +123,7 @@ def decode(streams: dict[str, bytes], layout: Layout) -> Tables:
             low=np.array(layout.surfel_low, dtype=np.float32),
             extent_m=layout.surfel_extent_m,
             spacing_m=layout.surfel_spacing_m,
-            position_codes=_sums(arrays["positions"]).T,
+            position_codes=_sums(arrays["positions"], axes=(-1,)).T,
             normal_codes=arrays["normals"].T,
             thickness_codes=arrays["thickness"],
             weight_codes=arrays["weights"],
@@ -135,20 +135,39 @@ def decode(streams: dict[str, bytes], layout: Layout) -> Tables:
     )
 
 
-def _differences(codes: Shaped[np.ndarray, "*rows length"]) -> Shaped[np.ndarray, "*rows length"]:
-    """Each code minus the one before it, modulo its own type."""
-    result = codes.copy()
-    result[..., 1:] -= codes[..., :-1]
-    return result
+def _differences(
+    codes: Shaped[np.ndarray, "*shape"], *, axes: tuple[int, ...]
+) -> Shaped[np.ndarray, "*shape"]:
+    """Each code minus the one before it along each of the axes, modulo its own type."""
+    for axis in axes:
+        first = np.take(codes, [0], axis=axis)
+        codes = np.concatenate([first, np.diff(codes, axis=axis)], axis=axis)
+    return codes
 
 
-def _sums(codes: Shaped[np.ndarray, "*rows length"]) -> Shaped[np.ndarray, "*rows length"]:
+def _sums(
+    codes: Shaped[np.ndarray, "*shape"], *, axes: tuple[int, ...]
+) -> Shaped[np.ndarray, "*shape"]:
     """The inverse of `_differences`."""
-    return np.cumsum(codes, axis=-1, dtype=codes.dtype)
+    for axis in axes:
+        codes = np.cumsum(codes, axis=axis, dtype=codes.dtype)
+    return codes
+
+
+def _against_green(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
+    """Red and blue minus green, modulo 256: what is bright in one channel is so in the others."""
+    red, green, blue, density = voxels
+    return np.stack([red - green, green, blue - green, density])
+
+
+def _with_green(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
+    """The inverse of `_against_green`."""
+    red, green, blue, density = voxels
+    return np.stack([red + green, green, blue + green, density])
 
 
 def _bricks(
-    blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 512"], layout: Layout
+    blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 8 8 8"], layout: Layout
 ) -> Bricks:
     counts = np.array(layout.brick_counts)
     used = np.unpackbits(blocks)[: counts.prod()].astype(np.int32)
@@ -158,8 +177,8 @@ def _bricks(
             "The file is damaged."
         )
     index = (np.cumsum(used, dtype=np.int32) * used).reshape(counts)
-    core = np.moveaxis(_sums(voxels), 0, -1).reshape(-1, BRICK, BRICK, BRICK, 4)
-    core = np.concatenate([np.zeros_like(core, shape=(1, BRICK, BRICK, BRICK, 4)), core])
+    voxels = _with_green(_sums(voxels, axes=(-3, -2, -1)))
+    core = np.pad(np.moveaxis(voxels, 0, -1), [(1, 0), *[(0, 0)] * 4])
     whole = np.zeros((len(core), NODES, NODES, NODES, 4), dtype=np.uint8)
     padded = np.pad(index, [(0, 1)] * 3)
     place = np.argwhere(index > 0)
