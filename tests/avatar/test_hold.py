@@ -1,0 +1,119 @@
+"""Held-out frames: which they are, what they are compared with, and how they are scored."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from avatar.cells import WarpCells
+from avatar.config import TrainConfig
+from avatar.hold import HeldOut, is_held_out, on_white, prepared, score, spread, truth_on_white
+from avatar.metrics import psnr, ssim
+from avatar.prepare import PreparedFrame
+from avatar.train import Trainer
+from capture.camera import Camera
+from capture.frame import Frame
+from preprocess.observation import Observation
+from preprocess.observe import Dropped
+from preprocess.pose import BodyPose
+
+
+def held_of(total, every=10):
+    return [p for p in range(total) if is_held_out(p, every=every, total=total)]
+
+
+@pytest.fixture(scope="module")
+def held(rig, clip) -> HeldOut:
+    observation = clip.observations[3]
+    cells = WarpCells.of(rig, observation.pose.joint_rotations)
+    return HeldOut(observation=observation, cells=cells)
+
+
+@given(st.integers(20, 500))
+def test_every_tenth_frame_is_held_out_from_the_ninth_on(total):
+    assert held_of(total) == list(range(9, total, 10))
+
+
+@given(st.integers(2, 19))
+def test_of_a_short_clip_it_is_the_last_quarter_and_at_least_one(total):
+    assert held_of(total) == list(range(total - max(1, total // 4), total))
+
+
+def test_a_single_frame_is_trained_on():
+    assert held_of(1) == held_of(0) == []
+
+
+@given(st.integers(0, 10_000))
+def test_a_stream_of_unknown_length_is_held_out_like_a_long_one(position):
+    assert is_held_out(position, every=10, total=None) == (position % 10 == 9)
+
+
+@given(st.integers(1, 500))
+def test_nothing_is_held_out_if_nobody_wants_it(total):
+    assert held_of(total, every=0) == []
+
+
+def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip):
+    items = [*clip.observations[:5], Dropped(index=5, reason="empty mask"), clip.observations[6]]
+    ready = list(prepared(iter(items), rig, every=3, total=None))
+    assert [type(item) for item in ready] == [
+        PreparedFrame, PreparedFrame, HeldOut, PreparedFrame, PreparedFrame, Dropped, PreparedFrame
+    ]  # fmt: skip
+    assert ready[5] is items[5]
+    assert ready[2].observation is items[2]
+    indices = [item.index for item in ready if isinstance(item, PreparedFrame)]
+    assert indices == [0, 1, 3, 4, 6]
+
+
+def observed(rgb, alpha) -> Observation:
+    size = alpha.shape[::-1]
+    camera = Camera(
+        focal_px=(9.0, 9.0), center_px=(1.0, 1.0), size_px=size, camera_from_world=np.eye(4)
+    )
+    frame = Frame(index=0, time_s=0.0, rgb=rgb)
+    return Observation(frame=frame, alpha=alpha, pose=BodyPose.rest(), camera=camera)
+
+
+def test_the_truth_is_the_picture_where_the_person_is_and_white_elsewhere():
+    rgb = np.array([[[255, 51, 0], [10, 20, 30], [0, 102, 204]]], dtype=np.uint8)
+    alpha = np.array([[1.0, 0.0, 0.5]], dtype=np.float32)
+    expected = [[[1.0, 0.2, 0.0], [1.0, 1.0, 1.0], [0.5, 0.7, 0.9]]]
+    np.testing.assert_allclose(truth_on_white(observed(rgb, alpha)), expected, atol=1e-6)
+
+
+def test_a_perfect_rendering_on_white_is_the_truth(rng):
+    rgb = rng.integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    alpha = rng.random((7, 5), dtype=np.float32)
+    color = rgb.astype(np.float32) / 255.0 * alpha[..., None]
+    perfect = np.concatenate([color, alpha[..., None]], axis=-1)
+    np.testing.assert_allclose(on_white(perfect), truth_on_white(observed(rgb, alpha)), atol=1e-6)
+
+
+def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
+    trainer = Trainer(rig, TrainConfig(levels=2, table_size=1 << 10), torch.device("cpu"))
+    trainer.avatar.occupancy.grid.occupied.zero_()
+    truth, mask = truth_on_white(held.observation), held.observation.alpha > 0.5
+    white = np.ones_like(truth)
+    got = score(trainer.avatar, held)
+    assert got.frame == held.observation.frame.index
+    assert got.psnr == pytest.approx(psnr(white, truth))
+    assert got.psnr_mask == pytest.approx(psnr(white, truth, mask))
+    assert got.ssim == pytest.approx(ssim(white, truth))
+    assert got.psnr_mask < got.psnr < math.inf
+
+
+@given(count=st.integers(0, 60), most=st.integers(2, 20))
+def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
+    frames = [HeldOut(observation=held.observation, cells=held.cells) for _ in range(count)]
+    chosen = [frames.index(frame) for frame in spread(frames, most)]
+    assert len(chosen) == min(count, most)
+    if count > most:
+        gaps = np.diff(chosen)
+        assert (chosen[0], chosen[-1]) == (0, count - 1)
+        assert gaps.min() >= 1
+        assert gaps.max() - gaps.min() <= 1
+    else:
+        assert chosen == list(range(count))
