@@ -9,8 +9,14 @@ import torch
 from apps.studio import motions
 from apps.studio.actor import Actor
 from apps.studio.framing import framed
+from avatar.cells import WarpCells
+from avatar.config import TrainConfig
+from avatar.events import Score
+from avatar.hold import HeldOut, prepared, score
 from avatar.levels import HashLevels
 from avatar.rig import Rig
+from avatar.step import cosine
+from avatar.train import Trainer
 from capture.frame import Frame
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
@@ -74,3 +80,46 @@ def clip() -> Clip:
         observations=[observed(i, filmed[i]) for i in range(len(filmed))],
         novel=observed(100, novel[0]),
     )
+
+
+LEARNT_STEPS, MARK_EVERY = 400, 50
+FRAMES_ARRIVE_FOR = 200
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Learnt:
+    """What a few seconds of training make of the clip. Tests look at it and leave it as it is.
+
+    Attributes:
+        trainer: After its last step.
+        held: Frames that it has never seen.
+        novel: A pose that was never filmed.
+        marks: Scores of the held-out frames and the novel pose, every so many steps.
+    """
+
+    trainer: Trainer
+    held: list[HeldOut]
+    novel: HeldOut
+    marks: list[list[Score]]
+
+
+@pytest.fixture(scope="session")
+def learnt(rig, clip) -> Learnt:
+    """Trained once for all tests, with a rate that falls after half of the steps."""
+    config = TrainConfig(rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14)
+    trainer = Trainer(rig, config, torch.device("cpu"))
+    held = []
+    for item in prepared(iter(clip.observations), rig, every=6, total=None):
+        if isinstance(item, HeldOut):
+            held.append(item)
+        else:
+            trainer.add(item)
+    cells = WarpCells.of(rig, clip.novel.pose.joint_rotations)
+    novel = HeldOut(observation=clip.novel, cells=cells)
+    marks = []
+    for step in range(LEARNT_STEPS):
+        falling = (step - FRAMES_ARRIVE_FOR) / (LEARNT_STEPS - FRAMES_ARRIVE_FOR)
+        trainer.step(rate=cosine(falling), hard_share=min(1.0, 4.0 * step / LEARNT_STEPS))
+        if trainer.steps % MARK_EVERY == 0:
+            marks.append([score(trainer.avatar, frame) for frame in [*held, novel]])
+    return Learnt(trainer=trainer, held=held, novel=novel, marks=marks)

@@ -1,0 +1,207 @@
+"""Training: what it reaches, that it never falls back, and what it says on the way."""
+
+import dataclasses
+import itertools
+import threading
+import time
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from avatar import train as train_module
+from avatar.config import TrainConfig
+from avatar.events import Evaluated, Finished, Stepped, Warned
+from avatar.hold import HeldOut, prepared
+from avatar.prepare import prepare
+from avatar.render import render
+from avatar.train import Trainer, train
+from capture.inbox import Inbox
+from preprocess.observe import Dropped
+
+CPU = torch.device("cpu")
+QUICK = TrainConfig(
+    rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_points=32,
+    seconds=60.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def ready(rig, clip):
+    """Prepared frames 0 … 7, where 2 and 5 are held out and 4 is left out."""
+    observations = [*clip.observations[:4], Dropped(index=4, reason="empty mask")]
+    observations += clip.observations[5:8]
+    return list(prepared(iter(observations), rig, every=3, total=None))
+
+
+def taught(rig, ready, config):
+    """A trainer that was taught by `train`, its held-out frames and its events."""
+    trainer, held = Trainer(rig, config, CPU), []
+    return trainer, held, list(train(trainer, Inbox(ready), held))
+
+
+def silhouettes(learnt, held):
+    """Where the avatar is, and where the person was."""
+    observation = held.observation
+    picture = render(learnt.trainer.avatar, observation.pose, observation.camera, cells=held.cells)
+    return picture[..., 3] > 0.5, observation.alpha > 0.5
+
+
+# --- what it reaches --------------------------------------------------------------------------
+
+
+def test_frames_it_has_never_seen_are_rendered_well(learnt):
+    last = [score.psnr for score in learnt.marks[-1][:-1]]
+    assert np.mean(last) > 32.0
+    assert min(last) > 31.0
+    assert np.mean([score.ssim for score in learnt.marks[-1][:-1]]) > 0.98
+
+
+def test_a_pose_that_was_never_filmed_is_rendered_well(learnt):
+    assert learnt.marks[-1][-1].psnr > 28.0
+
+
+def test_the_silhouette_is_the_persons(learnt):
+    for held in [*learnt.held, learnt.novel]:
+        avatar, person = silhouettes(learnt, held)
+        assert (avatar & person).sum() / (avatar | person).sum() > 0.95
+
+
+def test_no_frame_ever_falls_back(learnt):
+    """An occupancy that forgot thin surfaces, and rays cut too early, once cost 15 dB."""
+    scores = np.array([[score.psnr for score in mark] for mark in learnt.marks])
+    best = np.maximum.accumulate(scores, axis=0)
+    assert (best - scores).max() < 1.0
+
+
+def test_rays_need_few_samples(learnt):
+    """Without cells and occupancy a ray would have about a hundred."""
+    assert learnt.trainer.samples / learnt.trainer.rays < 12.0
+
+
+# --- that it can be repeated ------------------------------------------------------------------
+
+
+def after_three_steps(rig, ready, config):
+    trainer = Trainer(rig, config, CPU)
+    for item in ready:
+        if not isinstance(item, HeldOut | Dropped):
+            trainer.add(item)
+    losses = [trainer.step(rate=1.0, hard_share=0.5).loss for _ in range(3)]
+    grid = trainer.avatar.occupancy.grid
+    return [*losses, *trainer.avatar.field.parameters(), grid.density, grid.occupied]
+
+
+def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    try:
+        first, again = (after_three_steps(rig, ready, QUICK) for _ in range(2))
+        other = after_three_steps(rig, ready, dataclasses.replace(QUICK, seed=1))
+    finally:
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(first[0], other[0])
+
+
+# --- what the generator does and says ---------------------------------------------------------
+
+
+def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
+    trainer, held, events = taught(rig, ready, dataclasses.replace(QUICK, steps=60))
+    assert trainer.frames_seen == 5
+    assert trainer.replay.indices == [0, 1, 3, 6, 7]
+    assert [frame.observation.frame.index for frame in held] == [2, 5]
+    warnings = [event.message for event in events if isinstance(event, Warned)]
+    assert len(warnings) == 1
+    assert "4" in warnings[0]
+    assert "empty mask" in warnings[0]
+
+
+def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
+    trainer, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=25))
+    steps = [event for event in events if isinstance(event, Stepped)]
+    finished = events[-1]
+    assert isinstance(finished, Finished)
+    assert sum(isinstance(event, Finished) for event in events) == 1
+    assert [event.step for event in steps] == list(range(1, 26))
+    for before, after in itertools.pairwise(steps):
+        assert before.wall_seconds <= after.wall_seconds <= finished.wall_seconds
+        assert before.frames_seen <= after.frames_seen
+    assert finished.steps == trainer.steps == 25
+    assert finished.rays == trainer.rays == 25 * QUICK.rays
+    assert finished.samples == trainer.samples
+    per_ray = sum(event.samples_per_ray for event in steps)
+    assert per_ray * QUICK.rays == pytest.approx(finished.samples)
+
+
+def test_it_stops_when_the_time_is_up(rig, ready):
+    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.4))
+    steps = [event for event in events if isinstance(event, Stepped)]
+    assert steps[-2].wall_seconds < 0.4 <= steps[-1].wall_seconds <= events[-1].wall_seconds
+
+
+def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
+    monkeypatch.setattr(train_module, "MARKS_S", (0.05, 0.1, 60.0))
+    _, held, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.5))
+    marks = [event for event in events if isinstance(event, Evaluated)]
+    assert 1 <= len(marks) <= 2
+    assert marks[0].wall_seconds >= 0.05
+    for mark in marks:
+        indices = [frame.observation.frame.index for frame in held]
+        assert [score.frame for score in mark.scores] == indices[: len(mark.scores)]
+        assert np.isfinite([score.psnr for score in mark.scores]).all()
+    assert len(marks[-1].scores) == 2
+
+
+def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip):
+    frames = [prepare(observation, rig) for observation in clip.observations[:3]]
+    gate = threading.Event()
+
+    def arriving():
+        yield from frames[:2]
+        gate.wait(10.0)
+        yield frames[2]
+
+    config = dataclasses.replace(QUICK, seconds=1.2)
+    trainer, rates, began = Trainer(rig, config, CPU), {2: [], 3: []}, time.monotonic()
+    for event in train(trainer, Inbox(arriving()), []):
+        if isinstance(event, Stepped):
+            group = trainer.optimizer.param_groups[0]
+            rates.setdefault(event.frames_seen, []).append(group["lr"])
+        if time.monotonic() - began > 0.5:
+            gate.set()
+    assert set(rates[2]) == {config.learning_rate}
+    falling = np.array(rates[3][1:])
+    assert (np.diff(falling) <= 0.0).all()
+    assert falling[0] > 0.9 * config.learning_rate
+    assert falling[-1] < 0.1 * config.learning_rate
+
+
+def test_a_stream_without_a_usable_frame_ends_without_a_step(rig):
+    nothing = [Dropped(index=index, reason="pose invalid") for index in range(3)]
+    trainer, _, events = taught(rig, nothing, QUICK)
+    assert [type(event) for event in events] == [Warned] * 3
+    assert trainer.steps == 0
+
+
+def test_an_error_in_the_source_is_raised_in_training(rig, ready):
+    def breaking():
+        yield ready[0]
+        raise OSError("the disk was pulled out")
+
+    with pytest.raises(OSError, match="pulled out"):
+        list(train(Trainer(rig, QUICK, CPU), Inbox(breaking()), []))
+
+
+def test_a_resumed_trainer_goes_on_counting(rig, ready):
+    trainer, held, _ = taught(rig, ready, dataclasses.replace(QUICK, steps=10))
+    used, trainer.config = trainer.wall_seconds, dataclasses.replace(QUICK, steps=15)
+    events = list(train(trainer, Inbox([]), held))
+    assert [event.step for event in events if isinstance(event, Stepped)] == [11, 12, 13, 14, 15]
+    assert events[0].wall_seconds > used
+    assert trainer.frames_seen == 5
