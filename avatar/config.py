@@ -41,6 +41,8 @@ class TrainConfig:
     """Points at which that opacity is measured in each step."""
     occupancy_every: int = 16
     """Steps between updates of the occupancy."""
+    refine_poses: bool = False
+    """Whether the frames' poses are corrected while they are learnt from."""
     key_frames: int = 200
     """Frames that stay for replay."""
     hold_every: int = 10

@@ -82,8 +82,14 @@ class Field:
         return Activations(points, features, hidden, torch.addmm(second_bias, hidden, second))
 
     @torch.no_grad()
-    def backward(self, seen: Activations, grad_raw: Float32[Tensor, "points 4"]) -> None:
-        """Writes the gradient of every parameter (the table's is added to what is there)."""
+    def backward(
+        self, seen: Activations, grad_raw: Float32[Tensor, "points 4"]
+    ) -> Float32[Tensor, "points width"]:
+        """Writes the gradient of every parameter (the table's is added to what is there).
+
+        Returns:
+            The gradient of the grid's features.
+        """
         first, _, second, _ = self.layers
         for parameter, grad in zip(
             self.layers[2:], (seen.hidden.T @ grad_raw, grad_raw.sum(dim=0)), strict=True
@@ -94,9 +100,9 @@ class Field:
             self.layers[:2], (seen.features.T @ grad_hidden, grad_hidden.sum(dim=0)), strict=True
         ):
             parameter.grad = grad
-        self.backend.encode_backward(
-            seen.points, grad_hidden @ first.T, self.levels, self.table.grad
-        )
+        grad_features = grad_hidden @ first.T
+        self.backend.encode_backward(seen.points, grad_features, self.levels, self.table.grad)
+        return grad_features
 
     @torch.no_grad()
     def raw_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:

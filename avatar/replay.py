@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
-from avatar.cells import CELL_M
+from avatar.cells import CELL_M, WarpCells
 from avatar.kernels.backend import CellTables, Rays
 from avatar.prepare import PreparedFrame
 
@@ -21,6 +21,22 @@ NEAR_SHARE = 0.9
 ERROR_MEMORY = 0.9
 JOINT_SPREAD = 0.5
 """How much a radian of a joint counts beside a radian of the view when frames are compared."""
+
+
+class RootCorrection(NamedTuple):
+    """How far a frame's body stands from where its given pose puts it.
+
+    A point of the given body frame is at `pivot + rotationᵀ (x - pivot - shift)` in the corrected.
+
+    Attributes:
+        rotation: About the pivot.
+        shift: Metres, in the given body frame.
+        pivot: The rest pelvis.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    pivot: Float[np.ndarray, "3"]
 
 
 class Batch(NamedTuple):
@@ -52,7 +68,9 @@ class Replay:
         self._error = torch.zeros(capacity, device=device)
         self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._given_origins = np.zeros((capacity, 3))
         self._origins = torch.zeros(capacity, 3, device=device)
+        self._turns = torch.zeros(capacity, 3, 3, device=device)
         self._low = torch.zeros(capacity, 3, device=device)
         self._shape = torch.ones(capacity, 3, dtype=torch.int32, device=device)
         self._index = torch.zeros(capacity, 1, dtype=torch.int32, device=device)
@@ -69,8 +87,12 @@ class Replay:
         """The warp cells of all slots."""
         return CellTables(self._index, self._roots, self._low, self._shape, CELL_M)
 
-    def add(self, frame: PreparedFrame) -> None:
-        """Takes a frame in; when full, the more replaceable of the two most alike goes."""
+    def add(self, frame: PreparedFrame) -> int:
+        """Takes a frame in; when full, the more replaceable of the two most alike goes.
+
+        Returns:
+            The slot that it took.
+        """
         likeness = np.concatenate(
             [_facing(frame), frame.pose.joint_rotations.ravel() * JOINT_SPREAD]
         )
@@ -85,6 +107,21 @@ class Replay:
         self._fill(slot, frame)
         held = self._error[: len(self)]
         self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
+        return slot
+
+    def put_cells(self, slot: int, cells: WarpCells) -> None:
+        """Gives a slot the warp of its frame's pose."""
+        self._index = self._write(self._index, slot, cells.index.reshape(-1))
+        self._roots = self._write(self._roots, slot, cells.roots)
+        self._low[slot] = torch.from_numpy(cells.low).to(self.device)
+        self._shape[slot] = torch.tensor(cells.index.shape, dtype=torch.int32)
+
+    def move_root(self, slot: int, root: RootCorrection) -> None:
+        """Lets a slot's rays follow its corrected root."""
+        turn = root.rotation.T
+        origin = root.pivot + turn @ (self._given_origins[slot] - root.pivot - root.shift)
+        self._origins[slot] = torch.from_numpy(origin).to(self._origins)
+        self._turns[slot] = torch.from_numpy(turn).to(self._turns)
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """Draws rays from the kept frames.
@@ -108,7 +145,7 @@ class Replay:
         pixel = torch.minimum(pixel, near + far - 1)
         rays = Rays(
             self._origins[slot],
-            self._directions[slot, pixel],
+            (self._turns[slot] @ self._directions[slot, pixel][..., None])[..., 0],
             slot.int(),
             uniform(count),
         )
@@ -125,14 +162,12 @@ class Replay:
         error[seen] = ERROR_MEMORY * error[seen] + (1.0 - ERROR_MEMORY) * mean[seen]
 
     def _fill(self, slot: int, frame: PreparedFrame) -> None:
-        index, roots = frame.cells.index.reshape(-1), frame.cells.roots
-        self._index = self._write(self._index, slot, index)
-        self._roots = self._write(self._roots, slot, roots)
+        self.put_cells(slot, frame.cells)
         self._directions = self._write(self._directions, slot, frame.directions)
         self._colors = self._write(self._colors, slot, frame.colors)
-        self._low[slot] = torch.from_numpy(frame.cells.low).to(self.device)
-        self._shape[slot] = torch.tensor(frame.cells.index.shape, dtype=torch.int32)
+        self._given_origins[slot] = frame.origin
         self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
+        self._turns[slot] = torch.eye(3, device=self.device)
         self._near[slot] = frame.near
         self._far[slot] = len(frame.colors) - frame.near
 

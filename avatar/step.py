@@ -12,6 +12,7 @@ from avatar.field import Activations, Field
 from avatar.kernels.backend import CellTables, Marching
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.occupancy import Occupancy
+from avatar.refine import PoseTable
 from avatar.replay import Batch
 
 EMPTY_STEP_M = 0.01
@@ -40,6 +41,7 @@ def gradients(
     *,
     hard_share: float,
     remember: bool,
+    poses: PoseTable | None = None,
     generator: torch.Generator,
 ) -> StepResult:
     """Renders a batch and leaves the gradient of its mean loss in the field's parameters.
@@ -53,6 +55,7 @@ def gradients(
         hard_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
             must be found before it can be hard.
         remember: Whether the samples' densities raise the occupancy's.
+        poses: Whose wrenches take up what pulls the samples, if poses are refined.
         generator: Of backgrounds and empty points, on the field's device.
     """
     how = Marching(config.step_m, config.grace_m, config.most_samples)
@@ -70,7 +73,16 @@ def gradients(
         config.alpha_weight, config.hard_weight * hard_share,
     )  # fmt: skip
     grad_empty = _grad_of_emptiness(seen.raw[count:], config.empty_weight)
-    field.backward(seen, torch.cat([grad, grad_empty]))
+    grad_features = field.backward(seen, torch.cat([grad, grad_empty]))
+    if poses is not None and count:
+        backend = field.backend
+        grad_points = backend.encode_points_backward(
+            samples.points, grad_features[:count], field.table, field.levels
+        )
+        backend.add_wrenches(
+            samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones, poses.wrenches
+        )
+        poses.count(batch.rays.slots.long())
     if remember:
         _remember(field, occupancy, seen, count)
     return StepResult(loss, count)

@@ -6,6 +6,7 @@ from typing import final
 
 import torch
 
+from avatar.cells import WarpCells
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.events import Evaluated, Finished, Score, Stepped, TrainEvent, Warned
 from avatar.field import Field
@@ -15,6 +16,7 @@ from avatar.levels import HashLevels
 from avatar.model import Avatar
 from avatar.occupancy import DECAY, FIRST_DECAY, Occupancy
 from avatar.prepare import PreparedFrame
+from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.rig import Rig
 from avatar.step import StepResult, cosine, gradients
@@ -25,6 +27,8 @@ NETWORK_RATE = 0.3
 """The network's learning rate as a share of the table's."""
 CLEARING_STEPS = 300
 """Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
+REFINED_AFTER_STEPS = 150
+"""Poses are corrected once there is something to compare them with."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 """When the curve is measured, in seconds of training; then every 30 s."""
 
@@ -37,6 +41,7 @@ class Trainer:
         avatar: As it stands.
         config: The recipe.
         replay: The frames it learns from.
+        poses: Their poses, corrected if the recipe says so.
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
         frames_seen: Frames taken in so far, whether or not they are still kept.
@@ -56,6 +61,7 @@ class Trainer:
             rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
         )
         self.replay = Replay(config.key_frames, device)
+        self.poses = PoseTable(rig, config.key_frames, device)
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
@@ -71,7 +77,8 @@ class Trainer:
 
     def add(self, frame: PreparedFrame) -> None:
         """Takes in a frame to learn from."""
-        self.replay.add(frame)
+        slot = self.replay.add(frame)
+        self.poses.put(slot, frame.pose)
         self.frames_seen += 1
 
     def step(self, *, rate: float, hard_share: float) -> StepResult:
@@ -83,16 +90,20 @@ class Trainer:
         """
         config, field, occupancy = self.config, self.avatar.field, self.avatar.occupancy
         batch = self.replay.draw(config.rays, self._generator)
+        refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
         result = gradients(
             field, occupancy, self.replay.cells, batch, config,
             hard_share=hard_share,
             remember=self.steps % config.occupancy_every < 2,
+            poses=self.poses if refines else None,
             generator=self._generator,
         )  # fmt: skip
         for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE), strict=True):
             group["lr"] = config.learning_rate * base * rate
         self.optimizer.step()
         field.table.grad.zero_()
+        if refines:
+            self._correct_a_pose(rate)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             clearing = self.steps < CLEARING_STEPS
@@ -108,6 +119,18 @@ class Trainer:
         self.rays += config.rays
         self.samples += result.samples
         return result
+
+    def _correct_a_pose(self, rate: float) -> None:
+        slot = self.poses.correct_one(rate=rate)
+        if slot is None:
+            return
+        if self.poses.strayed(slot):
+            joints = self.poses.pose(slot).joint_rotations
+            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
+        else:
+            bones = self.poses.bones[slot]
+            self.backend.follow(self.replay.cells, slot, self.poses.skin, bones)
+        self.replay.move_root(slot, self.poses.root(slot))
 
 
 @final

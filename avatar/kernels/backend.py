@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
-from avatar.kernels import reference
+from avatar.kernels import pose, reference
 from avatar.levels import HashLevels
 
 
@@ -18,11 +18,13 @@ class Samples(NamedTuple):
         points: Canonical positions, metres.
         first: Where each ray's samples begin.
         count: How many each ray has.
+        rows: Root of its frame's cells that each sample was warped with.
     """
 
     points: Float32[Tensor, "samples 3"]
     first: Int64[Tensor, "rays"]
     count: Int32[Tensor, "rays"]
+    rows: Int32[Tensor, "samples"]
 
 
 class Rays(NamedTuple):
@@ -73,6 +75,20 @@ class Grid(NamedTuple):
     density: Float32[Tensor, "x y z"]
     low: Float32[Tensor, "3"]
     cells_per_m: Float32[Tensor, "3"]
+
+
+class Skin(NamedTuple):
+    """The skinning volume (`avatar.rig.Rig`).
+
+    Attributes:
+        weights: On the nodes of the canonical box.
+        low: Its corner, metres.
+        nodes_per_m: Nodes per metre along each axis.
+    """
+
+    weights: Float32[Tensor, "x y z 24"]
+    low: Float32[Tensor, "3"]
+    nodes_per_m: Float32[Tensor, "3"]
 
 
 class Marching(NamedTuple):
@@ -153,6 +169,39 @@ class Backend(Protocol):
         """Raises the grid's cached density, in place, to that of the samples."""
         ...
 
+    def encode_points_backward(
+        self,
+        points: Float32[Tensor, "points 3"],
+        grad_features: Float32[Tensor, "points width"],
+        table: Float32[Tensor, "entries 4"],
+        levels: HashLevels,
+    ) -> Float32[Tensor, "points 3"]:
+        """Gradient of the features with respect to the points."""
+        ...
+
+    def add_wrenches(
+        self,
+        samples: Samples,
+        grad_points: Float32[Tensor, "samples 3"],
+        slots: Int32[Tensor, "rays"],
+        cells: CellTables,
+        skin: Skin,
+        bones: Float32[Tensor, "slots 24 12"],
+        wrenches: Float32[Tensor, "slots 24 6"],
+    ) -> None:
+        """Adds what pulls the samples to the wrenches of the bones that move them."""
+        ...
+
+    def follow(
+        self,
+        cells: CellTables,
+        slot: int,
+        skin: Skin,
+        bones: Float32[Tensor, "24 12"],
+    ) -> None:
+        """Moves a slot's roots, in place, after its pose."""
+        ...
+
 
 @final
 class TorchBackend:
@@ -172,8 +221,10 @@ class TorchBackend:
         grad_table += grad
 
     def march(self, rays, cells, grid, how):  # noqa: D102
-        points, count = reference.march(*rays, how.step_m, *cells, *grid, how.grace_steps, how.most)
-        return Samples(points, torch.cumsum(count, 0) - count, count)
+        points, rows, count = reference.march(
+            *rays, how.step_m, *cells, *grid, how.grace_steps, how.most
+        )
+        return Samples(points, torch.cumsum(count, 0) - count, count, rows)
 
     def composite(self, raw, samples, step_m):  # noqa: D102
         with torch.no_grad():
@@ -191,6 +242,24 @@ class TorchBackend:
 
     def keep_highest(self, points, log_density, grid):  # noqa: D102
         reference.keep_highest(points, log_density, grid.low, grid.cells_per_m, grid.density)
+
+    def encode_points_backward(self, points, grad_features, table, levels):  # noqa: D102
+        leaf = points.detach().requires_grad_()
+        with torch.enable_grad():
+            features = reference.encode(leaf, table.detach(), levels)
+            (grad,) = torch.autograd.grad(features, leaf, grad_features)
+        return grad
+
+    def add_wrenches(self, samples, grad_points, slots, cells, skin, bones, wrenches):  # noqa: D102
+        slot = slots.repeat_interleave(samples.count).long()
+        roots = cells.roots[slot, samples.rows.long()]
+        wrench = pose.wrenches(samples.points, grad_points, roots, bones[slot], *skin)
+        wrenches.index_add_(0, slot, wrench)
+
+    def follow(self, cells, slot, skin, bones):  # noqa: D102
+        nx, ny, nz = cells.shape[slot].tolist()
+        index = cells.index[slot, : nx * ny * nz].view(nx, ny, nz)
+        pose.follow(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
 
 
 def backend_for(device: torch.device) -> Backend:

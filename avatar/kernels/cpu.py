@@ -5,7 +5,7 @@ from typing import final
 import numpy as np
 import torch
 
-from avatar.kernels import cpu_composite, cpu_grid, cpu_march
+from avatar.kernels import cpu_composite, cpu_grid, cpu_march, cpu_pose
 from avatar.kernels.backend import Samples
 from avatar.levels import HashLevels
 
@@ -32,16 +32,20 @@ class NumbaBackend:
 
     def march(self, rays, cells, grid, how):  # noqa: D102
         padded = np.empty((len(rays.slots), how.most, 3), dtype=np.float32)
+        padded_rows = np.empty((len(rays.slots), how.most), dtype=np.int32)
         count = torch.empty(len(rays.slots), dtype=torch.int32)
         cpu_march.march(
             *(part.numpy() for part in rays), np.float32(how.step_m),
             *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
-            *(part.numpy() for part in grid), how.grace_steps, padded, count.numpy(),
+            *(part.numpy() for part in grid), how.grace_steps, padded, padded_rows, count.numpy(),
         )  # fmt: skip
         first = torch.cumsum(count, 0) - count
-        points = torch.empty(int(count.sum()), 3)
-        cpu_march.pack(padded, first.numpy(), count.numpy(), points.numpy())
-        return Samples(points, first, count)
+        total = int(count.sum())
+        points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
+        cpu_march.pack(
+            padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
+        )
+        return Samples(points, first, count, rows)
 
     def composite(self, raw, samples, step_m):  # noqa: D102
         rendered = torch.empty(len(samples.count), 4)
@@ -67,4 +71,26 @@ class NumbaBackend:
         cpu_march.keep_highest(
             points.numpy(), log_density.numpy(), grid.low.numpy(), grid.cells_per_m.numpy(),
             grid.density.numpy(),
+        )  # fmt: skip
+
+    def encode_points_backward(self, points, grad_features, table, levels):  # noqa: D102
+        grad = torch.empty_like(points)
+        cpu_pose.encode_points_backward(
+            points.numpy(), *_levels(levels), table.detach().numpy(), grad_features.numpy(),
+            grad.numpy(),
+        )  # fmt: skip
+        return grad
+
+    def add_wrenches(self, samples, grad_points, slots, cells, skin, bones, wrenches):  # noqa: D102
+        cpu_pose.add_wrenches(
+            samples.points.numpy(), grad_points.numpy(), samples.rows.numpy(),
+            samples.first.numpy(), samples.count.numpy(), slots.numpy(), cells.roots.numpy(),
+            *(part.numpy() for part in skin), bones.numpy(), wrenches.numpy(),
+        )  # fmt: skip
+
+    def follow(self, cells, slot, skin, bones):  # noqa: D102
+        cpu_pose.follow(
+            cells.index[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
+            np.float32(cells.cell_m), cells.roots[slot].numpy(),
+            *(part.numpy() for part in skin), bones.numpy(),
         )  # fmt: skip

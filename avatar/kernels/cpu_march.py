@@ -27,9 +27,9 @@ def _exit(position, low, cell, index, direction):
 def march(
     origins, directions, slots, jitter, step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
-    occupied, density, low, cells_per_m, grace_steps, points, counts,
+    occupied, density, low, cells_per_m, grace_steps, points, rows, counts,
 ):  # fmt: skip
-    """Canonical sample points along rays of the body frame.
+    """Canonical sample points along rays of the body frame, and the root each was warped with.
 
     Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
     has a root whose canonical cell is occupied; of several roots the one of highest cached density
@@ -74,6 +74,7 @@ def march(
             ey = py - (ly + (F32(j) + F32(0.5)) * cell_m)
             ez = pz - (lz + (F32(k) + F32(0.5)) * cell_m)
             best = F32(-1)
+            row = I32(0)
             bx, by, bz = F32(0), F32(0), F32(0)
             for candidate in range(packed >> 2, (packed >> 2) + (packed & 3)):
                 r = cell_roots[slot, candidate]
@@ -90,10 +91,12 @@ def march(
                 if occupied[a, b, c] != 0 and density[a, b, c] > best:
                     best = density[a, b, c]
                     bx, by, bz = x, y, z
+                    row = I32(candidate)
             if best >= F32(0):
                 points[ray, kept, 0] = bx
                 points[ray, kept, 1] = by
                 points[ray, kept, 2] = bz
+                rows[ray, kept] = row
                 kept += 1
                 optical += best * step_m
                 if optical > F32(OPAQUE_DEPTH):
@@ -105,10 +108,11 @@ def march(
 
 
 @compile_kernel(parallel=True, nogil=True)
-def pack(padded, first, counts, points):
-    """Copies each ray's samples from its row to one list without gaps."""
+def pack(padded, padded_rows, first, counts, points, rows):
+    """Copies each ray's samples from its own line to one list without gaps."""
     for ray in prange(counts.shape[0]):
         for n in range(counts[ray]):
+            rows[first[ray] + n] = padded_rows[ray, n]
             for axis in range(3):
                 points[first[ray] + n, axis] = padded[ray, n, axis]
 

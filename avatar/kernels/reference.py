@@ -135,13 +135,16 @@ def march(
     cells_per_m: Float32[Tensor, "3"],
     grace_steps: int,
     most: int,
-) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "samples"], Int32[Tensor, "rays"]]:
     """Canonical sample points along rays of the body frame, packed ray by ray.
 
     Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
     has a root whose canonical cell is occupied; of several roots the one of highest cached density
     counts. A ray ends `grace_steps` samples after its cached optical depth has passed
     `OPAQUE_DEPTH`, or after `most` samples.
+
+    Returns:
+        The points, the root of its frame's cells that each was warped with, samples per ray.
     """
     slot = slots.long()
     shape = cell_shape[slot]
@@ -162,14 +165,17 @@ def march(
 
     best = torch.full_like(t, -1.0)
     points = torch.zeros_like(position)
+    rows = torch.zeros_like(packed)
     for candidate in range(3):
         exists = (packed & 3) > candidate
-        root = cell_roots[slot[:, None], torch.where(exists, (packed >> 2) + candidate, 0).long()]
+        row = torch.where(exists, (packed >> 2) + candidate, 0)
+        root = cell_roots[slot[:, None], row.long()]
         warp = root[..., 3:].unflatten(-1, (3, 3))
         canonical = root[..., :3] + (warp @ offset[..., None])[..., 0]
         cached, kept = _look_up(canonical, occupied, density, low, cells_per_m)
         better = exists & kept & (cached > best)
         best = torch.where(better, cached, best)
+        rows = torch.where(better, row, rows)
         points = torch.where(better[..., None], canonical, points)
 
     kept = best >= 0.0
@@ -177,7 +183,7 @@ def march(
     counted = (opaque & kept).int()
     kept &= torch.cumsum(counted, dim=1) - counted <= grace_steps
     kept &= torch.cumsum(kept.int(), dim=1) <= most
-    return points[kept], kept.sum(dim=1).int()
+    return points[kept], rows[kept].int(), kept.sum(dim=1).int()
 
 
 def _look_up(

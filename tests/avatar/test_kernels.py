@@ -27,7 +27,9 @@ def points_in(levels, count, generator, *, beyond=0.0):
 
 def packed(counts):
     counts = torch.tensor(counts, dtype=torch.int32)
-    return Samples(torch.zeros(int(counts.sum()), 3), torch.cumsum(counts, 0) - counts, counts)
+    total = int(counts.sum())
+    first = torch.cumsum(counts, 0) - counts
+    return Samples(torch.zeros(total, 3), first, counts, torch.zeros(total, dtype=torch.int32))
 
 
 def test_the_levels_hold_dense_and_hashed_ones(levels):

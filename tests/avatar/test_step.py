@@ -73,10 +73,8 @@ def test_the_steps_gradient_is_that_of_autograd(trainer, backend):
     grads, drawn = one_step(trainer, backend)
     parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
     expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
-    if backend.name == "torch":  # its own samples may differ on a cell's wall
-        tolerance = 2e-3
-    else:
-        tolerance = 1e-5
+    # the reference's own samples may differ on a cell's wall
+    tolerance = 2e-3 if backend.name == "torch" else 1e-5
     for ours, theirs in zip(grads, expected, strict=True):
         assert float((ours - theirs).abs().max()) <= tolerance * float(theirs.abs().max())
 

@@ -1,0 +1,155 @@
+"""Pose refinement: kernels, the implicit gradient, cells that follow, and poses that come back."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from avatar.cells import WarpCells
+from avatar.kernels import pose as pose_kernels
+from avatar.kernels.backend import CellTables, Samples, TorchBackend
+from avatar.kernels.cpu import NumbaBackend
+from avatar.levels import FEATURES
+from avatar.refine import PoseTable
+from avatar.render import cell_tables
+from preprocess.pose import BodyPose
+
+TORCH, NUMBA = TorchBackend(), NumbaBackend()
+CPU = torch.device("cpu")
+
+
+def pose_of(rotations, root=(0.1, 0.7, -0.2), place=(0.2, 0.1, -0.3)) -> BodyPose:
+    return BodyPose(
+        root_rotation=np.array(root),
+        root_translation=np.array(place),
+        joint_rotations=np.asarray(rotations),
+    )
+
+
+@pytest.fixture
+def table(rig, bent_pose) -> PoseTable:
+    table = PoseTable(rig, 2, CPU)
+    table.put(0, pose_of(np.zeros((23, 3))))
+    table.put(1, pose_of(bent_pose))
+    return table
+
+
+def copied(cells: CellTables) -> CellTables:
+    return cells._replace(roots=cells.roots.clone())
+
+
+def samples_near_the_skin(rig, count, generator):
+    """Canonical samples of one ray of slot 1, each warped with a root of its own."""
+    chosen = torch.randint(len(rig.seeds), (count,), generator=generator)
+    points = torch.from_numpy(rig.seeds)[chosen]
+    points = points + torch.randn(count, 3, generator=generator) * 0.01
+    counts = torch.tensor([count], dtype=torch.int32)
+    rows = torch.arange(count, dtype=torch.int32)
+    return Samples(points, torch.zeros(1, dtype=torch.int64), counts, rows)
+
+
+def jacobians(table, points, slot):
+    """Inverse Jacobians of skinning at the points, by autograd."""
+    leaf = points.clone().requires_grad_()
+    posed = pose_kernels.skinned(leaf, *table.skin, table.bones[slot])
+    rows = [torch.autograd.grad(posed[:, k].sum(), leaf, retain_graph=True)[0] for k in range(3)]
+    return torch.linalg.inv(torch.stack(rows, dim=1))
+
+
+def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, generator):
+    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    extent = torch.from_numpy((levels.counts[0] - 1) / levels.cells_per_m[0]).float()
+    points = torch.from_numpy(levels.low) + torch.rand(500, 3, generator=generator) * extent
+    slope = torch.randn(500, levels.width, generator=generator)
+    torch.testing.assert_close(
+        NUMBA.encode_points_backward(points, slope, table, levels),
+        TORCH.encode_points_backward(points, slope, table, levels),
+        atol=1e-2, rtol=1e-4,
+    )  # fmt: skip
+
+
+def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
+    samples = samples_near_the_skin(rig, 400, generator)
+    pull = torch.randn(400, 3, generator=generator)
+    roots = torch.zeros(2, 400, 12)
+    roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
+    cells = CellTables(torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03)
+    slots = torch.ones(1, dtype=torch.int32)
+    results = []
+    for backend in (NUMBA, TORCH):
+        wrenches = torch.zeros(2, 24, 6)
+        backend.add_wrenches(samples, pull, slots, cells, table.skin, table.bones, wrenches)
+        results.append(wrenches)
+    assert float(results[0][0].abs().max()) == 0.0
+    torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
+
+
+def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
+    cells = cell_tables(WarpCells.of(rig, bent_pose), CPU)
+    moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
+    bones = torch.from_numpy(moved.astype(np.float32))
+    ours, theirs = copied(cells), copied(cells)
+    NUMBA.follow(ours, 0, table.skin, bones)
+    TORCH.follow(theirs, 0, table.skin, bones)
+    off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
+    assert float((off < 1e-2).float().mean()) > 0.99
+    assert not torch.equal(ours.roots, cells.roots)
+
+
+def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, table, bent_pose):
+    cells = WarpCells.of(rig, bent_pose)
+    turned = (
+        Rotation.from_rotvec(bent_pose) * Rotation.from_rotvec(np.full((23, 3), 0.006))
+    ).as_rotvec()
+    tables = cell_tables(cells, CPU)
+    bones = torch.from_numpy(
+        rig.body_from_canonical(turned)[:, :3].reshape(24, 12).astype(np.float32)
+    )
+    before = residual(rig, table, cells, tables.roots[0], bones)
+    for _ in range(2):
+        NUMBA.follow(tables, 0, table.skin, bones)
+    after = residual(rig, table, cells, tables.roots[0], bones)
+    assert np.median(before) > 3e-3
+    assert np.quantile(after, 0.95) < 5e-4
+
+
+def residual(rig, table, cells, roots, bones):
+    """How far each root, skinned, is from its cell's centre."""
+    place = np.argwhere(cells.index > 0)
+    rows = cells.index[tuple(place.T)] >> 2
+    posed = pose_kernels.skinned(roots[rows, :3], *table.skin, bones).numpy()
+    return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
+
+
+def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table, generator):
+    """Against differences: move one number of the correction, find the roots again."""
+    samples = samples_near_the_skin(rig, 300, generator)
+    pull = torch.randn(300, 3, generator=generator)
+    roots = torch.zeros(2, 300, 12)
+    roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
+    cells = CellTables(torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03)
+    slots = torch.ones(1, dtype=torch.int32)
+    NUMBA.add_wrenches(samples, pull, slots, cells, table.skin, table.bones, table.wrenches)
+    gradient = table.gradient(1)
+    given = pose_kernels.skinned(samples.points, *table.skin, table.bones[1]).double().numpy()
+
+    def pulled(joint: int, axis: int, size: float) -> float:
+        table.corrections[1, joint, axis] = size
+        table._write_bones(1)
+        root = table.root(1)
+        target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
+        x = samples.points.clone()
+        for _ in range(8):
+            off = torch.from_numpy(target).float() - pose_kernels.skinned(
+                x, *table.skin, table.bones[1]
+            )
+            x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
+        table.corrections[1, joint, axis] = 0.0
+        table._write_bones(1)
+        return float((x.double() * pull.double()).sum())
+
+    for joint in (0, 1, 4, 9, 16, 18, 24):
+        for axis in range(3):
+            measured = (pulled(joint, axis, 2e-3) - pulled(joint, axis, -2e-3)) / 4e-3
+            scale = np.abs(gradient[joint]).max() + 0.1
+            assert gradient[joint, axis] == pytest.approx(measured, abs=0.08 * scale), joint
