@@ -29,6 +29,10 @@ FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.012
 """Bricks reach this far outside of the hull."""
+EMPTY = (
+    f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
+    "Nothing was written. Train it longer (--resume), or check the masks."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +69,8 @@ def bake(
         ExportRefused: If there is nothing to be seen in the field.
     """
     config = config or BakeConfig()
+    if not occupied.any():
+        raise ExportRefused(EMPTY)
     lattice = read_field(field_at, rig, occupied, config.voxel_m)
     hull = _hull_that_fits(lattice, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
@@ -81,10 +87,7 @@ def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
     """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
     visible = lattice.density[lattice.density > FAINTEST]
     if visible.size == 0:
-        raise ExportRefused(
-            f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
-            "Nothing was written. Train it longer (--resume), or check the masks."
-        )
+        raise ExportRefused(EMPTY)
     level = min(config.hull_density, FAINT_SHARE * float(np.percentile(visible, 99)))
     spacing_m = config.surfel_spacing_m
     while True:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32, Int
 from scipy import ndimage
 
 from export.lattice import Lattice
@@ -31,16 +31,12 @@ class Hull:
         positions: Metres.
         normals: Outward, of length 1.
         thickness: How deep one sees into it along the normal, metres.
-        low: Corner of `inside`'s lattice.
-        inside: Lattice nodes (`low + spacing_m · (i, j, k)`) enclosed by the hull.
     """
 
     spacing_m: float
     positions: Float32[np.ndarray, "surfels 3"]
     normals: Float32[np.ndarray, "surfels 3"]
     thickness: Float32[np.ndarray, "surfels"]
-    low: Float32[np.ndarray, "3"]
-    inside: Bool[np.ndarray, "x y z"]
 
 
 def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
@@ -66,8 +62,6 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
         positions=positions,
         normals=normals,
         thickness=_thickness(lattice, positions, normals),
-        low=lattice.low,
-        inside=inside,
     )
 
 
@@ -99,7 +93,7 @@ def _largest_parts(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"
 def _crossings(
     logs: Float32[np.ndarray, "x y z"], slope: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
-    """Where lattice edges cross zero (marching cubes' vertices), in nodes, and unit normals there.
+    """Where lattice edges cross zero (marching cubes' vertices), in nodes, and the unit normals.
 
     `slope` is a smoother version of `logs`, for the normals.
     """
@@ -118,7 +112,7 @@ def _crossings(
 
 
 def _gradient(
-    values: Float32[np.ndarray, "x y z"], nodes: Float[np.ndarray, "nodes 3"]
+    values: Float32[np.ndarray, "x y z"], nodes: Int[np.ndarray, "nodes 3"]
 ) -> Float32[np.ndarray, "nodes 3"]:
     """Central differences at nodes that are not on the border, per two nodes."""
     parts = []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy import ndimage
 
 from avatar.rig import Rig
@@ -76,8 +76,8 @@ def _bounds(
 
 def _occupied_nodes(
     occupied: UInt8[np.ndarray, "cx cy cz"],
-    offset: Float32[np.ndarray, "3"],
-    step: Float32[np.ndarray, "3"],
+    offset: Float[np.ndarray, "3"],
+    step: Float[np.ndarray, "3"],
     counts: Int[np.ndarray, "3"],
 ) -> Iterator[Int[np.ndarray, "nodes 3"]]:
     """Lattice nodes inside occupied cells, some 10⁵ at a time."""

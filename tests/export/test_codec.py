@@ -1,0 +1,93 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture.errors import BadInput
+from export.bake import weight_codes
+from export.codec import Layout, decode, encode
+from export.tables import LOG_DENSITY, Bricks, Surfels, Tables, density_codes
+
+
+def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: float) -> Tables:
+    rng = np.random.default_rng(seed)
+    nodes = np.array(counts) * 8 + 1
+    lattice = rng.integers(0, 256, (*nodes, 4), dtype=np.uint8)
+    lattice[-1] = lattice[:, -1] = lattice[:, :, -1] = 0  # a lattice ends in emptiness
+    used = rng.random(counts) < share
+    index = np.zeros(counts, np.int32)
+    index[used] = np.arange(1, used.sum() + 1)
+    for block in np.argwhere(~used):
+        lattice[tuple(slice(8 * b, 8 * b + 8) for b in block)] = 0
+    voxels = np.zeros((used.sum() + 1, 9, 9, 9, 4), np.uint8)
+    for number, block in enumerate(np.argwhere(used), start=1):
+        voxels[number] = lattice[tuple(slice(8 * b, 8 * b + 9) for b in block)]
+    return Tables(
+        surfels=Surfels(
+            low=rng.normal(size=3).astype(np.float32),
+            extent_m=float(rng.random()),
+            spacing_m=0.005,
+            position_codes=rng.integers(0, 65536, (surfels, 3), dtype=np.uint16),
+            normal_codes=rng.integers(-127, 128, (surfels, 3), dtype=np.int8),
+            thickness_codes=rng.integers(0, 256, surfels, dtype=np.uint8),
+            weight_codes=rng.integers(0, 256, (24, surfels), dtype=np.uint8),
+            gradient_codes=rng.integers(-127, 128, (surfels, 3, 24), dtype=np.int8),
+        ),
+        bricks=Bricks(
+            low=rng.normal(size=3).astype(np.float32), voxel_m=0.004, index=index, voxels=voxels
+        ),
+        pelvis=rng.normal(size=3).astype(np.float32),
+        reach_m=1.5,
+    )
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if dataclasses.is_dataclass(left):
+            assert_same(left, right)
+        else:
+            np.testing.assert_array_equal(left, right, err_msg=field.name, strict=True)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    surfels=st.integers(1, 40),
+    counts=st.tuples(*[st.integers(1, 3)] * 3),
+    share=st.floats(0, 1),
+)
+def test_tables_come_back_from_their_streams_bit_by_bit(seed, surfels, counts, share):
+    tables = random_tables(seed, surfels, counts, share)
+    layout, streams = Layout.of(tables), encode(tables)
+    for name, (dtype, shape) in layout.streams().items():
+        assert len(streams[name]) == np.dtype(dtype).itemsize * np.prod(shape)
+    assert_same(tables, decode(streams, layout))
+
+
+def test_blocks_that_do_not_match_the_bricks_are_refused():
+    tables = random_tables(0, 5, (2, 2, 2), 0.5)
+    streams = encode(tables)
+    streams["blocks"] = bytes([255])
+    with pytest.raises(BadInput, match="blocks"):
+        decode(streams, Layout.of(tables))
+
+
+@given(
+    st.lists(st.floats(0, 1), min_size=24, max_size=24).filter(lambda w: sum(w) > 1e-3),
+)
+def test_weight_codes_sum_to_one_and_stay_close(weights):
+    weights = np.array([weights])
+    codes = weight_codes(weights).astype(int)
+    assert codes.sum() == 255
+    assert np.abs(codes / 255 - weights / weights.sum()).max() < 1 / 255
+
+
+def test_density_codes_are_logarithmic_and_zero_is_empty():
+    low, high = LOG_DENSITY
+    density = np.exp(np.linspace(low, high, 1000))
+    restored = np.exp(density_codes(density) / 255.0 * (high - low) + low)
+    np.testing.assert_allclose(restored, density, rtol=0.5 * (high - low) / 255 * 1.02)
+    assert density_codes(np.array([0.0, 0.4, 1e9])).tolist() == [0, 0, 255]

@@ -1,0 +1,70 @@
+import numpy as np
+import onnxruntime
+import pytest
+
+from export.nodes import Graph
+
+
+def run(graph, value, **inputs):
+    graph.output(value, "out", ["n"])
+    session = onnxruntime.InferenceSession(
+        graph.model().SerializeToString(), providers=["CPUExecutionProvider"]
+    )
+    return session.run(None, inputs)[0]
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x: 2.0 * x + 1.0 - x * x,
+        lambda x: 3.0 - x / 4.0,
+        lambda x: 1.0 / x,
+        lambda x: -x * (x - 0.5),
+    ],
+)
+def test_an_expression_means_the_same_in_numpy_and_in_a_graph(formula):
+    x = np.random.default_rng(0).normal(size=50).astype(np.float32)
+    graph = Graph()
+    result = run(graph, formula(graph.input("x", np.float32, [50])), x=x)
+    np.testing.assert_allclose(result, formula(x), rtol=1e-6)
+
+
+def test_a_number_takes_the_type_of_the_value_beside_it():
+    graph = Graph()
+    x = graph.input("x", np.int32, [3])
+    result = run(graph, (x * 5 + 1) // 2, x=np.array([0, 1, 7], dtype=np.int32))
+    assert result.dtype == np.int32
+    assert result.tolist() == [0, 3, 18]
+
+
+def test_bits_are_masked_and_shifted_without_a_sign():
+    graph = Graph()
+    x = graph.input("x", np.int32, [2])
+    numbers = np.array([-1, 0x12345678], dtype=np.int32)
+    assert run(graph, x.shifted_right(16), x=numbers).tolist() == [0xFFFF, 0x1234]
+    graph = Graph()
+    x = graph.input("x", np.int32, [2])
+    assert run(graph, x.masked(0xFFFF), x=numbers).tolist() == [0xFFFF, 0x5678]
+
+
+@pytest.mark.parametrize("turns", [0, 1, 7])
+def test_a_loop_does_its_body_as_often_as_it_is_told(turns):
+    graph = Graph()
+    x, count = graph.input("x", np.float32, [4]), graph.input("count", np.int64, [])
+
+    def body(turn, states):
+        power, total = states
+        return [power * x, total + power * turn.cast(np.float32)]
+
+    _, total = graph.loop(count, [x * 0.0 + 1.0, x * 0.0], body)
+    numbers = np.array([0.5, 1.0, -1.0, 2.0], dtype=np.float32)
+    expected = sum((numbers**i * i for i in range(turns)), np.zeros(4))
+    result = run(graph, total, x=numbers, count=np.array(turns))
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
+
+
+def test_equal_constants_are_stored_once():
+    graph = Graph()
+    x = graph.input("x", np.float32, [1])
+    graph.output((x + 2.0) * 2.0 - 2.0, "out", [1])
+    assert len(graph.model().graph.initializer) == 1

@@ -1,0 +1,215 @@
+import json
+import os
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.errors import BadInput
+from export import build
+from export.build import export_field
+from export.errors import ExportRefused
+from export.package import read_package, write_package
+from export.player import Player
+
+
+def rewritten(source, target, change):
+    """A copy of a package whose entries went through `change(name, content)`; None drops one."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            changed = change(name, old.read(name))
+            if changed is not None:
+                new.writestr(name, changed)
+    return target
+
+
+def with_manifest(**changes):
+    def change(name, content):
+        if name != "manifest.json":
+            return content
+        return json.dumps(json.loads(content) | changes).encode()
+
+    return change
+
+
+def test_a_package_comes_back_byte_by_byte(exported, tmp_path):
+    package = read_package(exported.path)
+    again = tmp_path / "again.iavatar"
+    assert write_package(package, again) == exported.bytes
+    assert again.read_bytes() == exported.path.read_bytes()
+
+
+def test_the_manifest_says_what_the_package_is(exported):
+    with zipfile.ZipFile(exported.path) as archive:
+        content = json.loads(archive.read("manifest.json"))
+        assert set(archive.namelist()) - {"manifest.json"} == set(content["sha256"])
+    assert content["format"] == 1
+    assert len(content["joints"]) == len(content["rest_joints"]) == 24
+    assert "metres" in content["units"]
+    assert content["metrics"] == {"psnr": 30.0}
+    note = content["tiers"]["hq"]
+    assert note["psnr_to_renderer"] == exported.psnr_to_renderer["hq"] > 30
+    assert max(side for frame in content["golden"] for side in frame["size_px"]) <= 128
+
+
+def test_every_altered_byte_of_a_stream_is_noticed(exported, tmp_path):
+    content = bytearray(exported.path.read_bytes())
+    whole, noticed = read_package(exported.path).manifest.to_json(), []
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(content) - 1, 12):
+        damaged = content.copy()
+        damaged[place] ^= 0x55
+        path = tmp_path / "damaged.iavatar"
+        path.write_bytes(damaged)
+        try:
+            package = read_package(path)
+        except BadInput as error:
+            noticed.append(str(error))
+        else:  # a byte that carries no content, such as a time stamp
+            assert package.manifest.to_json() == whole
+    assert len(noticed) > 6
+    assert all("damaged.iavatar" in message for message in noticed)
+
+
+def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
+    def change(name, content):
+        return content[:-1] + b"x" if name == "hq/weights.bin" else content
+
+    path = rewritten(exported.path, tmp_path / "x.iavatar", change)
+    with pytest.raises(BadInput, match=r"altered: hq/weights\.bin"):
+        read_package(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_package_is_refused(exported, tmp_path, share):
+    content = exported.path.read_bytes()
+    path = tmp_path / "short.iavatar"
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(BadInput, match="truncated"):
+        read_package(path)
+
+
+def test_a_missing_file_and_a_missing_entry_are_named(exported, tmp_path):
+    with pytest.raises(BadInput, match="no package"):
+        read_package(tmp_path / "none.iavatar")
+    path = rewritten(
+        exported.path,
+        tmp_path / "x.iavatar",
+        lambda name, content: None if name == "player.onnx" else content,
+    )
+    with pytest.raises(BadInput, match=r"player\.onnx is missing"):
+        read_package(path)
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "..\\evil", "C:evil"])
+def test_paths_out_of_the_archive_are_refused(exported, tmp_path, name):
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(exported.path.read_bytes())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(name, b"evil")
+    with pytest.raises(BadInput, match="outside"):
+        read_package(path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.iavatar"]
+
+
+def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path):
+    def change(name, content):
+        return bytes(200 << 20) if name == "hq/thickness.bin" else content
+
+    path = rewritten(exported.path, tmp_path / "bomb.iavatar", change)
+    with pytest.raises(BadInput, match=r"thickness\.bin claims 209715200 bytes"):
+        read_package(path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"surfels": 10**9}, {"brick_counts": [10**6, 10**6, 10**6]}, {"bricks": -1}]
+)
+def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported, tmp_path, change):
+    with zipfile.ZipFile(exported.path) as archive:
+        tiers = json.loads(archive.read("manifest.json"))["tiers"]
+    tiers["hq"]["layout"] |= change
+    path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(tiers=tiers))
+    with pytest.raises(BadInput, match="claims"):
+        read_package(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 2}, "format 2"),
+        ({"rest_joints": [[0.0]]}, "damaged"),
+        ({"rest_joints": [[float("nan")] * 3] * 24}, "damaged"),
+        ({"parents": [-1] + [23] * 23}, "damaged"),
+        ({"tiers": {"hq": {}}}, "damaged"),
+        ({"tiers": []}, "damaged"),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_refused(exported, tmp_path, change, message):
+    path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(**change))
+    with pytest.raises(BadInput, match=message):
+        read_package(path)
+
+
+def test_a_tier_that_is_not_there_is_named(exported):
+    with pytest.raises(BadInput, match=r"no tier 'lite'; it has: hq"):
+        Player.load(exported.path, tier="lite")
+
+
+@pytest.fixture
+def export(stand_in, views, truth, coarse, tmp_path):
+    """Exports the bent stand-in, or something else in its place."""
+
+    def run(**changes):
+        arguments = {
+            "occupied": stand_in.occupied,
+            "path": tmp_path / "a.iavatar",
+            "views": [views["bent"]],
+            "metrics": {},
+            "renderer": lambda pose, camera: truth["bent"],
+            "config": coarse,
+        }
+        return export_field(stand_in.field_at, stand_in.rig, **(arguments | changes))
+
+    return run
+
+
+def test_a_player_that_differs_from_the_renderer_is_refused_and_leaves_nothing(
+    export, truth, tmp_path
+):
+    with pytest.raises(ExportRefused, match="dB"):
+        export(renderer=lambda pose, camera: np.roll(truth["bent"], 12, axis=1))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_graph_that_differs_from_its_twin_is_refused_and_leaves_nothing(
+    export, tmp_path, monkeypatch
+):
+    right = build.build_graph
+    monkeypatch.setattr(
+        build, "build_graph", lambda tables, rules: right(tables, replace(rules, longest_m=0.01))
+    )
+    with pytest.raises(ExportRefused, match="2/255"):
+        export()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_avatar_of_nothing_is_refused(export, stand_in, tmp_path):
+    with pytest.raises(ExportRefused, match="empty"):
+        export(occupied=np.zeros_like(stand_in.occupied))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
+    path = tmp_path / "a.iavatar"
+    path.write_bytes(b"older")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    package = read_package(exported.path)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="space"):
+        write_package(package, path)
+    assert path.read_bytes() == b"older"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.iavatar"]

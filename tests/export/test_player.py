@@ -1,0 +1,148 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avatar.metrics import psnr
+from capture.errors import BadInput
+from export.player import Likeness, Player, premultiplied, verify
+from export.twin import Shot, draw, read
+from preprocess.pose import BodyPose
+
+
+@pytest.fixture(scope="module")
+def player(exported):
+    return Player.load(exported.path)
+
+
+def on_white(picture):
+    return np.clip(picture[..., :3] + 1 - picture[..., 3:], 0, 1)
+
+
+@pytest.mark.parametrize("posed", ["canonical", "bent"])
+@pytest.mark.parametrize(("size", "distance_m"), [((96, 120), 3.0), ((131, 77), 1.2)])
+def test_the_graph_draws_what_its_twin_draws(
+    player, tables, stand_in, bent, camera, posed, size, distance_m
+):
+    pose = stand_in.canonical if posed == "canonical" else bent
+    view = camera(*size, distance_m=distance_m)
+    rules = player.manifest.tiers["hq"].rules
+    shot = Shot(
+        bones=player.bones(pose, view),
+        focal=np.array(view.focal_px, np.float32),
+        center=np.array(view.center_px, np.float32),
+        size_px=size,
+        samples=5,
+    )
+    drawn = premultiplied(player.render(pose, view, samples=5))
+    likeness = Likeness.of(drawn, draw(tables, rules, shot))
+    assert drawn[..., 3].mean() > 0.05
+    assert likeness.alike, likeness
+
+
+@pytest.mark.parametrize(("posed", "least"), [("canonical", 36.0), ("bent", 32.5)])
+def test_the_player_shows_what_volume_rendering_shows(player, views, truth, posed, least):
+    drawn, exact = premultiplied(player.render(*views[posed])), truth[posed]
+    assert psnr(on_white(drawn), on_white(exact)) > least
+    assert abs(drawn[..., 3].sum() / exact[..., 3].sum() - 1) < 0.02
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 200), (333, 90)])
+def test_any_size_can_be_drawn(player, bent, camera, size):
+    picture = player.render(bent, camera(*size))
+    assert picture.shape == (size[1], size[0], 4)
+    assert picture.dtype == np.uint8
+
+
+def test_moving_person_and_camera_together_changes_nothing(player, stand_in, bent, camera):
+    view, shift = camera(80, 100), np.array([5.0, -3.0, 7.0])
+    world = np.eye(4)
+    world[:3, 3] = -shift
+    moved = replace(view, camera_from_world=view.camera_from_world @ world)
+    pose = replace(bent, root_translation=bent.root_translation + shift)
+    a, b = player.render(bent, view), player.render(pose, moved)
+    assert Likeness.of(premultiplied(a), premultiplied(b)).close > 0.995
+
+
+def test_shifting_the_centre_by_whole_pixels_shifts_the_picture(player, bent, camera):
+    view = camera(90, 90)
+    x, y = view.center_px
+    shifted = player.render(bent, replace(view, center_px=(x + 6.0, y - 4.0)))
+    likeness = Likeness.of(
+        premultiplied(shifted[:-4, 6:]), premultiplied(player.render(bent, view)[4:, :-6])
+    )
+    assert likeness.alike
+
+
+def test_an_avatar_out_of_sight_leaves_the_picture_empty(player, bent, camera):
+    behind = replace(bent, root_translation=np.array([0.0, 0.0, 8.0]))
+    assert not player.render(behind, camera(50, 40)).any()
+    aside = replace(bent, root_translation=np.array([30.0, 0.0, 0.0]))
+    assert not player.render(aside, camera(50, 40)).any()
+
+
+def test_a_close_up_has_no_holes(player, stand_in, camera):
+    view = camera(160, 160, distance_m=0.75)
+    alpha = player.render(stand_in.canonical, view)[..., 3]
+    chest = alpha[:90, 70:90]
+    assert chest.min() > 245
+
+
+def test_more_samples_converge(player, bent, camera):
+    view = camera(96, 96)
+    pictures = [premultiplied(player.render(bent, view, samples=n)) for n in (2, 8, 32, 128)]
+    errors = [float(np.abs(p - pictures[-1]).mean()) for p in pictures[:-1]]
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_what_cannot_be_drawn_is_said(player, bent, camera):
+    with pytest.raises(BadInput, match="distortion"):
+        player.render(bent, replace(camera(9, 9), distortion=(0.1,)))
+    with pytest.raises(BadInput, match="samples"):
+        player.render(bent, camera(9, 9), samples=0)
+
+
+def test_bricks_give_linear_ramps_back(tables):
+    """Tetrahedra interpolate what is linear exactly: colour codes along any line."""
+    bricks = tables.bricks
+    i, j, k = np.meshgrid(*[np.arange(9)] * 3, indexing="ij")
+    ramp = (3 * i + 7 * j + 11 * k + 5).astype(np.uint8)
+    voxels = np.stack([ramp, ramp, ramp, np.full_like(ramp, 200)], axis=-1)[None]
+    one = replace(
+        bricks, low=np.zeros(3, np.float32), voxel_m=1.0, index=np.zeros((1, 1, 1), np.int32),
+        voxels=voxels,
+    )  # fmt: skip
+    points = np.random.default_rng(0).uniform(0, 8, (500, 3)).astype(np.float32)
+    rgb, density = read(one, points)
+    np.testing.assert_allclose(rgb[:, 0] * 255, points @ [3, 7, 11] + 5, rtol=1e-4)
+    assert np.ptp(density) < 1e-3 * density.max()
+
+
+def test_golden_frames_are_drawn_again_without_a_difference(exported):
+    likenesses = verify(exported.path)
+    assert len(likenesses) == 2
+    assert all(likeness.alike for likeness in likenesses)
+
+
+def test_the_player_needs_numpy_and_onnxruntime_alone(exported):
+    code = f"""
+import sys
+import numpy as np
+from capture.camera import Camera
+from export.player import Player
+from preprocess.pose import BodyPose
+player = Player.load({str(exported.path)!r})
+camera = Camera(focal_px=(60.0, 60.0), center_px=(20.0, 25.0), size_px=(40, 50),
+                camera_from_world=np.diag([1.0, -1.0, -1.0, 1.0]))
+assert player.render(BodyPose.rest(), camera).shape == (50, 40, 4)
+heavy = {{"torch", "cv2", "scipy", "numba", "onnx", "PIL"}} & set(sys.modules)
+sys.exit(f"the player pulls in {{heavy}}" if heavy else 0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_resting_is_a_pose_too(player, camera):
+    assert player.render(BodyPose.rest(), camera(60, 60)).any()
