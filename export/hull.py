@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Int, Int32
 from scipy import ndimage
 
 from export.lattice import Lattice
@@ -82,12 +82,19 @@ def _resampled(
 
 def _largest_parts(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Solid without floaters, and with what it encloses."""
-    parts, _ = ndimage.label(solid)
+    parts = _labelled(solid)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     kept = sizes >= SMALLEST_PART * sizes.max()
-    outside, _ = ndimage.label(~kept[parts])
+    outside = _labelled(~kept[parts])
     return outside != outside[0, 0, 0]
+
+
+def _labelled(mask: Bool[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
+    """The number of each connected part; 0 outside of the mask."""
+    parts = np.zeros(mask.shape, dtype=np.int32)
+    ndimage.label(mask, output=parts)
+    return parts
 
 
 def _crossings(

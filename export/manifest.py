@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass, fields
+from math import isfinite
 from typing import Any, TypeVar
 
 import numpy as np
@@ -96,11 +97,11 @@ class Manifest:
             "canonical_rotations": self.canonical_rotations.tolist(),
             "tiers": {name: asdict(tier) for name, tier in self.tiers.items()},
             "golden": [_golden_to_json(frame) for frame in self.golden],
-            "metrics": self.metrics,
+            "metrics": _finite(self.metrics),
             "licence": self.licence,
             "sha256": self.sha256,
         }
-        return json.dumps(content, indent=1)
+        return json.dumps(content, indent=1, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: bytes) -> "Manifest":
@@ -125,6 +126,15 @@ class Manifest:
             if isinstance(error, BadInput):
                 raise
             raise BadInput(f"The package's manifest is damaged: {error!r}.") from error
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN and no infinity: they become null."""
+    if isinstance(value, dict):
+        return {str(key): _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def _parsed(text: bytes) -> dict[str, Any]:

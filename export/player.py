@@ -83,7 +83,7 @@ class Player:
             "width": np.array(width, dtype=np.int64),
             "samples": np.array(samples, dtype=np.int64),
         }
-        return self._session.run(["rgba"], inputs)[0]
+        return np.asarray(self._session.run(["rgba"], inputs)[0])
 
     def bones(self, pose: BodyPose, camera: Camera) -> Float32[np.ndarray, "24 3 4"]:
         """Camera-from-canonical matrices of the joints."""

@@ -18,7 +18,7 @@ from preprocess.kinematics import body_from_rest
 from preprocess.pose import BodyPose
 
 RADII_CM = [12, 8, 8, 12, 6, 6, 13, 5, 5, 13, 5, 5, 7, 7, 7, 10, 6, 6, 5, 5, 4, 4, 4, 4]
-STEP_M = 0.004
+STEP_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,13 @@ class StandIn:
         directions = camera.directions(camera.pixel_centers()).reshape(-1, 3) @ root[:3, :3]
         origin = (camera.center_world - root[:3, 3]) @ root[:3, :3]
         bones = self.rig.body_from_canonical(pose.joint_rotations)
-        skin, nearest = _posed(self.rig, self.rig.seeds, bones), 0.12
+        skin, nearest = _posed(self.rig, self.rig.seeds, bones), 0.10
         tree = cKDTree(skin)
         far = np.linalg.norm(skin - origin, axis=1)
         steps = np.arange(far.min() - nearest, far.max() + nearest, STEP_M)
         picture = np.zeros((width * height, 4))
-        for start in range(0, len(steps), 16):  # sixteen steps share one look at what is near
-            some = steps[start : start + 16]
+        for start in range(0, len(steps), 12):  # twelve steps share one look at what is near
+            some = steps[start : start + 12]
             near = tree.query(origin + directions * some.mean())[0] < nearest
             rays = np.flatnonzero(near & (picture[:, 3] < 0.999))
             points = origin + some[:, None, None] * directions[rays]
@@ -174,7 +174,7 @@ def tables(stand_in: StandIn, coarse: BakeConfig) -> Tables:
 
 @pytest.fixture(scope="session")
 def views(stand_in: StandIn, bent: BodyPose) -> dict[str, tuple[BodyPose, Camera]]:
-    view = camera_of(72, 90)
+    view = camera_of(64, 80)
     return {"canonical": (stand_in.canonical, view), "bent": (bent, view)}
 
 

@@ -72,6 +72,13 @@ def test_every_altered_byte_of_a_stream_is_noticed(exported, tmp_path):
     assert all("damaged.iavatar" in message for message in noticed)
 
 
+def test_metrics_without_a_value_are_null(exported):
+    manifest = replace(
+        read_package(exported.path).manifest, metrics={"psnr": [float("nan"), 1.5], "n": 3}
+    )
+    assert json.loads(manifest.to_json())["metrics"] == {"psnr": [None, 1.5], "n": 3}
+
+
 def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
     def change(name, content):
         return content[:-1] + b"x" if name == "hq/weights.bin" else content
