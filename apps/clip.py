@@ -133,7 +133,7 @@ def _quiet() -> Iterator[None]:
         os.close(nothing)
 
 
-def _even(picture: Rgb) -> Rgb:
+def _even(picture: Rgb) -> UInt8[np.ndarray, "even_height even_width 3"]:
     """Video codecs want even sizes: the last row or column is doubled where needed."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -45,9 +45,9 @@ def _axes(x: Place, y: Place, low: float, high: float, end: float) -> list[str]:
     parts = [
         f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y(decibels):.1f}" '
         f'y2="{y(decibels):.1f}"/>'
-        f'<text class="tick" x="{LEFT - 8}" y="{y(decibels) + 4:.1f}" text-anchor="end">'
-        f"{decibels}</text>"
-        for decibels in range(int(low), int(high) + 1, 5)
+        f'<text class="tick" x="{LEFT - 8}" y="{y(decibels) + 4.0:.1f}" text-anchor="end">'
+        f"{decibels:g}</text>"
+        for decibels in (float(n) for n in range(int(low), int(high) + 1, 5))
     ]
     parts += [
         f'<text class="tick" x="{x(seconds):.1f}" y="{HEIGHT - 12}" text-anchor="middle">'

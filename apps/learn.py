@@ -119,9 +119,11 @@ class Lesson:
         for warning in self._recording.source.warnings:
             self._console.warn(warning)
         self._console.count_the_rest()
+        scores: tuple[Score, ...] = ()
         if len(self._trainer.replay):
+            self._save()  # scoring takes a while
+            scores = self._final_scores()
             self._save()
-        scores = self._final_scores()
         return Learnt(
             trainer=self._trainer,
             held=self._held,
@@ -192,7 +194,7 @@ class Lesson:
         return point
 
     def _final_scores(self) -> tuple[Score, ...]:
-        if not (self._held and len(self._trainer.replay)):
+        if not self._held:
             return ()
         with self._console.waiting(f"scoring {len(self._held)} held-out frames"):
             scores = tuple(score(self._trainer.avatar, held) for held in self._held)

@@ -109,11 +109,11 @@ def _clip(given: PlayArguments, console: Console) -> int:
     player = Player.load(given.avatar)
     shots = _shots(given, player, console)
     fps = given.fps or _rate(shots.motion)
-    with console.bar(f"drawing {out.name}", len(shots.rows)) as bar:
+    with console.bar(f"drawing {out.name}", float(len(shots.rows))) as bar:
 
         def pictures() -> Iterator[np.ndarray]:
             for done, (pose, camera) in enumerate(shots):
-                bar.move(done, f"{done}/{len(shots.rows)} pictures")
+                bar.move(float(done), f"{done}/{len(shots.rows)} pictures")
                 yield player.render(pose, camera)
 
         count = write_clip(out, pictures(), fps=fps, blend=blend)

@@ -1,0 +1,135 @@
+"""A short film of the actor and a short run on it, shared by all tests of the commands."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apps import deliver, ingest, learn, play
+from apps.studio.writer import ShootConfig, shoot
+from avatar import warm
+from avatar.rig import Rig
+from avatar.train import train
+from export.build import ExportReport
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How a command ended.
+
+    Attributes:
+        code: Its exit code.
+        out, err: What it said.
+    """
+
+    code: int
+    out: str
+    err: str
+
+    def complaint(self, program: str = "ia-ingest") -> str:
+        """Its one message, as one line of words."""
+        said = [line for line in self.err.splitlines() if line.startswith(f"{program}:")]
+        assert len(said) == 1, self.err
+        assert "Traceback" not in self.err
+        return said[0]
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session")
+def film(tmp_path_factory) -> Path:
+    """A capture folder: 24 frames of 64 px."""
+    folder = tmp_path_factory.mktemp("film") / "capture"
+    shoot(folder, ShootConfig(frames=24, size=64, background="plain"))
+    return folder
+
+
+def train_on_everything(trainer, inbox, held):
+    """As `train`, but all frames are ready before it begins, however slow the machine is."""
+    assert inbox._ended.wait(timeout=60.0)
+    yield from train(trainer, inbox, held)
+
+
+@pytest.fixture(scope="session")
+def run(film, tmp_path_factory) -> Path:
+    """What ia-ingest makes of it in three seconds."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learn, "train", train_on_everything)
+        assert ingest.main([str(film), "--out", str(out), "--seconds", "3"]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def rig(shaped) -> Rig:
+    """The rig of the embedded body, which all of these films are about."""
+    return Rig.of(shaped)
+
+
+@pytest.fixture
+def capture(film, tmp_path) -> Path:
+    """A copy of the film that a test may spoil."""
+    copy = tmp_path / "capture"
+    shutil.copytree(film, copy)
+    return copy
+
+
+@pytest.fixture
+def call_ingest(capsys, monkeypatch, rig) -> Command:
+    """Runs ia-ingest, half a second long unless the test says otherwise."""
+    monkeypatch.setattr(learn, "train", train_on_everything)
+    monkeypatch.setattr(learn.Rig, "of", lambda shaped: rig)
+    monkeypatch.setattr(warm, "warm_up", lambda trainer: 0.0)
+
+    def call(*arguments: object, seconds: float = 0.5) -> Outcome:
+        words = [str(argument) for argument in arguments]
+        code = ingest.main([*words, "--seconds", str(seconds)])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err)
+
+    return call
+
+
+@pytest.fixture
+def call_play(capsys) -> Command:
+    """Runs ia-play."""
+
+    def call(*arguments: object) -> Outcome:
+        code = play.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err)
+
+    return call
+
+
+@pytest.fixture
+def without_baking(monkeypatch) -> None:
+    """Leaves out the seconds that baking takes, where a test is not about the package."""
+
+    def export_nothing(avatar, path, *, views, metrics):
+        path.write_bytes(b"stand-in")
+        return ExportReport(
+            path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
+            largest_difference=0.0, warnings=(),
+        )  # fmt: skip
+
+    monkeypatch.setattr(deliver, "export_avatar", export_nothing)
+    monkeypatch.setattr(deliver, "novel", lambda player: "data:,")
+    monkeypatch.setattr(deliver.Player, "load", lambda path: None)
+
+
+@pytest.fixture
+def changed() -> Callable[..., None]:
+    """Rewrites an .npz with some arrays changed, or left out where they are None."""
+
+    def change(path: Path, **arrays: np.ndarray | None) -> None:
+        with np.load(path) as archive:
+            content = {key: archive[key] for key in archive.files}
+        content.update(arrays)
+        np.savez(path, **{key: array for key, array in content.items() if array is not None})
+
+    return change

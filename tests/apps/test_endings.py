@@ -1,0 +1,191 @@
+"""How commands end, and files that appear whole or not at all."""
+
+import errno
+import io
+import threading
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console as RichConsole
+
+from apps.background import background
+from apps.console import MOST_WARNINGS, Console
+from apps.exit_codes import Stop, exit_code
+from apps.meter import Meter
+from apps.run_folder import RunFolder
+from apps.whole import whole_file, whole_folder, write_text
+from capture.errors import BadInput
+from capture.images import read_image
+
+
+def raising(error):
+    def work():
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "word"),
+    [
+        (BadInput("3 poses for 4 frames"), 2, "3 poses for 4 frames"),
+        (OSError(errno.ENOSPC, "No space left on device"), 3, "full"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), 3, "full"),
+        (OSError(errno.EBUSY, "Device or resource busy"), 3, "busy"),
+        (RuntimeError("CUDA error: out of memory\nat line 3"), 3, "out of memory"),
+        (PermissionError(errno.EACCES, "Permission denied", "/out"), 2, "/out"),
+        (MemoryError(), 3, "memory"),
+        (KeyboardInterrupt(), 130, "Ctrl-C"),
+        (Stop("too [blurred]", 1), 1, "too [blurred]"),
+    ],
+)
+def test_each_failure_has_its_number_and_one_message(error, code, word, capsys):
+    assert exit_code("ia-test", raising(error)) == code
+    said = capsys.readouterr().err
+    assert said.startswith("ia-test: ")
+    assert word in said
+    assert said.count("\n") == 1
+
+
+def test_what_is_added_on_the_way_is_said(capsys):
+    error = OSError(errno.ENOSPC, "No space left on device")
+    error.add_note("The checkpoint is kept.")
+    assert exit_code("ia-test", raising(error)) == 3
+    assert "The checkpoint is kept." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), RuntimeError("shape"), OSError(5, "EIO")])
+def test_our_own_faults_keep_their_traceback(error):
+    with pytest.raises(type(error)):
+        exit_code("ia-test", raising(error))
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path):
+    path = tmp_path / "deep" / "report.json"
+    write_text(path, "old")
+    with whole_file(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+        assert part.suffix == path.suffix
+    assert path.read_text() == "new"
+    assert [file.name for file in path.parent.iterdir()] == ["report.json"]
+
+
+def test_a_file_that_fails_leaves_the_older_one(tmp_path):
+    path = tmp_path / "report.json"
+    write_text(path, "old")
+
+    def fails():
+        with whole_file(path) as part:
+            part.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fails()
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_folder_that_fails_leaves_the_older_one(tmp_path):
+    path = tmp_path / "frames"
+    with whole_folder(path) as part:
+        (part / "0000.png").write_bytes(b"old")
+
+    def fails():
+        with whole_folder(path) as part:
+            (part / "0000.png").write_bytes(b"half")
+            raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        fails()
+    assert (path / "0000.png").read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["frames"]
+
+
+def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):
+    run = RunFolder(path=tmp_path / "run")
+    run.begin(resume=False)
+    assert not run.holds_a_run()
+    run.checkpoint.mkdir()
+    (run.checkpoint / "state.pt").write_bytes(b"learnt")
+    (run.path / "notes.txt").write_text("mine")
+    run.begin(resume=True)
+    assert run.has_checkpoint()
+    assert "--resume" in run.what_is_kept()
+    run.begin(resume=False)
+    assert [file.name for file in run.path.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_folder_that_stayed_empty_goes(tmp_path):
+    run = RunFolder(path=tmp_path / "run")
+    run.begin(resume=False)
+    run.checkpoint.mkdir()
+    run.tidy()
+    assert not run.path.exists()
+
+
+def test_resuming_and_overwriting_contradict(tmp_path):
+    with pytest.raises(BadInput, match="one of them"):
+        RunFolder(path=tmp_path).check(resume=True, overwrite=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="is a file"):
+        RunFolder(path=tmp_path / "file").check(resume=False, overwrite=False)
+
+
+def test_warnings_are_said_once_and_not_for_ever():
+    said = io.StringIO()
+    console = Console(RichConsole(file=said, soft_wrap=True))
+    for number in range(MOST_WARNINGS + 3):
+        console.warn(f"frame {number} [bold]")
+        console.warn(f"frame {number} [bold]")
+    console.count_the_rest()
+    assert said.getvalue().count("frame") == MOST_WARNINGS
+    assert "and 3 more" in said.getvalue()
+    assert "[bold]" in said.getvalue()
+    assert len(console.warnings) == MOST_WARNINGS + 3
+
+
+def test_a_log_gets_plain_lines_and_few(monkeypatch):
+    said = io.StringIO()
+    console = Console(RichConsole(file=said))
+    with console.bar("learning", 60.0) as bar:
+        for step in range(100):
+            bar.move(float(step), f"step {step}")
+        monkeypatch.setattr("apps.console.LOG_EVERY_S", 0.0)
+        bar.move(60.0, "the end")
+    assert said.getvalue() == "learning: the end\n"
+
+
+def test_a_meter_times_what_passes_and_stops_when_asked():
+    stop = threading.Event()
+    meter = Meter(stop)
+
+    def slow():
+        for number in range(5):
+            time.sleep(0.02)
+            yield number
+
+    taken = []
+    for number in meter.timed(slow()):
+        taken.append(number)
+        if number == 2:
+            stop.set()
+    assert taken == [0, 1, 2]
+    assert 20.0 <= meter.ingest_ms().p50 <= meter.ingest_ms().p95
+    assert meter.first_at is not None
+
+
+def test_colours_and_pictures_stand_behind_an_avatar(tmp_path, rng):
+    rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    rgba[0, :, 3], rgba[1, :, 3] = 0, 255
+    on_blue = background("rgb(10, 20, 250)")(rgba)
+    assert (on_blue[0] == [10, 20, 250]).all()
+    np.testing.assert_array_equal(on_blue[1], rgba[1, :, :3])
+    from PIL import Image
+
+    path = tmp_path / "wall.png"
+    Image.fromarray(rng.integers(0, 256, (6, 20, 3), dtype=np.uint8)).save(path)
+    on_wall = background(str(path))(rgba)
+    np.testing.assert_array_equal(on_wall[0], read_image(path)[0][0, 6:14])
+    np.testing.assert_array_equal(on_wall[1], rgba[1, :, :3])

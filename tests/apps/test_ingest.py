@@ -1,0 +1,229 @@
+"""The whole walk, from a film to a run folder."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from apps import learn
+from avatar import checkpoint
+from export.player import Player
+
+KEYS = {
+    "": "format command recipe machine frames training held_out held_out_refined curve stream "
+    "package",
+    "machine": "device backend threads",
+    "frames": "read used held_out dropped not_replayed",
+    "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
+    "samples_per_ray peak_memory_mb",
+    "held_out": "frames size psnr psnr_mask ssim lpips background poses",
+    "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds",
+    "package": "path bytes seconds psnr_to_renderer",
+}
+
+FEW = ("--frames", "0:8")
+"""Enough for everything that is not about how well something was learnt."""
+
+
+@pytest.fixture(scope="module")
+def report(run):
+    return json.loads((run / "report.json").read_text())
+
+
+def test_a_run_leaves_four_things(run):
+    assert sorted(file.name for file in run.iterdir()) == [
+        "avatar.iavatar",
+        "checkpoint",
+        "report.html",
+        "report.json",
+    ]
+
+
+def test_the_report_has_the_keys_that_were_agreed(report):
+    for place, keys in KEYS.items():
+        found = report[place] if place else report
+        assert list(found) == keys.split()
+    assert set(report["curve"][0]) == {
+        "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask",
+    }  # fmt: skip
+    assert set(report["stream"]["ingest_ms"]) == {"p50", "p95"}
+    assert set(report["package"]["psnr_to_renderer"]) == {"hq", "lite"}
+
+
+def test_every_frame_is_accounted_for(report):
+    frames = report["frames"]
+    assert frames == {"read": 24, "used": 22, "held_out": 2, "dropped": [], "not_replayed": 0}
+    assert report["held_out"]["frames"] == [9, 19]
+    assert report["held_out"]["size"] == [64, 64]
+
+
+def test_something_was_learnt(report):
+    # an empty picture scores about 15 dB
+    assert report["held_out"]["psnr"] > 25.0
+    assert report["held_out"]["psnr_mask"] < report["held_out"]["psnr"]
+    assert report["package"]["psnr_to_renderer"]["hq"] >= 30.0
+
+
+def test_the_clock_counts_training_alone(report):
+    training = report["training"]
+    assert 3.0 <= training["wall_seconds"] < 4.0
+    assert training["rays"] == training["steps"] * report["recipe"]["rays"]
+    expected = training["rays"] / training["wall_seconds"]
+    assert training["rays_per_second"] == pytest.approx(expected, rel=1e-4)
+    assert report["curve"][-1]["wall_seconds"] == training["wall_seconds"]
+    assert report["curve"][0]["wall_seconds"] == pytest.approx(2.0, abs=0.5)
+
+
+def test_the_package_is_the_one_that_was_reported(run, report):
+    assert (run / "avatar.iavatar").stat().st_size == report["package"]["bytes"]
+    player = Player.load(run / "avatar.iavatar")
+    assert player.manifest.metrics["held_out"]["psnr"] == pytest.approx(
+        report["held_out"]["psnr"], abs=1e-4
+    )
+
+
+def test_the_page_needs_nothing_else(run):
+    page = (run / "report.html").read_text()
+    assert page.count("data:image/webp;base64,") == 5  # two pairs and the novel poses
+    assert "http" not in page.replace("http-equiv", "")
+    assert "<svg" in page
+
+
+def test_nothing_is_written_outside_the_run(capture, call_ingest, without_baking, tmp_path):
+    before = sorted(tmp_path.rglob("*"))
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    assert outcome.code == 0
+    after = [
+        file for file in tmp_path.rglob("*") if (tmp_path / "run") not in [file, *file.parents]
+    ]
+    assert sorted(after) == before
+
+
+def test_an_older_run_is_not_lost_by_accident(capture, call_ingest, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert "--overwrite" in outcome.complaint()
+    assert (tmp_path / "run" / "report.json").read_text() == "{}"
+
+
+def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.json").write_text("{}")
+    copy = tmp_path / "copy.json"
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", "--overwrite", "--json", copy)
+    assert outcome.code == 0
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["format"] == 1
+    assert copy.read_text() == (tmp_path / "run" / "report.json").read_text()
+
+
+def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
+    out = tmp_path / "run"
+    assert "no checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
+    first = json.loads((out / "report.json").read_text())
+    outcome = call_ingest(capture, *FEW, "--out", out, "--resume", seconds=1.5)
+    second = json.loads((out / "report.json").read_text())
+    assert outcome.code == 0
+    assert second["training"]["wall_seconds"] == pytest.approx(1.5, abs=0.3)
+    assert second["training"]["steps"] > first["training"]["steps"]
+    assert second["curve"][: len(first["curve"])] == first["curve"]
+    assert second["frames"] == first["frames"]
+
+
+def test_a_full_disk_keeps_the_checkpoint_before(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(learn, "CHECKPOINT_EVERY_S", 0.3)
+    save, written = torch.save, []
+
+    def full_after_one(state, file):
+        if written:
+            file.write(b"half of it")
+            raise OSError(28, "No space left on device")
+        written.append(save(state, file))
+
+    monkeypatch.setattr(torch, "save", full_after_one)
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", seconds=5.0)
+    assert outcome.code == 3
+    assert "--resume" in outcome.complaint()
+    left = [file.name for file in (tmp_path / "run").rglob("*") if file.is_file()]
+    assert left == ["state.pt"]
+    trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint", torch.device("cpu"))
+    assert 0.0 < trainer.wall_seconds < 5.0
+
+
+def test_a_disk_that_is_full_from_the_start_leaves_nothing(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch
+):
+    def full(state, file):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    assert outcome.code == 3
+    assert "Nothing was written" in outcome.complaint()
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_what_was_learnt(film, tmp_path):
+    command = [sys.executable, "-m", "apps.ingest", str(film), "--out", str(tmp_path / "run")]
+    with subprocess.Popen(
+        [*command, "--seconds", "120"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        said = ""
+        while " dB" not in said:  # the first mark of the curve
+            line = process.stderr.readline()
+            assert line, said
+            said += line
+        os.kill(process.pid, signal.SIGINT)
+        stopped_at = time.perf_counter()
+        said += process.stderr.read()
+        assert process.wait() == 130
+    assert time.perf_counter() - stopped_at < 60.0
+    assert "Traceback" not in said
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert 2.0 <= report["training"]["wall_seconds"] < 60.0
+    assert len(report["held_out"]["frames"]) >= 1
+    Player.load(tmp_path / "run" / "avatar.iavatar")
+    assert (tmp_path / "run" / "checkpoint" / "state.pt").exists()
+
+
+def test_pictures_are_shrunk_but_never_enlarged(capture, call_ingest, without_baking, tmp_path):
+    for size, expected in ((48, [48, 48]), (200, [64, 64])):
+        out = tmp_path / f"run{size}"
+        assert call_ingest(capture, *FEW, "--out", out, "--size", size).code == 0
+        report = json.loads((out / "report.json").read_text())
+        assert report["held_out"]["size"] == expected
+
+
+def test_few_frames_hold_out_the_last_quarter(capture, call_ingest, without_baking, tmp_path):
+    out = tmp_path / "run"
+    assert call_ingest(capture, "--out", out, "--frames", "2:14:1").code == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["held_out"]["frames"] == [11, 12, 13]
+    assert report["frames"]["read"] == 12
+
+
+def test_lost_poses_are_left_out_and_listed(
+    capture, call_ingest, without_baking, tmp_path, changed
+):
+    with np.load(capture / "poses.npz") as archive:
+        places = archive["transl"].copy()
+    places[[3, 7]] = np.nan
+    changed(capture / "poses.npz", transl=places)
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    assert outcome.code == 0
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["frames"]["dropped"] == [
+        {"index": 3, "reason": "pose invalid"},
+        {"index": 7, "reason": "pose invalid"},
+    ]
+    assert report["frames"]["read"] == 8

@@ -1,0 +1,162 @@
+"""The report: numbers that a machine can read and a page that needs nothing else."""
+
+import json
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from apps.curve_svg import curve_svg
+from apps.pictures import data_uri, moving_data_uri
+from apps.report import (
+    CurvePoint,
+    DroppedNote,
+    FramesNote,
+    HeldOutNote,
+    MachineNote,
+    Milliseconds,
+    Report,
+    StreamNote,
+    TrainingNote,
+    mean,
+)
+from apps.report_page import Pair, report_page
+from avatar.events import Score
+
+
+def point(seconds, psnr, psnr_mask=None):
+    return CurvePoint(
+        wall_seconds=seconds, cpu_seconds=seconds, frames_seen=9, psnr=psnr, psnr_mask=psnr_mask
+    )
+
+
+def report(**changes):
+    content = {
+        "command": {"video": "a <b> & c.mp4"},
+        "recipe": {"rays": 1024, "finest_m": 0.0081234567},
+        "machine": MachineNote(device="cpu", backend="numba", threads=2),
+        "frames": FramesNote(
+            read=20,
+            used=17,
+            held_out=2,
+            dropped=(DroppedNote(index=7, reason="pose invalid"),),
+            not_replayed=0,
+        ),
+        "training": TrainingNote(
+            wall_seconds=60.0,
+            cpu_seconds=61.0,
+            startup_seconds=3.0,
+            steps=100,
+            rays=102400,
+            rays_per_second=1706.7,
+            samples_per_ray=7.0,
+            peak_memory_mb=900.0,
+        ),
+        "held_out": HeldOutNote.of((), None),
+        "curve": (point(2.0, 24.0, 18.0), point(5.0, 29.0, 23.0)),
+        "stream": StreamNote(
+            realtime=False,
+            ingest_ms=Milliseconds(p50=20.0, p95=30.0),
+            inbox_dropped=0,
+            ready_after_last_frame_seconds=None,
+        ),
+        "package": None,
+    }
+    return Report(**{**content, **changes})
+
+
+def scores(*values):
+    return tuple(
+        Score(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
+        for i, (psnr, mask) in enumerate(values)
+    )
+
+
+def test_the_mean_leaves_out_what_is_no_number():
+    assert mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
+    assert mean([float("nan")]) is None
+    assert mean([]) is None
+
+
+def test_a_frame_without_a_person_has_no_masked_score():
+    note = HeldOutNote.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
+    assert (note.psnr, note.psnr_mask) == (31.0, 20.0)
+    assert note.frames == (9, 19)
+
+
+def test_nothing_to_score_is_null():
+    content = json.loads(report().to_json())
+    assert content["held_out"]["psnr"] is None
+    assert content["held_out"]["frames"] == []
+    assert content["package"] is None
+    assert content["held_out_refined"] is None
+
+
+def test_the_file_holds_no_number_that_json_does_not_know():
+    text = report(curve=(point(2.0, float("nan"), float("inf")),)).to_json()
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert content["curve"][0]["psnr"] is None
+    assert content["curve"][0]["psnr_mask"] is None
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects addresses."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.addresses = [], []
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_asks_for_no_other_file():
+    white = data_uri(np.full((4, 4, 3), 255, np.uint8))
+    page = report_page(
+        report(),
+        name="a <b> & c.mp4",
+        pairs=[Pair(frame=9, psnr=30.0, truth=white, render=white)],
+        novel=moving_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
+        warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
+    )
+    tags = Tags(page)
+    assert len(tags.addresses) == 3
+    assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
+    assert "a &lt;b&gt; &amp; c.mp4" in page
+    assert "masks &lt;turned&gt;" in page
+    assert "Left out, pose invalid: frame 7." in page
+    assert "url(" not in page
+    assert "prefers-color-scheme: dark" in page
+
+
+def test_a_page_without_pictures_or_scores_is_whole_too():
+    page = report_page(report(curve=()), name="clip")
+    assert Tags(page).addresses == []
+    assert "<svg" not in page
+    assert "n/a" in page
+
+
+def test_the_curve_goes_up_when_the_score_does():
+    svg = ElementTree.fromstring(curve_svg((point(2.0, 24.0), point(5.0, 29.0), point(9.0, 29.0))))
+    (line,) = svg.findall("polyline")
+    places = [tuple(map(float, pair.split(","))) for pair in line.get("points").split()]
+    (x0, y0), (x1, y1), (x2, y2) = places
+    assert x0 < x1 < x2
+    assert y0 > y1 == y2
+    assert (x1 - x0) / (x2 - x1) == pytest.approx(3.0 / 4.0, abs=0.01)
+    width, height = map(float, svg.get("viewBox").split()[2:])
+    assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
+
+
+def test_nothing_measured_draws_nothing():
+    assert curve_svg((point(2.0, None),)) == ""
