@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-import zipfile
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -97,15 +97,13 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
         return trainer, state["notes"]
     except BadInput:
         raise
-    except (RuntimeError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise BadInput(
-            f"The checkpoint {path} cannot be read ({error}). "
-            "Expected one that ia-ingest wrote. Train again with --overwrite."
-        ) from error
-    except Exception as error:
-        if type(error).__name__ != "UnpicklingError":
-            raise
+    except pickle.UnpicklingError as error:
         raise BadInput(
             f"The checkpoint {path} holds something other than numbers and is refused. "
             "Train again with --overwrite."
+        ) from error
+    except Exception as error:  # what a damaged file makes torch stumble over has many types
+        raise BadInput(
+            f"The checkpoint {path} cannot be read ({error}). "
+            "Expected one that ia-ingest wrote. Train again with --overwrite."
         ) from error
