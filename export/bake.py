@@ -29,6 +29,8 @@ FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.012
 """Bricks reach this far outside of the hull."""
+VOXEL_SHARE = 0.53
+"""Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 EMPTY = (
     f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
     "Nothing was written. Train it longer (--resume), or check the masks."
@@ -48,6 +50,11 @@ class BakeConfig:
     voxel_m: float = 0.004
     surfel_spacing_m: float = 0.005
     hull_density: float = 20.0
+
+    @classmethod
+    def for_cells(cls, finest_m: float) -> "BakeConfig":
+        """For a field whose finest cells are that long: about two voxels each, 4 to 6 mm."""
+        return cls(voxel_m=float(np.clip(VOXEL_SHARE * finest_m, 0.004, 0.006)))
 
 
 def bake(

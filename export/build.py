@@ -84,7 +84,7 @@ def export_avatar(
             the first few become golden frames. Lens distortion is left out.
         metrics: What training reported, kept in the manifest (JSON).
         renderer: The exact picture of an avatar.
-        config: How finely to bake.
+        config: How finely to bake; follows the field's own finest cells if None.
 
     Raises:
         ExportRefused: If the player would not draw what the avatar looks like, or there is nothing
@@ -93,6 +93,7 @@ def export_avatar(
     """
     occupied = avatar.rendering_grid().occupied.cpu().numpy()
     device = avatar.field.table.device
+    finest_m = 1.0 / float(avatar.field.levels.cells_per_m[-1])
 
     def field_at(
         points: Float32[torch.Tensor, "points 3"],
@@ -108,7 +109,7 @@ def export_avatar(
         views=views,
         metrics=metrics,
         renderer=lambda pose, camera: renderer(avatar, pose, camera),
-        config=config,
+        config=config or BakeConfig.for_cells(finest_m),
     )
 
 
