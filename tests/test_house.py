@@ -1,0 +1,174 @@
+"""House rules that a machine can check."""
+
+import ast
+import importlib
+import importlib.util
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+STAGES = ("capture", "preprocess", "avatar", "export", "apps")
+"""In the order in which data walks; imports walk the other way."""
+MOST_LINES = 400
+MOST_LINES_OF_A_FUNCTION = {"avatar/kernels": 100}
+"""A kernel's loop is one function, for a call inside it would be slow; others have 80 at most."""
+TORCH_FREE = ("capture", "preprocess", "export.player")
+PLAYER_FREE = ("torch", "cv2", "scipy", "numba", "onnx", "trimesh", "pycolmap")
+
+
+def sources():
+    """Every Python file of the stages, with its syntax tree."""
+    for stage in STAGES:
+        for path in sorted((ROOT / stage).rglob("*.py")):
+            yield path.relative_to(ROOT), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def modules(package):
+    """A package and everything below it, by name."""
+    below = pkgutil.walk_packages([str(ROOT / package.replace(".", "/"))], package + ".")
+    return [package, *(found.name for found in below)]
+
+
+def imported(tree):
+    """What a file imports, wherever in the file it does; relative imports begin with dots."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or "")
+
+
+def wrong_arrows(stage, tree):
+    """Imports that do not point leftwards."""
+    later = STAGES[STAGES.index(stage) + 1 :]
+    return [name for name in imported(tree) if name.startswith(".") or name.split(".")[0] in later]
+
+
+def loads(names, forbidden):
+    """What of the forbidden has been loaded in a fresh interpreter that imports the names."""
+    code = (
+        f"import importlib, sys\nfor name in {names!r}: importlib.import_module(name)\n"
+        f"print(*(name for name in {forbidden!r} if name in sys.modules))"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+# --- imports ----------------------------------------------------------------------------------
+
+
+def test_data_walks_right_and_imports_walk_left():
+    wrong = {
+        str(path): arrows
+        for path, tree in sources()
+        if (arrows := wrong_arrows(path.parts[0], tree))
+    }
+    assert not wrong, f"imports of a later stage, or relative ones: {wrong}"
+
+
+@pytest.mark.parametrize(
+    ("stage", "line", "is_wrong"),
+    [
+        ("capture", "import avatar.rig", True),
+        ("preprocess", "def f():\n from export.player import Player", True),
+        ("avatar", "from . import rig", True),
+        ("export", "from avatar import rig", False),
+        ("apps", "import capture, preprocess, avatar, export", False),
+        ("avatar", "import avatar.rig, exporters", False),
+    ],
+)
+def test_the_check_of_imports_can_fail(stage, line, is_wrong):
+    assert bool(wrong_arrows(stage, ast.parse(line))) == is_wrong
+
+
+@pytest.mark.parametrize("package", TORCH_FREE)
+def test_what_stands_before_or_after_training_loads_without_torch(package):
+    names = modules(package) if package in STAGES else [package]
+    assert loads(names, ("torch",)) == []
+
+
+def test_the_player_loads_with_numpy_and_onnxruntime_alone():
+    assert loads(["export.player"], PLAYER_FREE) == []
+
+
+def test_the_checks_of_what_is_loaded_can_fail():
+    assert loads(["avatar.rig", "capture.video"], ("scipy", "cv2", "onnx")) == ["scipy", "cv2"]
+    assert loads(["avatar.field"], ("torch",)) == ["torch"]
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_module_can_be_imported_and_comes_from_this_checkout(stage):
+    for name in modules(stage):
+        module = importlib.import_module(name)
+        assert module.__doc__, f"{name} does not say what it knows"
+        assert Path(module.__file__).is_relative_to(ROOT / stage)
+
+
+def test_the_stages_are_all_the_packages_there_are():
+    found = {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert found == set(STAGES)
+    assert not list((ROOT / "tests").rglob("__init__.py"))  # it would hide the real packages
+
+
+# --- size -------------------------------------------------------------------------------------
+
+
+def test_a_file_holds_one_idea():
+    lines = {
+        str(path): len((ROOT / path).read_text(encoding="utf-8").splitlines())
+        for path, _ in sources()
+    }
+    too_long = {path: count for path, count in lines.items() if count > MOST_LINES}
+    assert not too_long, f"over {MOST_LINES} lines (60 to 300 are the aim): {too_long}"
+
+
+def test_a_function_fits_a_screen_or_two():
+    lengths = {
+        (path, node.name): node.end_lineno - node.lineno + 1
+        for path, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
+    too_long = {
+        f"{path}:{name}": lines
+        for (path, name), lines in lengths.items()
+        if lines > MOST_LINES_OF_A_FUNCTION.get(path.parent.as_posix(), 80)
+    }
+    worst = sorted(((lines, f"{p}:{name}") for (p, name), lines in lengths.items()), reverse=True)
+    assert not too_long, f"too long (40 lines are the aim); the longest of all: {worst[:8]}"
+
+
+def test_no_folder_of_leftovers():
+    homeless = {"utils", "util", "common", "helpers", "helper", "misc", "types", "core"}
+    assert [str(path) for path, _ in sources() if homeless & {path.stem, *path.parts}] == []
+
+
+# --- what must not be told --------------------------------------------------------------------
+
+
+def tracked_texts():
+    """Every file that git keeps and that is text."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if listed.returncode:
+        pytest.skip("this is no git checkout")
+    for name in filter(None, listed.stdout.split("\0")):
+        path = ROOT / name
+        if not path.is_file():
+            continue
+        content = path.read_bytes()
+        if b"\0" not in content:
+            yield name, content.decode("utf-8", errors="replace")
+
+
+def test_no_file_knows_the_machine_it_was_written_on():
+    homes = ["/" + name + "/" for name in ("work", "farm", "root", "Users")]
+    told = [(name, home) for name, text in tracked_texts() for home in homes if home in text]
+    assert told == []
