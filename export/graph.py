@@ -4,8 +4,9 @@ import numpy as np
 import onnx
 
 from export.nodes import Graph, Value
-from export.raster import View, holes_filled, keys_behind, nearest_keys, pose_hull, splat
+from export.raster import holes_filled, keys_behind, nearest_keys, pose_hull, splat
 from export.rules import DrawingRules
+from export.scene import Scene, View
 from export.shading import Layer, shade
 from export.tables import Tables, initialisers
 
@@ -18,30 +19,38 @@ def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
     (height, width, 4), uint8, straight alpha. Its tables stay outside (`initialisers`).
     """
     graph = Graph()
-    view = _view(graph)
-    samples = graph.input("samples", np.int64, [])
-    columns = {name: graph.table(name, array) for name, array in initialisers(tables).items()}
-    hull = pose_hull(graph, columns, view)
-    splats = splat(graph, hull, view, tables, rules)
-
-    def layer(keys: Value, wanted: Value) -> Layer:
-        return shade(graph, columns, tables, hull, view, keys, wanted, samples, rules)
-
-    keys = holes_filled(graph, nearest_keys(graph, splats, view), view, tables, rules)
-    everywhere = graph.filled(graph.shape(view.pixels), np.True_)
-    first = layer(keys, everywhere)
-    empty = graph.filled(graph.shape(view.pixels), np.float32(0))
-    picture = [empty.scattered(first.pixel, channel) for channel in [*first.color, first.alpha]]
-    if rules.layers == 2:
-        passed = 1.0 - picture[3]
-        nearest = graph.filled(graph.shape(view.pixels), np.float32(1e6))
-        limit = nearest.scattered(first.pixel, first.depth + rules.gap_m)
-        wanted = passed > rules.transmitted
-        limit = graph.where(wanted, limit, 1e6)
-        second = layer(keys_behind(graph, splats, limit, view), wanted)
-        picture = _with_layer_behind(picture, second, passed)
-    graph.output(_as_bytes(graph, picture, view), "rgba", ["height", "width", 4])
+    scene = Scene(
+        graph=graph,
+        tables=tables,
+        columns={name: graph.table(name, array) for name, array in initialisers(tables).items()},
+        rules=rules,
+        view=_view(graph),
+        samples=graph.input("samples", np.int64, []),
+    )
+    picture = _picture(scene)
+    graph.output(_as_bytes(scene, picture), "rgba", ["height", "width", 4])
     return graph.model()
+
+
+def _picture(scene: Scene) -> list[Value]:
+    """Premultiplied colour and alpha, a value per channel with one entry a pixel."""
+    graph, rules = scene.graph, scene.rules
+    pixels = graph.shape(scene.view.pixels)
+    hull = pose_hull(scene)
+    splats = splat(scene, hull)
+    keys = holes_filled(scene, nearest_keys(scene, splats))
+    first = shade(scene, hull, keys, graph.filled(pixels, np.True_))
+    empty = graph.filled(pixels, np.float32(0))
+    picture = [empty.scattered(first.pixel, channel) for channel in [*first.color, first.alpha]]
+    if rules.layers == 1:
+        return picture
+    passed = 1.0 - picture[3]
+    wanted = passed > rules.transmitted
+    limit = graph.filled(pixels, np.float32(1e6))
+    limit = limit.scattered(first.pixel, first.depth + rules.gap_m)
+    limit = graph.where(wanted, limit, 1e6)
+    second = shade(scene, hull, keys_behind(scene, splats, limit), wanted)
+    return _with_layer_behind(picture, second, passed)
 
 
 def _view(graph: Graph) -> View:
@@ -65,11 +74,12 @@ def _with_layer_behind(picture: list[Value], second: Layer, passed: Value) -> li
     ]
 
 
-def _as_bytes(graph: Graph, picture: list[Value], view: View) -> Value:
+def _as_bytes(scene: Scene, picture: list[Value]) -> Value:
     """Eight bits a channel, straight alpha: colour is divided by alpha."""
+    view = scene.view
     *color, alpha = picture
     inverse = alpha.maximum(1e-6).reciprocal()
     channels = [*(channel * inverse for channel in color), alpha]
     planes = [channel.reshaped(1, view.height, view.width) for channel in channels]
-    image = graph.concatenated(planes).transposed(1, 2, 0)
+    image = scene.graph.concatenated(planes).transposed(1, 2, 0)
     return (image * 255.0 + 0.5).clipped(0.0, 255.0).cast(np.uint8)

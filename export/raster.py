@@ -5,34 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from export.columns import Matrix, Vector, dot, moved
-from export.nodes import Graph, Value
-from export.rules import DrawingRules
-from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
+from export.nodes import Value
+from export.scene import Scene
+from export.tables import DEPTH_STEPS, SURFEL_BITS
 
 FAR = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class View:
-    """Where a picture is taken from: values of the graph.
-
-    Attributes:
-        bones: Camera-from-canonical 3×4 matrices, one row of 12 a joint.
-        focal, center: (x, y) in pixels.
-        height, width: Scalars, int64.
-    """
-
-    bones: Value
-    focal: tuple[Value, Value]
-    center: tuple[Value, Value]
-    height: Value
-    width: Value
-
-    @property
-    def pixels(self) -> Value:
-        """How many there are, int64 scalar."""
-        return self.height * self.width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,23 +46,25 @@ class Splats:
     depth: Value
 
 
-def pose_hull(graph: Graph, tables: dict[str, Value], view: View) -> Hull:
+def pose_hull(scene: Scene) -> Hull:
     """Linear blend skinning of every surfel, straight into the camera's frame."""
-    skin = tables["skin"].cast(np.float32)
-    blended = (view.bones.transposed(1, 0) * (1.0 / 255.0)).matmul(skin)
+    columns = scene.columns
+    skin = columns["skin"].cast(np.float32)
+    blended = (scene.view.bones.transposed(1, 0) * (1.0 / 255.0)).matmul(skin)
     matrix = [[blended.row(4 * i + j) for j in range(4)] for i in range(3)]
-    canonical = [tables[f"position_{letter}"] for letter in "xyz"]
+    canonical = [columns[f"position_{letter}"] for letter in "xyz"]
     return Hull(
-        surfel=tables["surfel"],
+        surfel=columns["surfel"],
         canonical=canonical,
-        normal=[tables[f"normal_{letter}"] for letter in "xyz"],
+        normal=[columns[f"normal_{letter}"] for letter in "xyz"],
         camera_from_canonical=matrix,
         camera=moved(matrix, canonical),
     )
 
 
-def splat(graph: Graph, hull: Hull, view: View, tables: Tables, rules: DrawingRules) -> Splats:
+def splat(scene: Scene, hull: Hull) -> Splats:
     """Culls and projects the surfels and spreads them over their footprints."""
+    graph, view, rules = scene.graph, scene.view, scene.rules
     x, y, depth = hull.camera
     inverse = depth.maximum(rules.nearest_m).reciprocal()
     u = view.focal[0] * x * inverse + view.center[0]
@@ -95,22 +75,21 @@ def splat(graph: Graph, hull: Hull, view: View, tables: Tables, rules: DrawingRu
     seen = (depth > rules.nearest_m) & (facing < depth * rules.behind)
     seen = seen & (u > -margin) & (v > -margin)
     seen = graph.nonzero(seen & (u < width + margin) & (v < height + margin))
-    key = depth_code(depth, view, tables) * (1 << SURFEL_BITS) + hull.surfel
+    key = depth_code(scene, depth) * (1 << SURFEL_BITS) + hull.surfel
     u, v, depth, key, facing = (value.take(seen) for value in (u, v, depth, key, facing))
-    side = footprint(graph, depth, view, tables, rules)
-    pixel = _covered_pixels(graph, u, v, side, view)
-    behind_first = graph.where(facing < depth * -rules.facing, depth, 0.0)
+    side = footprint(scene, depth)
+    deep_enough = graph.where(facing < depth * -rules.facing, depth, 0.0)
     copies = graph.shape(side * side, 1)
     return Splats(
-        pixel=pixel,
-        key=_repeated(graph, key, copies),
-        depth=_repeated(graph, behind_first, copies),
+        pixel=_covered_pixels(scene, u, v, side),
+        key=_repeated(scene, key, copies),
+        depth=_repeated(scene, deep_enough, copies),
     )
 
 
-def depth_code(depth: Value, view: View, tables: Tables) -> Value:
+def depth_code(scene: Scene, depth: Value) -> Value:
     """Depth as an integer of 14 bits, in a window about the pelvis."""
-    root = view.bones.row(0)
+    tables, root = scene.tables, scene.view.bones.row(0)
     pelvis = root.row(11)
     for axis in range(3):
         pelvis = pelvis + root.row(8 + axis) * float(tables.pelvis[axis])
@@ -119,21 +98,23 @@ def depth_code(depth: Value, view: View, tables: Tables) -> Value:
     return steps.clipped(0.0, DEPTH_STEPS - 1.0).cast(np.int32)
 
 
-def footprint(graph: Graph, depth: Value, view: View, tables: Tables, rules: DrawingRules) -> Value:
+def footprint(scene: Scene, depth: Value) -> Value:
     """Pixels along the edge of every surfel's footprint, an int64 scalar of at least 2.
 
     It follows the spacing of the surfels where they are nearest to the camera, so that one does
     not see through the hull in a close-up.
     """
+    graph, rules, focal = scene.graph, scene.rules, scene.view.focal
     far = graph.constant(np.array([1e6], dtype=np.float32))  # so that there always is a smallest
     nearest = graph.concatenated([depth, far]).smallest()
-    spacing_px = view.focal[0].maximum(view.focal[1]) * tables.surfels.spacing_m / nearest
+    spacing_px = focal[0].maximum(focal[1]) * scene.tables.surfels.spacing_m / nearest
     side = (spacing_px * rules.footprint_spacings + 0.999).floor()
     return side.clipped(2.0, float(rules.largest_footprint_px)).cast(np.int64)
 
 
-def _covered_pixels(graph: Graph, u: Value, v: Value, side: Value, view: View) -> Value:
-    """The pixels about (u, v), one row of the footprint after the other; `pixels` = outside."""
+def _covered_pixels(scene: Scene, u: Value, v: Value, side: Value) -> Value:
+    """The pixels about (u, v), one place of the footprint after the other; `pixels` = outside."""
+    graph, view = scene.graph, scene.view
     zero, one = graph.constant(np.int64(0)), graph.constant(np.int64(1))
     corner = (side.cast(np.float32) - 1.0) * 0.5
     offset = graph.node("Range", zero, side * side, one).reshaped(-1, 1)
@@ -147,42 +128,43 @@ def _covered_pixels(graph: Graph, u: Value, v: Value, side: Value, view: View) -
     return graph.where(inside, pixel, view.pixels.cast(np.int32)).reshaped(-1)
 
 
-def _repeated(graph: Graph, value: Value, copies: Value) -> Value:
-    return graph.node("Expand", value.reshaped(1, -1), copies).reshaped(-1)
+def _repeated(scene: Scene, value: Value, copies: Value) -> Value:
+    return scene.graph.node("Expand", value.reshaped(1, -1), copies).reshaped(-1)
 
 
-def nearest_keys(graph: Graph, splats: Splats, view: View) -> Value:
+def nearest_keys(scene: Scene, splats: Splats) -> Value:
     """The z-buffer: the least key of every pixel, in one scatter."""
-    empty = graph.filled(graph.shape(view.pixels + 1), FAR)
-    keys = empty.scattered(splats.pixel, splats.key, reduction="min")
-    return keys.slices([0], [view.pixels])
+    return _z_buffer(scene, splats.pixel, splats.key)
 
 
-def holes_filled(
-    graph: Graph, keys: Value, view: View, tables: Tables, rules: DrawingRules
-) -> Value:
+def keys_behind(scene: Scene, splats: Splats, limit: Value) -> Value:
+    """The z-buffer of what lies deeper than `limit` (metres a pixel) and faces the camera."""
+    graph = scene.graph
+    nothing = graph.constant(np.array([1e6], dtype=np.float32))
+    behind = splats.depth > graph.concatenated([limit, nothing]).take(splats.pixel)
+    chosen = graph.nonzero(behind)
+    return _z_buffer(scene, splats.pixel.take(chosen), splats.key.take(chosen))
+
+
+def _z_buffer(scene: Scene, pixel: Value, key: Value) -> Value:
+    graph, pixels = scene.graph, scene.view.pixels
+    empty = graph.filled(graph.shape(pixels + 1), FAR)  # one more, for what lands outside
+    return empty.scattered(pixel, key, reduction="min").slices([0], [pixels])
+
+
+def holes_filled(scene: Scene, keys: Value) -> Value:
     """Fills single pixels that two opposite neighbours overtop."""
+    graph, view = scene.graph, scene.view
     image = keys.reshaped(view.height, view.width)
     border = graph.constant(np.array([1, 1, 1, 1], dtype=np.int64))
     padded = graph.node("Pad", image, border, graph.constant(FAR))
 
     def shifted(down: int, right: int) -> Value:
-        ends = [view.height + down, view.width + right]
-        return padded.slices([down, right], ends)
+        return padded.slices([down, right], [view.height + down, view.width + right])
 
     across = shifted(1, 0).maximum(shifted(1, 2))
     along = shifted(0, 1).maximum(shifted(2, 1))
     neighbours = across.minimum(along)
-    steps = int(rules.hole_m / (2.0 * tables.reach_m) * DEPTH_STEPS)
+    steps = int(scene.rules.hole_m / (2.0 * scene.tables.reach_m) * DEPTH_STEPS)
     hole = (image - (steps << SURFEL_BITS)) > neighbours
     return graph.where(hole, neighbours, image).reshaped(-1)
-
-
-def keys_behind(graph: Graph, splats: Splats, limit: Value, view: View) -> Value:
-    """The z-buffer of what lies deeper than `limit` (metres a pixel) and faces the camera."""
-    nothing = graph.constant(np.array([1e6], dtype=np.float32))
-    behind = splats.depth > graph.concatenated([limit, nothing]).take(splats.pixel)
-    chosen = graph.nonzero(behind)
-    empty = graph.filled(graph.shape(view.pixels + 1), FAR)
-    pixel, key = splats.pixel.take(chosen), splats.key.take(chosen)
-    return empty.scattered(pixel, key, reduction="min").slices([0], [view.pixels])

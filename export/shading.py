@@ -6,10 +6,10 @@ import numpy as np
 
 from export.columns import Matrix, Vector, adjugate, applied, dot, taken
 from export.lookup import FULL, read_bricks
-from export.nodes import Graph, Value
-from export.raster import FAR, Hull, View
-from export.rules import DrawingRules
-from export.tables import GRADIENT_LIMIT, SURFEL_BITS, Tables
+from export.nodes import Value
+from export.raster import FAR, Hull
+from export.scene import Scene, View
+from export.tables import GRADIENT_LIMIT, SURFEL_BITS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,6 +30,22 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Seen:
+    """What a pixel sees: values of the graph, one entry a covered pixel.
+
+    Attributes:
+        surfel: Its number.
+        canonical, normal: Its canonical position and normal.
+        camera: Its position in the camera's frame.
+    """
+
+    surfel: Value
+    canonical: Vector
+    normal: Vector
+    camera: Vector
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Segment:
     """A piece of a straight canonical ray: point(t) = origin + t · direction, t in posed metres."""
 
@@ -39,77 +55,54 @@ class Segment:
     length: Value
 
 
-def shade(
-    graph: Graph,
-    tables: dict[str, Value],
-    source: Tables,
-    hull: Hull,
-    view: View,
-    keys: Value,
-    wanted: Value,
-    samples: Value,
-    rules: DrawingRules,
-) -> Layer:
+def shade(scene: Scene, hull: Hull, keys: Value, wanted: Value) -> Layer:
     """Colour and alpha of every pixel that is `wanted` and covered.
 
     The map from canonical space to the camera's is taken as linear about the surfel that the
     pixel sees; its inverse carries the ray into canonical space.
     """
-    pixel = graph.nonzero((keys < FAR) & wanted)
+    pixel = scene.graph.nonzero((keys < FAR) & wanted)
     surfel = keys.take(pixel).masked((1 << SURFEL_BITS) - 1)
-    canonical, camera = taken(hull.canonical, surfel), taken(hull.camera, surfel)
-    normal = taken(hull.normal, surfel)
-    inverse = local_inverse(graph, tables, hull, view, surfel, canonical, camera, rules)
-    ray = _rays(view, pixel)
-    direction = applied(inverse, ray)
-    to_surfel = applied(inverse, camera)
-    begin, length = _extent(
-        graph,
-        normal,
-        direction,
-        to_surfel,
-        dot(camera, ray),
-        tables["thickness"].take(surfel),
-        rules,
+    seen = Seen(
+        surfel=surfel,
+        canonical=taken(hull.canonical, surfel),
+        normal=taken(hull.normal, surfel),
+        camera=taken(hull.camera, surfel),
     )
+    inverse = local_inverse(scene, hull, seen)
+    ray = _rays(scene.view, pixel)
+    direction, to_surfel = applied(inverse, ray), applied(inverse, seen.camera)
+    begin, length = _extent(scene, seen, direction, to_surfel, dot(seen.camera, ray))
     segment = Segment(
-        origin=[a - b for a, b in zip(canonical, to_surfel, strict=True)],
+        origin=[a - b for a, b in zip(seen.canonical, to_surfel, strict=True)],
         direction=direction,
         begin=begin,
         length=length,
     )
-    color, alpha = march(graph, tables, source, segment, samples)
+    color, alpha = march(scene, segment)
     return Layer(pixel=pixel, color=color, alpha=alpha, depth=begin * ray[2])
 
 
-def local_inverse(
-    graph: Graph,
-    tables: dict[str, Value],
-    hull: Hull,
-    view: View,
-    surfel: Value,
-    canonical: Vector,
-    camera: Vector,
-    rules: DrawingRules,
-) -> Matrix:
+def local_inverse(scene: Scene, hull: Hull, seen: Seen) -> Matrix:
     """Inverse of the derivative of linear blend skinning at each pixel's surfel.
 
-    With y(c) = Σ w_k(c) B_k c the derivative is Σ w_k B_k + Σ (B_k c − y) ∇w_kᵀ. Subtracting y,
+    With y(c) = Σ w_k(c) B_k c the derivative is Σ w_k B_k + Σ (B_k c - y) ∇w_kᵀ. Subtracting y,
     which changes nothing in exact numbers, keeps the rounding of the stored gradients from being
-    multiplied by the distance to the camera.
+    multiplied by the distance to the camera. Where the whole is out of shape, in the folds of
+    extreme poses, the first sum has to do.
     """
-    blended = [[row[j].take(surfel) for j in range(3)] for row in hull.camera_from_canonical]
-    gradient = tables["skin_gradient"].take_rows(surfel).cast(np.float32).reshaped(-1, 24)
+    graph, rules = scene.graph, scene.rules
+    blended = [[row[j].take(seen.surfel) for j in range(3)] for row in hull.camera_from_canonical]
+    gradient = scene.columns["skin_gradient"].take_rows(seen.surfel).cast(np.float32)
     ones = graph.constant(np.ones((24, 1), dtype=np.float32))
-    bones = graph.concatenated([view.bones, ones], axis=1) * (GRADIENT_LIMIT / 127.0)
-    terms = gradient.matmul(bones).reshaped(-1, 39).transposed(1, 0)
+    bones = graph.concatenated([scene.view.bones, ones], axis=1) * (GRADIENT_LIMIT / 127.0)
+    terms = gradient.reshaped(-1, 24).matmul(bones).reshaped(-1, 39).transposed(1, 0)
     full: Matrix = [[] for _ in range(3)]
-    for axis in range(3):  # of the gradient; then 12 sums of B_k and one of 1
-        row = 13 * axis
+    for axis in range(3):  # of the gradient; each has 12 sums over B_k and one over 1
+        sums = [terms.row(13 * axis + entry) for entry in range(13)]
         for i in range(3):
-            moved = dot([terms.row(row + 4 * i + j) for j in range(3)], canonical)
-            moved = moved + terms.row(row + 4 * i + 3) - terms.row(row + 12) * camera[i]
-            full[i].append(blended[i][axis] + moved)
+            lever = dot(sums[4 * i : 4 * i + 3], seen.canonical) + sums[4 * i + 3]
+            full[i].append(blended[i][axis] + lever - sums[12] * seen.camera[i])
     volume = _determinant(full)
     sound = (volume > 1.0 / rules.stretch) & (volume < rules.stretch)
     mixed = [
@@ -139,15 +132,11 @@ def _rays(view: View, pixel: Value) -> Vector:
 
 
 def _extent(
-    graph: Graph,
-    normal: Vector,
-    direction: Vector,
-    to_surfel: Vector,
-    along: Value,
-    thickness: Value,
-    rules: DrawingRules,
+    scene: Scene, seen: Seen, direction: Vector, to_surfel: Vector, along: Value
 ) -> tuple[Value, Value]:
     """Where the ray enters the hull's tangent plane, and how far it is followed from there."""
+    graph, rules, normal = scene.graph, scene.rules, seen.normal
+    thickness = scene.columns["thickness"].take(seen.surfel)
     falling = dot(normal, direction)
     shallow = -0.5 * rules.steepest
     hit = dot(normal, to_surfel) / falling.minimum(shallow)
@@ -160,15 +149,13 @@ def _extent(
     return begin - lead, (length + lead).minimum(rules.longest_m)
 
 
-def march(
-    graph: Graph, tables: dict[str, Value], source: Tables, segment: Segment, samples: Value
-) -> tuple[Vector, Value]:
+def march(scene: Scene, segment: Segment) -> tuple[Vector, Value]:
     """Front-to-back compositing of equal steps along the segment (a Loop: any number of them).
 
     Returns:
         Premultiplied colour and alpha in [0, 1].
     """
-    bricks = source.bricks
+    graph, bricks, samples = scene.graph, scene.tables.bricks, scene.samples
     step = segment.length / samples.cast(np.float32)
     scale = 1.0 / bricks.voxel_m
     start = [
@@ -181,7 +168,7 @@ def march(
         transmittance, *color = state
         distance = segment.begin + step * (turn.cast(np.float32) + 0.5)
         lattice = [a + distance * b for a, b in zip(start, slope, strict=True)]
-        sampled, density = read_bricks(graph, tables, bricks, lattice)
+        sampled, density = read_bricks(graph, scene.columns, bricks, lattice)
         passed = (-(density * step)).exp()
         weight = transmittance * (1.0 - passed)
         summed = [a + b * weight for a, b in zip(color, sampled, strict=True)]

@@ -5,10 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from avatar.config import TrainConfig
+from avatar.train import Trainer
 from capture.errors import BadInput
 from export import build
-from export.build import export_field
+from export.bake import BakeConfig
+from export.build import export_avatar, export_field
 from export.errors import ExportRefused
 from export.package import read_package, write_package
 from export.player import Player
@@ -205,6 +209,23 @@ def test_an_avatar_of_nothing_is_refused(export, stand_in, tmp_path):
     with pytest.raises(ExportRefused, match="empty"):
         export(occupied=np.zeros_like(stand_in.occupied))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_fog_of_an_untrained_avatar_is_refused(stand_in, views, coarse, tmp_path):
+    config = TrainConfig(table_size=1 << 10, finest_m=0.03)
+    avatar = Trainer(stand_in.rig, config, torch.device("cpu")).avatar
+    pose, camera = views["canonical"]
+    with pytest.raises(ExportRefused, match="dB"):
+        export_avatar(
+            avatar, tmp_path / "a.iavatar", views=[(pose, camera)], metrics={}, config=coarse
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_voxels_follow_the_field_within_bounds():
+    assert BakeConfig.for_cells(0.001).voxel_m == 0.004
+    assert 0.004 < BakeConfig.for_cells(0.009).voxel_m < 0.006
+    assert BakeConfig.for_cells(0.1).voxel_m == 0.006
 
 
 def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
