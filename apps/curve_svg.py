@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 
 from apps.report import CurvePoint
 
-WIDTH, HEIGHT = 720, 300
-LEFT, RIGHT, TOP, BOTTOM = 46, 16, 14, 34
+WIDTH, HEIGHT = 720, 320
+LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
 """Room around the plot for its labels."""
 
 Place = Callable[[float], float]
@@ -50,13 +50,13 @@ def _axes(x: Place, y: Place, low: float, high: float, end: float) -> list[str]:
         for decibels in (float(n) for n in range(int(low), int(high) + 1, 5))
     ]
     parts += [
-        f'<text class="tick" x="{x(seconds):.1f}" y="{HEIGHT - 12}" text-anchor="middle">'
+        f'<text class="tick" x="{x(seconds):.1f}" y="{HEIGHT - 28}" text-anchor="middle">'
         f"{seconds:g}</text>"
         for seconds in _ticks(end)
     ]
-    parts.append(f'<text class="unit" x="{LEFT}" y="{TOP - 3}" text-anchor="middle">dB</text>')
+    parts.append(f'<text class="unit" x="{LEFT - 8}" y="{TOP - 12}" text-anchor="end">dB</text>')
     parts.append(
-        f'<text class="unit" x="{WIDTH - RIGHT}" y="{HEIGHT - 1}" text-anchor="end">'
+        f'<text class="unit" x="{WIDTH - RIGHT}" y="{HEIGHT - 8}" text-anchor="end">'
         "seconds of training</text>"
     )
     return parts

@@ -13,7 +13,7 @@ def use_threads(wish: int | None) -> int:
         How many there are now; numba cannot have more than it started with.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    threads = max(1, min(wish or cores or 1, numba.config.NUMBA_NUM_THREADS))
+    threads = max(1, min(wish or cores or 1, numba.get_num_threads()))
     torch.set_num_threads(threads)
     numba.set_num_threads(threads)
     return threads

@@ -1,0 +1,65 @@
+"""Learns an avatar in a few lines of Python: film an actor, train, export.
+
+    python examples/1_learn_from_python.py [FOLDER]
+
+The events of `train` are all there is to listen to: a progress bar, a checkpoint or a curve is
+whatever you do with them.
+"""
+
+import sys
+from pathlib import Path
+
+import apps  # noqa: F401 - sets OpenMP's variables, which torch reads when it is imported
+
+# isort: split
+
+import torch
+
+from apps.recording import Recording, RecordingPaths
+from apps.studio.writer import ShootConfig, shoot
+from avatar.config import TrainConfig
+from avatar.events import Evaluated, Finished, Warned
+from avatar.hold import prepared
+from avatar.rig import Rig
+from avatar.train import Trainer, train
+from avatar.warm import warm_up
+from capture.inbox import Inbox
+from export.build import export_avatar
+
+SECONDS = 10.0
+
+
+def main(folder: Path) -> None:
+    # A film of somebody who does not exist; yours would be a video with poses and masks.
+    shoot(folder / "capture", ShootConfig(frames=48, size=96), overwrite=True)
+
+    # Everything that is known about it, checked before a frame is read.
+    recording = Recording.open(RecordingPaths(video=folder / "capture"))
+
+    # The rig never changes; the recipe follows from your patience and the size of a pixel.
+    rig = Rig.of(recording.shaped)
+    config = TrainConfig.within(SECONDS, footprint_m=recording.footprint_m())
+    trainer = Trainer(rig, config, torch.device("cpu"))
+    warm_up(trainer)  # compiles kernels, so that the clock counts learning alone
+
+    # One thread makes frames ready, this one learns from them as they come.
+    frames = prepared(recording.observations(), rig, every=10, total=recording.source.frame_count)
+    held_out = []
+    for event in train(trainer, Inbox(frames), held_out):
+        match event:
+            case Evaluated(wall_seconds=seconds, scores=scores) if scores:
+                psnr = sum(score.psnr for score in scores) / len(scores)
+                print(f"{seconds:5.1f} s  {psnr:.2f} dB on {len(scores)} frames it never learnt")
+            case Warned(message=message):
+                print(message)
+            case Finished(steps=steps):
+                print(f"{steps} steps")
+
+    # A package plays without torch; it is checked against the renderer before it is written.
+    views = [(held.observation.pose, held.observation.camera) for held in held_out[:4]]
+    report = export_avatar(trainer.avatar, folder / "avatar.iavatar", views=views, metrics={})
+    print(f"{report.path}: {report.bytes / 1e6:.1f} MB, {report.psnr_to_renderer}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "demo/python"))

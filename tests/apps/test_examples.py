@@ -1,0 +1,48 @@
+"""The examples run as they stand, only shorter."""
+
+import importlib.util
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from apps import learn
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location("example", EXAMPLES / name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_examples_are_one_walk_each():
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text().splitlines()) <= 80
+
+
+def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):
+    example = load("1_learn_from_python.py")
+    monkeypatch.setattr(example, "SECONDS", 3.0)
+    monkeypatch.setattr(example, "shoot", lambda out, config, overwrite: shutil.copytree(film, out))
+    monkeypatch.setattr(learn.Rig, "of", lambda shaped: rig)
+    example.main(tmp_path)
+    said = capsys.readouterr().out
+    assert (tmp_path / "avatar.iavatar").exists()
+    assert "steps" in said
+    assert "'hq'" in said
+
+
+def test_a_package_is_played_in_a_pose_of_our_own(run, tmp_path, capsys):
+    example = load("2_play_in_a_new_pose.py")
+    example.main(run / "avatar.iavatar", tmp_path / "pose.png")
+    with Image.open(tmp_path / "pose.png") as picture:
+        rgba = np.asarray(picture)
+    assert rgba.shape == (540, 540, 4)
+    assert 0.05 < (rgba[..., 3] > 0).mean() < 0.3
+    # the person's left arm is up, so the right half of the picture has its highest pixel
+    columns = np.flatnonzero(rgba[np.flatnonzero(rgba[..., 3].max(axis=1) > 127)[0], :, 3] > 127)
+    assert columns.mean() > 270
