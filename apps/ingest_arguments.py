@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.recording import Recording, RecordingPaths
 from apps.run_folder import RunFolder
 from capture.errors import BadInput
+
+Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,40 +32,40 @@ class IngestArguments:
 
     video: Positional[Path]
     """Video file, folder of pictures, or capture folder."""
-    poses: Path | None = None
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """SMPL poses, one a frame: an .npz with global_orient, body_pose, transl (or poses, trans)."""
-    masks: Path | None = None
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, one a frame: a folder of pictures, or an .npz; 255 where the person is."""
-    mask_invert: Annotated[bool, FlagCreatePairsOff] = False
+    mask_invert: Flag = False
     """The person is dark in the masks. Without either flag that is found out."""
-    no_mask_invert: Annotated[bool, FlagCreatePairsOff] = False
+    no_mask_invert: Flag = False
     """The person is bright in the masks."""
-    cameras: str | None = None
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A cameras.npz (intrinsic, extrinsic: one, or one a frame), or `static`: it never moved and
     nobody knows its focal length."""
-    body: Path | None = None
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Your own SMPL body, .npz or .pkl (nothing in it is executed); else the embedded body."""
-    out: Path | None = None
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the run; without it runs/NAME, after the video."""
-    resume: Annotated[bool, FlagCreatePairsOff] = False
+    resume: Flag = False
     """Go on with the run in --out: with the same video after an interruption, or with another."""
-    overwrite: Annotated[bool, FlagCreatePairsOff] = False
+    overwrite: Flag = False
     """Replace the run in --out."""
     seconds: float = 60.0
     """How long you will wait: seconds of training, after start-up."""
-    size: int | None = None
+    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of the pictures in pixels; they are never enlarged."""
     frames: str = "::"
     """Which frames, START:STOP:STEP, counted from 0."""
-    no_refine_poses: Annotated[bool, FlagCreatePairsOff] = False
+    no_refine_poses: Flag = False
     """Keep the poses as they are given. (This version always does.)"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto takes a GPU if there is one."""
-    threads: int | None = None
+    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Threads of the trainer; without it one for each core."""
     seed: int = 0
     """Of everything random."""
-    json: Path | None = None
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write a copy of report.json to this file."""
 
     def check(self) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, exit_code
@@ -19,6 +19,8 @@ from preprocess.pose import BodyPose, Motion
 
 if TYPE_CHECKING:
     from export.player import Player  # onnxruntime is loaded after --help has been answered
+
+Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,24 +40,24 @@ class PlayArguments:
 
     avatar: Positional[Path]
     """The .iavatar package."""
-    poses: Path | None = None
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Poses to move it through: an .npz with global_orient, body_pose, transl (or poses, trans)."""
-    camera: Path | None = None
+    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A cameras.npz to look through (one camera, or one for each pose)."""
-    out: Path | None = None
+    out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
     """Clip to write (.webm, .mp4, .gif), or a folder for RGBA frames 0000.png …; without it a
     .webm beside the package, named after the poses."""
-    size: int | None = None
+    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side in pixels; without it 540, or what --camera says."""
-    fps: float | None = None
+    fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Pictures a second; without it what the poses say, else 30."""
     background: str = "white"
     """Of clips: a colour (white, #203040) or a picture. Frames keep their alpha."""
-    bench: Annotated[bool, FlagCreatePairsOff] = False
+    bench: Flag = False
     """Write no pictures; say how long one takes. Without --poses it moves through a turn."""
-    verify: Annotated[bool, FlagCreatePairsOff] = False
+    verify: Flag = False
     """Write no pictures; draw the package's golden frames and compare them with the stored ones."""
-    json: Path | None = None
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """With --bench: write the figures to this file too."""
 
 
