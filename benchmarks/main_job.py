@@ -112,11 +112,10 @@ def measured(job: MainJob, folder: Path) -> list[Row]:
     report, whole = ingested(job, capture, run)
     unseen = observations(capture)
     rows = [*learning_rows(report), *novel_rows(run, unseen), *cost_rows(report, run)]
+    video = f"the video lasts {length(job):.1f} s"
     return [
         *rows,
-        Row(
-            name="whole ia-ingest, s", value=whole, reference=f"the video lasts {length(job):.1f} s"
-        ),
+        Row(name="whole ia-ingest, s", value=whole, reference=video),
         Row(name="filming the sample, s", value=filmed),
     ]
 
