@@ -122,6 +122,7 @@ def _trainer(
         return trainer, trainer.frames_seen, notes
     console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
     trainer.config = replace(trainer.config, seconds=had + given.seconds)
+    trainer.corrections.clear()  # they are of the other video's frames
     return trainer, 0, {**notes, "video": video}
 
 

@@ -152,7 +152,7 @@ class Lesson:
                     if isinstance(item, HeldOut):
                         self._held.append(item)
                     elif isinstance(item, PreparedFrame):
-                        self._trainer.replay.add(item)
+                        self._trainer.add(item, again=True)
                         seen += 1
         return seen
 

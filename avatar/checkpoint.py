@@ -46,6 +46,9 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
         "density": occupancy.density,
         "occupied": occupancy.occupied,
         "counts": {name: getattr(trainer, name) for name in COUNTS},
+        "corrections": {
+            frame: torch.from_numpy(numbers) for frame, numbers in trainer.corrections.items()
+        },
         "notes": notes or {},
     }
     path, part = folder / FILE, folder / (FILE + ".part")
@@ -92,6 +95,9 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
         grid = trainer.avatar.occupancy.grid
         grid.density.copy_(state["density"])
         grid.occupied.copy_(state["occupied"])
+        trainer.corrections = {
+            frame: tensor.numpy() for frame, tensor in state["corrections"].items()
+        }
         for name in COUNTS:
             setattr(trainer, name, state["counts"][name])
         return trainer, state["notes"]

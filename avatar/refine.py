@@ -20,17 +20,17 @@ from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
 from preprocess.pose import BodyPose
 
-ROTATION_RATE = 4e-3
-"""Adam's step for joints and root, radians."""
-TRANSLATION_RATE = 2e-3
-"""Adam's step for the root's place, metres."""
+STEP_M = 5e-3
+"""Adam's step: how far a correction moves what hangs on a joint, metres."""
 MOMENTS = 0.8, 0.95
 ENOUGH_RAYS = 256
 """A frame's pose moves when this many of its rays have been seen since it last did."""
-STRAYED_M = 0.015
+STRAYED_M = 0.04
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
+FORGOTTEN = 0.03
+"""Share of a correction that is given up at each step: what the pictures do not ask for goes."""
 FARTHEST = 0.35
 """A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
 
@@ -65,18 +65,27 @@ class PoseTable:
         self._first = np.zeros((capacity, 25, 3))
         self._second = np.zeros((capacity, 25, 3))
         self._times = np.zeros(capacity, dtype=int)
+        self._posed = np.zeros((capacity, 24, 4, 4))
         self._solved_at = np.zeros((capacity, 24, 3))
+        self._rest_from_canonical = np.linalg.inv(
+            body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
+        )
         self._below = _subtrees(rig)
+        self._lever = np.append(_levers(rig, self._below), 1.0)
 
-    def put(self, slot: int, pose: BodyPose) -> None:
-        """Takes in a frame's given pose."""
+    def put(
+        self, slot: int, pose: BodyPose, correction: Float[np.ndarray, "25 3"] | None = None
+    ) -> None:
+        """Takes in a frame's given pose, and its correction if one is known."""
         self._given[slot] = pose
         for values in (self.corrections, self._first, self._second, self._times):
             values[slot] = 0
+        if correction is not None:
+            self.corrections[slot] = correction
         self.wrenches[slot] = 0.0
         self._rays[slot] = 0
-        self._solved_at[slot] = self._posed_joints(slot)[0]
-        self._write_bones(slot)
+        self._move(slot)
+        self._solved_at[slot] = self._joint_places(slot)
 
     def pose(self, slot: int) -> BodyPose:
         """The corrected pose."""
@@ -115,7 +124,7 @@ class PoseTable:
         self.wrenches[slot] = 0.0
         self._rays[slot] = 0
         self._descend(slot, gradient, rate)
-        self._write_bones(slot)
+        self._move(slot)
         return slot
 
     def strayed(self, slot: int) -> bool:
@@ -123,7 +132,7 @@ class PoseTable:
 
         Saying so counts as solving it anew.
         """
-        places, _ = self._posed_joints(slot)
+        places = self._joint_places(slot)
         moved = np.linalg.norm(places - self._solved_at[slot], axis=1).max()
         if moved > STRAYED_M:
             self._solved_at[slot] = places
@@ -146,10 +155,9 @@ class PoseTable:
         wrench = self.wrenches[slot].double().cpu().numpy()
         total = self._below @ wrench
         force, moment = total[:, :3], total[:, 3:]
-        places, axes = self._posed_joints(slot)
-        turning = -(moment - np.cross(places, force))
+        turning = -(moment - np.cross(self._joint_places(slot), force))
         gradient = np.empty((25, 3))
-        gradient[:24] = np.einsum("jba,jb->ja", axes, turning)
+        gradient[:24] = np.einsum("jba,jb->ja", self._posed[slot, :, :3, :3], turning)
         gradient[24] = -wrench[:, :3].sum(axis=0)
         # the shift lives in the given body frame, the force in the corrected one
         gradient[24] = rotation_matrices(self.corrections[slot, 0]) @ gradient[24]
@@ -166,26 +174,26 @@ class PoseTable:
         step = (first / (1.0 - MOMENTS[0] ** times)) / (
             np.sqrt(second / (1.0 - MOMENTS[1] ** times)) + 1e-12
         )
-        step[:24] *= ROTATION_RATE * rate
-        step[24] *= TRANSLATION_RATE * rate
+        step *= STEP_M * rate / self._lever[:, None]
         held = [i for i, pose in enumerate(self._given) if pose is not None]
         mean = self.corrections[held].mean(axis=0)
-        moved = self.corrections[slot] - step - MEAN_PULL * mean
+        moved = (1.0 - FORGOTTEN) * self.corrections[slot] - step - MEAN_PULL * mean
         self.corrections[slot] = np.clip(moved, -FARTHEST, FARTHEST)
 
-    def _posed_joints(
-        self, slot: int
-    ) -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3 3"]]:
-        """Each joint's place, and its axes, in the body frame of the corrected pose."""
-        rest = self.rig.rest_joints
-        posed = body_from_rest(rest, self.rig.parents, self.pose(slot).joint_rotations)
-        places = np.einsum("jab,jb->ja", posed[:, :3, :3], rest) + posed[:, :3, 3]
-        return places, posed[:, :3, :3]
+    def _joint_places(self, slot: int) -> Float[np.ndarray, "24 3"]:
+        """Where the joints are, body frame, metres."""
+        posed = self._posed[slot]
+        turned = np.einsum("jab,jb->ja", posed[:, :3, :3], self.rig.rest_joints)
+        return turned + posed[:, :3, 3]
 
-    def _write_bones(self, slot: int) -> None:
-        bones = self.rig.body_from_canonical(self.pose(slot).joint_rotations)[:, :3]
-        values = torch.from_numpy(bones.reshape(24, 12).astype(np.float32))
-        self.bones[slot] = values.to(self.bones.device)
+    def _move(self, slot: int) -> None:
+        """Lets the slot's joints and bones follow its correction."""
+        rig = self.rig
+        self._posed[slot] = body_from_rest(
+            rig.rest_joints, rig.parents, self.pose(slot).joint_rotations
+        )
+        bones = (self._posed[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
+        self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)
 
 
 def _subtrees(rig: Rig) -> Float[np.ndarray, "24 24"]:
@@ -197,3 +205,9 @@ def _subtrees(rig: Rig) -> Float[np.ndarray, "24 24"]:
             below[joint, bone] = 1.0
             joint = int(rig.parents[joint])
     return below
+
+
+def _levers(rig: Rig, below: Float[np.ndarray, "24 24"]) -> Float[np.ndarray, "24"]:
+    """How far from each joint the farthest joint is that it moves, and a hand's width, metres."""
+    gap = np.linalg.norm(rig.rest_joints[:, None] - rig.rest_joints[None], axis=-1)
+    return (gap * below).max(axis=1) + 0.15

@@ -132,7 +132,7 @@ class Replay:
         """
         held = len(self)
         error = self._error[:held]
-        chance = 0.5 / held + 0.5 * error / error.sum()
+        chance = 0.5 / held + 0.5 * error / error.sum().clamp(min=1e-30)
 
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, device=self.device)

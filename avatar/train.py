@@ -4,7 +4,9 @@ import time
 from collections.abc import Iterator
 from typing import final
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
 from avatar.cells import WarpCells
 from avatar.config import COARSEST_M, TrainConfig
@@ -29,6 +31,7 @@ CLEARING_STEPS = 300
 """Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
 REFINED_AFTER_STEPS = 150
 """Poses are corrected once there is something to compare them with."""
+CORRECTIONS_PER_STEP = 2
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 """When the curve is measured, in seconds of training; then every 30 s."""
 
@@ -42,6 +45,8 @@ class Trainer:
         config: The recipe.
         replay: The frames it learns from.
         poses: Their poses, corrected if the recipe says so.
+        corrections: How each frame's pose was corrected, by the frame's number in its source; a
+            frame that comes again starts from there. Clear it before another source is read.
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
         frames_seen: Frames taken in so far, whether or not they are still kept.
@@ -62,6 +67,7 @@ class Trainer:
         )
         self.replay = Replay(config.key_frames, device)
         self.poses = PoseTable(rig, config.key_frames, device)
+        self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
@@ -75,11 +81,21 @@ class Trainer:
             fused=True,
         )
 
-    def add(self, frame: PreparedFrame) -> None:
-        """Takes in a frame to learn from."""
+    def add(self, frame: PreparedFrame, *, again: bool = False) -> None:
+        """Takes in a frame to learn from.
+
+        Args:
+            frame: Made ready.
+            again: It was learnt from before a checkpoint, and counts no second time.
+        """
         slot = self.replay.add(frame)
-        self.poses.put(slot, frame.pose)
-        self.frames_seen += 1
+        known = self.corrections.get(frame.index)
+        self.poses.put(slot, frame.pose, correction=known)
+        if known is not None:
+            joints = self.poses.pose(slot).joint_rotations
+            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
+            self.replay.move_root(slot, self.poses.root(slot))
+        self.frames_seen += not again
 
     def step(self, *, rate: float, hard_share: float) -> StepResult:
         """Draws rays, follows their gradient once, and keeps the occupancy up to date.
@@ -103,7 +119,8 @@ class Trainer:
         self.optimizer.step()
         field.table.grad.zero_()
         if refines:
-            self._correct_a_pose(rate)
+            for _ in range(CORRECTIONS_PER_STEP):
+                self._correct_a_pose(rate)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             clearing = self.steps < CLEARING_STEPS
@@ -131,6 +148,7 @@ class Trainer:
             bones = self.poses.bones[slot]
             self.backend.follow(self.replay.cells, slot, self.poses.skin, bones)
         self.replay.move_root(slot, self.poses.root(slot))
+        self.corrections[self.replay.indices[slot]] = self.poses.corrections[slot].copy()
 
 
 @final
@@ -191,6 +209,11 @@ def train(
             continue
         now = clock.read()
         if now >= config.seconds or (config.steps and trainer.steps >= config.steps):
+            if arrived_at is None and not config.steps:
+                yield Warned(
+                    message=f"The time was up when {trainer.frames_seen} frames had been learnt "
+                    "from and more were coming: give more --seconds, or fewer --frames"
+                )
             break
         if now >= mark:
             mark = next(m for m in marks if m > now)

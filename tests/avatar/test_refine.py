@@ -135,7 +135,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
 
     def pulled(joint: int, axis: int, size: float) -> float:
         table.corrections[1, joint, axis] = size
-        table._write_bones(1)
+        table._move(1)
         root = table.root(1)
         target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
         x = samples.points.clone()
@@ -145,7 +145,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
             )
             x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
         table.corrections[1, joint, axis] = 0.0
-        table._write_bones(1)
+        table._move(1)
         return float((x.double() * pull.double()).sum())
 
     for joint in (0, 1, 4, 9, 16, 18, 24):
