@@ -4,7 +4,7 @@ import resource
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,13 @@ def novel(player: Player) -> str:
     return moving_data_uri([player.render(p, camera.at(p)) for p in poses], fps=NOVEL_FPS)
 
 
+def _fitted_note(learnt: Learnt) -> HeldOutNote | None:
+    """Scores in poses fitted to the frames, if there are any."""
+    if not learnt.fitted:
+        return None
+    return replace(HeldOutNote.of(learnt.fitted, learnt.meter.size_px), poses="fitted")
+
+
 def _package_note(exported: ExportReport, run: RunFolder) -> PackageNote:
     return PackageNote(
         path=run.package.name,
@@ -191,6 +198,7 @@ def _report(
         ),
         training=_training_note(learnt, note),
         held_out=held,
+        held_out_refined=_fitted_note(learnt),
         curve=learnt.curve,
         stream=StreamNote(
             realtime=False,

@@ -107,7 +107,10 @@ def _trainer(
     if given.resume and not run.has_checkpoint():
         console.say(f"There is no checkpoint in {run.path}: starting afresh.")
     if not (given.resume and run.has_checkpoint()):
-        trainer = new_trainer(recording, seconds=given.seconds, seed=given.seed, device=device)
+        trainer = new_trainer(
+            recording, seconds=given.seconds, seed=given.seed, refine_poses=given.refine_poses,
+            device=device,
+        )  # fmt: skip
         return trainer, 0, {"video": video}
     trainer, notes = checkpoint.load(run.checkpoint, device)
     had = trainer.wall_seconds
@@ -118,10 +121,14 @@ def _trainer(
                 f"The run has had {had:.0f} of {given.seconds:.0f} seconds; only its package and "
                 "report are written again. Give more --seconds to go on learning."
             )
-        trainer.config = replace(trainer.config, seconds=given.seconds)
+        trainer.config = replace(
+            trainer.config, seconds=given.seconds, refine_poses=given.refine_poses
+        )
         return trainer, trainer.frames_seen, notes
     console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
-    trainer.config = replace(trainer.config, seconds=had + given.seconds)
+    trainer.config = replace(
+        trainer.config, seconds=had + given.seconds, refine_poses=given.refine_poses
+    )
     trainer.corrections.clear()  # they are of the other video's frames
     return trainer, 0, {**notes, "video": video}
 
@@ -154,6 +161,9 @@ def _conclude(
     """Names what was made."""
     held = delivered.report.held_out
     score = "nothing was held out" if held.psnr is None else f"held out {held.psnr:.2f} dB"
+    fitted = delivered.report.held_out_refined
+    if fitted is not None and fitted.psnr is not None:
+        score += f" ({fitted.psnr:.2f} dB in poses fitted to those frames)"
     seconds = delivered.report.training.wall_seconds
     console.say(f"Learnt for {seconds:.1f} s, {delivered.report.training.steps} steps; {score}.")
     if delivered.refused is None:

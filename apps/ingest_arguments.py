@@ -11,6 +11,9 @@ from apps.recording import Recording, RecordingPaths
 from apps.run_folder import RunFolder
 from capture.errors import BadInput
 
+LEARNABLE_PX = 540
+"""Longer side of the pictures that a minute is enough for."""
+
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
@@ -54,11 +57,12 @@ class IngestArguments:
     seconds: float = 60.0
     """How long you will wait: seconds of training, after start-up."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
-    """Longer side of the pictures in pixels; they are never enlarged."""
+    """Longer side of the pictures in pixels; they are never enlarged. Without it, what can
+    be learnt in --seconds: 540 in a minute, twice as many in four."""
     frames: str = "::"
     """Which frames, START:STOP:STEP, counted from 0."""
-    no_refine_poses: Flag = False
-    """Keep the poses as they are given. (This version always does.)"""
+    refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto takes a GPU if there is one."""
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -104,7 +108,7 @@ class IngestArguments:
             frames=parsed_frames(self.frames),
             mask_invert=invert,
         )
-        return Recording.open(wanted, size_px=self.size)
+        return Recording.open(wanted, size_px=self.size or learnable_px(self.seconds))
 
     def as_json(self) -> dict[str, Any]:
         """The arguments as report.json keeps them."""
@@ -126,3 +130,8 @@ def parsed_frames(text: str) -> slice | None:
         )
     parts = [int(part) if part else None for part in text.split(":")]
     return None if not any(part is not None for part in parts) else slice(*parts)
+
+
+def learnable_px(seconds: float) -> int:
+    """Longer side, in pixels, of pictures whose detail can be learnt in so many seconds."""
+    return max(256, round(LEARNABLE_PX * (seconds / 60.0) ** 0.5))

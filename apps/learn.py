@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import torch
@@ -16,6 +16,7 @@ from apps.run_folder import RunFolder
 from avatar import checkpoint
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Score, Stepped, TrainEvent, Warned
+from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
@@ -35,7 +36,8 @@ class Learnt:
     Attributes:
         trainer: With the avatar as it is now.
         held: Held-out frames that have arrived.
-        scores: Of each of them, at the end.
+        scores: Of each of them, at the end, in the given poses.
+        fitted: The same in poses fitted to them, if poses are refined.
         curve: Scores on the way, and at the end.
         meter: What it saw of the stream.
         added: Frames that were put into the trainer's memory in this run.
@@ -45,6 +47,7 @@ class Learnt:
     trainer: Trainer
     held: list[HeldOut]
     scores: tuple[Score, ...]
+    fitted: tuple[Score, ...]
     curve: tuple[CurvePoint, ...]
     meter: Meter
     added: int
@@ -57,10 +60,11 @@ class Learnt:
 
 
 def new_trainer(
-    recording: Recording, *, seconds: float, seed: int, device: torch.device
+    recording: Recording, *, seconds: float, seed: int, refine_poses: bool, device: torch.device
 ) -> Trainer:
     """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
     config = TrainConfig.within(seconds, footprint_m=recording.footprint_m(), seed=seed)
+    config = replace(config, refine_poses=refine_poses)
     return Trainer(Rig.of(recording.shaped), config, device)
 
 
@@ -120,14 +124,19 @@ class Lesson:
             self._console.warn(warning)
         self._console.count_the_rest()
         scores: tuple[Score, ...] = ()
+        fitted: tuple[Score, ...] = ()
         if len(self._trainer.replay):
             self._save()  # scoring takes a while
             scores = self._final_scores()
             self._save()
+            if self._trainer.config.refine_poses and scores and not interrupted:
+                with self._console.waiting("fitting poses to the held-out frames"):
+                    fitted = fitted_scores(self._trainer, self._held)
         return Learnt(
             trainer=self._trainer,
             held=self._held,
             scores=scores,
+            fitted=fitted,
             curve=tuple(self._curve),
             meter=self.meter,
             added=added + self._trainer.frames_seen,

@@ -35,13 +35,13 @@ class TrainConfig:
     """Of the L1 loss on alpha."""
     hard_weight: float = 0.02
     """Of the hard-surface loss."""
-    empty_weight: float = 0.1
+    empty_weight: float = 1.0
     """Of the opacity in cells that should be empty."""
     empty_points: int = 256
     """Points at which that opacity is measured in each step."""
     occupancy_every: int = 16
     """Steps between updates of the occupancy."""
-    refine_poses: bool = False
+    refine_poses: bool = True
     """Whether the frames' poses are corrected while they are learnt from."""
     key_frames: int = 200
     """Frames that stay for replay."""

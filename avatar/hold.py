@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
-from preprocess.observe import Dropped
 
 from avatar.cells import WarpCells
 from avatar.events import Score
@@ -15,6 +14,7 @@ from avatar.prepare import PreparedFrame, prepare
 from avatar.render import render
 from avatar.rig import Rig
 from preprocess.observation import Observation
+from preprocess.observe import Dropped
 
 SCORED_AT_A_MARK = 12
 """Held-out frames scored at each mark of the curve; all of them at the end."""
@@ -90,3 +90,11 @@ def spread(held: list[HeldOut], most: int) -> list[HeldOut]:
     if len(held) <= most:
         return held
     return [held[i] for i in np.linspace(0, len(held) - 1, most).round().astype(int)]
+
+
+def interleaved(held: list[HeldOut]) -> list[HeldOut]:
+    """The same frames in an order whose every beginning is spread over the stream."""
+    order: list[int] = []
+    for stride in (8, 4, 2, 1):
+        order += [i for i in range(0, len(held), stride) if i not in order]
+    return [held[i] for i in order]

@@ -10,7 +10,7 @@ from typing import final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy.ndimage import label
 from torch import Tensor
 
@@ -25,8 +25,12 @@ FIRST_DECAY = 0.7
 OPACITY = 0.02
 """A cell counts as empty when a step through it would be less opaque than this."""
 FIRST_DENSITY = 1e-3
-SPECK = 0.02
-"""Connected pieces smaller than this share of the largest are no part of the person."""
+FIRM_DENSITY = 20.0
+"""What is denser than this, in 1/m, counts as solid when pieces are told apart."""
+SKIN_M = 0.03
+"""A piece of the person lies about this close to the skin; what floats does not."""
+SPECK = 0.003
+"""Pieces with less near the skin than this share of the largest are no part of the person."""
 
 
 @final
@@ -50,6 +54,7 @@ class Occupancy:
         )
         self.band: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
+        self._near_skin = rig.distance <= SKIN_M
 
     @torch.no_grad()
     def update(
@@ -68,8 +73,9 @@ class Occupancy:
             log_density_at: Log density at canonical points.
             share: How much of the band is probed, in (0, 1].
             decay: What a probed cell keeps of its density.
-            drop_specks: Whether small pieces without contact to the rest are dropped (the paper's
-                code keeps the largest piece alone).
+            drop_specks: Whether pieces without contact to the rest are dropped that are small or
+                float off the skin (the paper's code keeps the largest piece alone; a foot may be
+                a piece of its own).
             step_m: Distance between samples along a ray.
             generator: Chooses cells and places.
         """
@@ -79,7 +85,9 @@ class Occupancy:
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
         bar = min(OPACITY / step_m, float(flat[self.band].mean()))
         occupied = grown((self.grid.density > bar).to(torch.uint8)) & self._in_band
-        self.grid.occupied.copy_(without_specks(occupied) if drop_specks else occupied)
+        if drop_specks:
+            occupied &= 1 - specks(self.grid.density > FIRM_DENSITY, self._near_skin)
+        self.grid.occupied.copy_(occupied)
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
@@ -114,12 +122,24 @@ def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
     return out
 
 
-def without_specks(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """The cells without those connected pieces that are small beside the largest."""
-    pieces, count = label(occupied.cpu().numpy())
+def specks(
+    firm: Bool[Tensor, "x y z"], near_skin: Bool[np.ndarray, "x y z"]
+) -> UInt8[Tensor, "x y z"]:
+    """Cells in and about those connected pieces that are no part of the person.
+
+    Args:
+        firm: What is solid.
+        near_skin: Only such cells count towards a piece's size.
+    """
+    pieces, count = label(firm.cpu().numpy())
     if count < 2:
-        return occupied
-    sizes = np.bincount(pieces.ravel())
-    sizes[0] = 0
+        return torch.zeros_like(firm, dtype=torch.uint8)
+    sizes = np.bincount(pieces.ravel(), weights=near_skin.ravel())
+    sizes[0] = 0.0
     kept = sizes >= SPECK * sizes.max()
-    return torch.from_numpy(kept[pieces].astype(np.uint8)).to(occupied.device)
+    kept[0] = False
+
+    def about(cells: Bool[np.ndarray, "x y z"]) -> UInt8[Tensor, "x y z"]:
+        return grown(grown(torch.from_numpy(cells.astype(np.uint8)).to(firm.device)))
+
+    return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))

@@ -20,9 +20,9 @@ from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
 from preprocess.pose import BodyPose
 
-STEP_M = 5e-3
+STEP_M = 1.2e-2
 """Adam's step: how far a correction moves what hangs on a joint, metres."""
-MOMENTS = 0.8, 0.95
+MOMENTS = 0.9, 0.95
 ENOUGH_RAYS = 256
 """A frame's pose moves when this many of its rays have been seen since it last did."""
 STRAYED_M = 0.04
@@ -48,9 +48,20 @@ class PoseTable:
         wrenches: What has been found out about each slot since its pose last moved.
     """
 
-    def __init__(self, rig: Rig, capacity: int, device: torch.device) -> None:
-        """A table without poses."""
+    def __init__(
+        self, rig: Rig, capacity: int, device: torch.device, *, mean_pull: float = MEAN_PULL
+    ) -> None:
+        """A table without poses.
+
+        Args:
+            rig: Whose body.
+            capacity: How many poses it may hold.
+            device: Where gradients are gathered.
+            mean_pull: Share of the mean correction taken out at each correction; 0 where the
+                canonical body is known already.
+        """
         self.rig = rig
+        self._mean_pull = mean_pull
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
@@ -171,13 +182,11 @@ class PoseTable:
         first += (1.0 - MOMENTS[0]) * gradient
         second *= MOMENTS[1]
         second += (1.0 - MOMENTS[1]) * gradient**2
-        step = (first / (1.0 - MOMENTS[0] ** times)) / (
-            np.sqrt(second / (1.0 - MOMENTS[1] ** times)) + 1e-12
-        )
-        step *= STEP_M * rate / self._lever[:, None]
+        surely = first / (np.sqrt(second / (1.0 - MOMENTS[1] ** times)) + 1e-12)
+        step = surely * np.abs(surely) * STEP_M * rate / self._lever[:, None]
         held = [i for i, pose in enumerate(self._given) if pose is not None]
         mean = self.corrections[held].mean(axis=0)
-        moved = (1.0 - FORGOTTEN) * self.corrections[slot] - step - MEAN_PULL * mean
+        moved = (1.0 - FORGOTTEN) * self.corrections[slot] - step - self._mean_pull * mean
         self.corrections[slot] = np.clip(moved, -FARTHEST, FARTHEST)
 
     def _joint_places(self, slot: int) -> Float[np.ndarray, "24 3"]:

@@ -5,9 +5,12 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Float32
+from torch import Tensor
 
 from avatar.cells import WarpCells
-from avatar.kernels.backend import CellTables, Marching, Rays
+from avatar.field import Field
+from avatar.kernels.backend import CellTables, Marching, Rays, Samples
+from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
 from avatar.prepare import BodyRays
 from capture.camera import Camera
@@ -15,6 +18,11 @@ from preprocess.pose import BodyPose
 
 RAYS_AT_ONCE = 16384
 MOST_SAMPLES = 512
+AT_ONCE = 6
+"""Samples of a ray that are asked for together."""
+UNSEEN_DEPTH = 14.0
+"""Optical depth behind which less than a millionth of the light comes from."""
+EMPTY_LOG_DENSITY = -30.0
 
 
 @torch.no_grad()
@@ -50,10 +58,34 @@ def render(
         )
         samples = field.backend.march(batch, tables, grid, how)
         if len(samples.points):
-            raw = field.raw_at(samples.points)
+            raw = _raw_as_far_as_seen(field, samples, avatar.step_m)
             colors = field.backend.composite(raw, samples, avatar.step_m)
             picture[start : start + len(chunk)] = colors.cpu()
     return picture.reshape(height, width, 4).numpy()
+
+
+def _raw_as_far_as_seen(
+    field: Field, samples: Samples, step_m: float
+) -> Float32[Tensor, "samples 4"]:
+    """Raw outputs of all samples that a millionth of the light reaches; the others stay empty.
+
+    The field is asked front to back, a few samples of every ray at a time.
+    """
+    points, first, count, _ = samples
+    ray = torch.repeat_interleave(torch.arange(len(count), device=points.device), count)
+    rank = torch.arange(len(points), device=points.device) - first[ray]
+    raw = points.new_zeros(len(points), 4)
+    raw[:, 3] = EMPTY_LOG_DENSITY
+    optical = points.new_zeros(len(count))
+    for start in range(0, int(count.max()), AT_ONCE):
+        lit = (rank >= start) & (rank < start + AT_ONCE) & (optical[ray] < UNSEEN_DEPTH)
+        seen = lit.nonzero()[:, 0]
+        if len(seen):
+            values = field.raw_at(points[seen])
+            raw[seen] = values
+            density = torch.exp(values[:, 3].clamp(max=MAX_LOG_DENSITY))
+            optical.index_add_(0, ray[seen], density * step_m)
+    return raw
 
 
 def cell_tables(cells: WarpCells, device: torch.device) -> CellTables:

@@ -12,7 +12,7 @@ from avatar.cells import WarpCells
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.events import Evaluated, Finished, Score, Stepped, TrainEvent, Warned
 from avatar.field import Field
-from avatar.hold import SCORED_AT_A_MARK, HeldOut, score, spread
+from avatar.hold import SCORED_AT_A_MARK, HeldOut, interleaved, score, spread
 from avatar.kernels.backend import Backend, backend_for
 from avatar.levels import HashLevels
 from avatar.model import Avatar
@@ -32,6 +32,8 @@ CLEARING_STEPS = 300
 REFINED_AFTER_STEPS = 150
 """Poses are corrected once there is something to compare them with."""
 CORRECTIONS_PER_STEP = 2
+SCORING_SHARE = 0.015
+"""Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 """When the curve is measured, in seconds of training; then every 30 s."""
 
@@ -120,7 +122,10 @@ class Trainer:
         field.table.grad.zero_()
         if refines:
             for _ in range(CORRECTIONS_PER_STEP):
-                self._correct_a_pose(rate)
+                slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
+                if slot is not None:
+                    correction = self.poses.corrections[slot].copy()
+                    self.corrections[self.replay.indices[slot]] = correction
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             clearing = self.steps < CLEARING_STEPS
@@ -137,18 +142,31 @@ class Trainer:
         self.samples += result.samples
         return result
 
-    def _correct_a_pose(self, rate: float) -> None:
-        slot = self.poses.correct_one(rate=rate)
-        if slot is None:
-            return
-        if self.poses.strayed(slot):
-            joints = self.poses.pose(slot).joint_rotations
-            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
-        else:
-            bones = self.poses.bones[slot]
-            self.backend.follow(self.replay.cells, slot, self.poses.skin, bones)
-        self.replay.move_root(slot, self.poses.root(slot))
-        self.corrections[self.replay.indices[slot]] = self.poses.corrections[slot].copy()
+
+def let_follow(
+    rig: Rig, backend: Backend, replay: Replay, poses: PoseTable, *, rate: float
+) -> int | None:
+    """Corrects one pose; its frame's warp and rays follow.
+
+    Args:
+        rig: Whose body.
+        backend: Moves the warp cells.
+        replay: Holds the frames.
+        poses: Holds their poses, slot by slot.
+        rate: Factor of the step, in (0, 1].
+
+    Returns:
+        The slot whose pose moved, or None if too little is known about any.
+    """
+    slot = poses.correct_one(rate=rate)
+    if slot is None:
+        return None
+    if poses.strayed(slot):
+        replay.put_cells(slot, WarpCells.of(rig, poses.pose(slot).joint_rotations))
+    else:
+        backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
+    replay.move_root(slot, poses.root(slot))
+    return slot
 
 
 @final
@@ -184,51 +202,33 @@ def train(
         What happens, on the caller's thread: what the caller does with an event takes training
         time.
     """
-    config = trainer.config
-    clock = Clock(trainer) if len(trainer.replay) else None  # a resumed run remembers frames
-    arrived_at: float | None = None
-    marks = _marks(after=trainer.wall_seconds)
-    mark = next(marks)
+    config, stream, marks = trainer.config, _Stream(trainer, inbox, held), _Marks(trainer)
     while True:
-        if arrived_at is None:
-            empty = len(trainer.replay) == 0
-            for item in inbox.take(wait_s=0.1 if empty else 0.0):
-                if isinstance(item, Dropped):
-                    yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
-                    continue
-                clock = clock or Clock(trainer)
-                if isinstance(item, HeldOut):
-                    held.append(item)
-                else:
-                    trainer.add(item)
-            if inbox.finished:
-                arrived_at = trainer.wall_seconds if clock is None else clock.read()
+        yield from stream.take_in()
         if len(trainer.replay) == 0:
-            if arrived_at is not None:
+            if stream.ended:
                 return
             continue
-        now = clock.read()
+        now = stream.clock.read()
         if now >= config.seconds or (config.steps and trainer.steps >= config.steps):
-            if arrived_at is None and not config.steps:
-                yield Warned(
-                    message=f"The time was up when {trainer.frames_seen} frames had been learnt "
-                    "from and more were coming: give more --seconds, or fewer --frames"
-                )
             break
-        if now >= mark:
-            mark = next(m for m in marks if m > now)
-            yield _evaluated(trainer, spread(held, SCORED_AT_A_MARK))
-        tail = config.seconds - arrived_at if arrived_at is not None else 1.0
-        progress = (now - arrived_at) / max(tail, 1e-6) if arrived_at is not None else 0.0
+        if marks.due(now):
+            yield marks.score(held, stream.clock)
+            continue
         result = trainer.step(
-            rate=cosine(progress), hard_share=min(1.0, 4.0 * now / config.seconds)
+            rate=cosine(stream.progress(now)), hard_share=min(1.0, 4.0 * now / config.seconds)
         )
         yield Stepped(
             step=trainer.steps,
-            wall_seconds=clock.read(),
+            wall_seconds=stream.clock.read(),
             loss=float(result.loss.mean()),
             samples_per_ray=result.samples / config.rays,
             frames_seen=trainer.frames_seen,
+        )
+    if not stream.ended and not config.steps:
+        yield Warned(
+            message=f"The time was up when {trainer.frames_seen} frames had been learnt from and "
+            "more were coming: give more --seconds, or fewer --frames"
         )
     yield Finished(
         wall_seconds=trainer.wall_seconds,
@@ -239,17 +239,84 @@ def train(
     )
 
 
-def _evaluated(trainer: Trainer, held: list[HeldOut]) -> Evaluated:
-    scores: list[Score] = [score(trainer.avatar, frame) for frame in held]
-    return Evaluated(
-        wall_seconds=trainer.wall_seconds,
-        cpu_seconds=trainer.cpu_seconds,
-        frames_seen=trainer.frames_seen,
-        scores=tuple(scores),
-    )
+@final
+class _Stream:
+    """What arrives while training goes on, and since when nothing more does."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        inbox: Inbox[PreparedFrame | HeldOut | Dropped],
+        held: list[HeldOut],
+    ) -> None:
+        self._trainer, self._inbox, self._held = trainer, inbox, held
+        self._ended_at: float | None = None
+        self.clock = Clock(trainer)
+        self._started = len(trainer.replay) > 0  # a resumed run remembers frames
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will arrive."""
+        return self._ended_at is not None
+
+    def take_in(self) -> Iterator[Warned]:
+        """Hands what has arrived to the trainer; the clock starts with the first frame."""
+        if self.ended:
+            return
+        for item in self._inbox.take(wait_s=0.0 if len(self._trainer.replay) else 0.1):
+            if isinstance(item, Dropped):
+                yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+                continue
+            if not self._started:
+                self.clock, self._started = Clock(self._trainer), True
+            if isinstance(item, HeldOut):
+                self._held.append(item)
+            else:
+                self._trainer.add(item)
+        if self._inbox.finished:
+            self._ended_at = self.clock.read()
+
+    def progress(self, now: float) -> float:
+        """How much of the time after the last frame has gone by, in [0, 1]; 0 before it."""
+        if self._ended_at is None:
+            return 0.0
+        tail = self._trainer.config.seconds - self._ended_at
+        return (now - self._ended_at) / max(tail, 1e-6)
 
 
-def _marks(*, after: float) -> Iterator[float]:
+@final
+class _Marks:
+    """When the curve is measured, and how long that may take."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+        self._times = _mark_times(after=trainer.wall_seconds)
+        self._next = next(self._times)
+
+    def due(self, now: float) -> bool:
+        """Whether a mark has been reached."""
+        return now >= self._next
+
+    def score(self, held: list[HeldOut], clock: Clock) -> Evaluated:
+        """Scores held-out frames, evenly over the stream, until the time for it is spent."""
+        trainer, scores = self._trainer, list[Score]()
+        at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
+        enough = at + SCORING_SHARE * trainer.config.seconds
+        for frame in interleaved(spread(held, SCORED_AT_A_MARK)):
+            if scores and clock.read() > enough:
+                break
+            scores.append(score(trainer.avatar, frame))
+        now = clock.read()
+        self._next = next(time for time in self._times if time > now)
+        return Evaluated(
+            wall_seconds=at,
+            cpu_seconds=cpu_at,
+            frames_seen=trainer.frames_seen,
+            scores=tuple(scores),
+        )
+
+
+def _mark_times(*, after: float) -> Iterator[float]:
     for mark in MARKS_S:
         if mark > after:
             yield mark

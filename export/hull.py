@@ -12,7 +12,7 @@ CONTRAST = 16.0
 """Densities beyond this factor from the level count as the factor: emptiness has no log."""
 SMOOTHING_M = 0.004
 """Deviation of the blur before the level is taken: a trained field is never quite smooth."""
-SMALLEST_PART = 0.01
+SMALLEST_PART = 0.002
 """Parts of less volume than this share of the largest are floaters."""
 OPAQUE = 7.0
 """Optical depth behind which nothing is seen (0.1 %)."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.occupancy import OPACITY, Occupancy, grown, without_specks
+from avatar.occupancy import OPACITY, Occupancy, grown, specks
 
 CPU = torch.device("cpu")
 STEP_M = 0.01
@@ -80,12 +80,24 @@ def test_growing_adds_the_six_neighbours():
     assert int(grown(corner).sum()) == 4
 
 
-def test_specks_go_and_large_pieces_stay():
-    occupied = torch.zeros(30, 30, 30, dtype=torch.uint8)
-    occupied[:10] = 1
-    occupied[20:22, 20:30, 20:30] = 1  # a foot without contact: 200 of 9,000 cells
-    occupied[15, 15, 15] = 1
-    kept = without_specks(occupied)
-    assert int(kept.sum()) == int(occupied.sum()) - 1
-    assert kept[15, 15, 15] == 0
-    assert np.isin(kept.numpy(), (0, 1)).all()
+def test_specks_go_and_pieces_near_the_skin_stay():
+    firm = torch.zeros(40, 40, 40, dtype=torch.bool)
+    firm[:10] = True  # the body
+    firm[20:22, 20:30, 20:30] = True  # a foot without contact: 200 of 16,000 cells, on the skin
+    firm[30:33, 5:15, 5:15] = True  # as large, off the skin
+    firm[15, 35, 35] = True  # a speck
+    near_skin = np.ones(firm.shape, dtype=bool)
+    near_skin[28:] = False
+    gone = specks(firm, near_skin).bool()
+    assert not gone[firm][: 10 * 1600].any()
+    assert not gone[20:22, 20:30, 20:30].any()
+    assert gone[30:33, 5:15, 5:15].all()
+    assert gone[15, 35, 35]
+    assert gone[15, 35, 37]  # and the haze around it
+    assert not gone[12].any()  # but not what is nearer to the body
+
+
+def test_one_piece_has_no_specks():
+    firm = torch.zeros(8, 8, 8, dtype=torch.bool)
+    firm[2:5, 2:5, 2:5] = True
+    assert int(specks(firm, np.ones(firm.shape, dtype=bool)).sum()) == 0

@@ -1,0 +1,60 @@
+"""Poses fitted to held-out frames with the avatar frozen: how much of an error is the pose's."""
+
+import dataclasses
+import math
+from dataclasses import replace
+
+import torch
+
+from avatar.cells import WarpCells
+from avatar.events import Score
+from avatar.hold import HeldOut, score
+from avatar.prepare import prepare
+from avatar.refine import PoseTable
+from avatar.replay import Replay
+from avatar.step import cosine, gradients
+from avatar.train import Trainer, let_follow
+
+CORRECTIONS = 40
+"""Corrections that each frame's pose gets."""
+RAYS_A_CORRECTION = 512
+
+
+def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
+    """Scores of held-out frames after their poses have been fitted to them.
+
+    The avatar stays as it is: nothing of these frames is learnt but where the body was.
+
+    Args:
+        trainer: Whose avatar; its field's gradients are overwritten.
+        held: Frames that were never trained on.
+    """
+    if not held:
+        return ()
+    avatar, field = trainer.avatar, trainer.avatar.field
+    device = field.table.device
+    replay = Replay(len(held), device)
+    poses = PoseTable(avatar.rig, len(held), device, mean_pull=0.0)
+    for frame in held:
+        prepared = prepare(frame.observation, avatar.rig)
+        poses.put(replay.add(prepared), prepared.pose)
+    config = dataclasses.replace(trainer.config, empty_weight=0.0, rays=2 * RAYS_A_CORRECTION)
+    generator = torch.Generator(device=device).manual_seed(config.seed)
+    steps = math.ceil(CORRECTIONS * len(held) / 2)
+    for step in range(steps):
+        batch = replay.draw(config.rays, generator)
+        gradients(
+            field, avatar.occupancy, replay.cells, batch, config,
+            hard_share=1.0, remember=False, poses=poses, generator=generator,
+        )  # fmt: skip
+        field.table.grad.zero_()
+        for _ in range(2):
+            let_follow(avatar.rig, trainer.backend, replay, poses, rate=cosine(step / steps))
+    scores = []
+    for slot, frame in enumerate(held):
+        pose = poses.pose(slot)
+        cells = WarpCells.of(avatar.rig, pose.joint_rotations)
+        scores.append(
+            score(avatar, HeldOut(observation=replace(frame.observation, pose=pose), cells=cells))
+        )
+    return tuple(scores)
