@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float32
@@ -15,6 +16,8 @@ from avatar.render import render
 from avatar.rig import Rig
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
+
+Item = TypeVar("Item")
 
 SCORED_AT_A_MARK = 12
 """Held-out frames scored at each mark of the curve; all of them at the end."""
@@ -92,7 +95,7 @@ def spread(held: list[HeldOut], most: int) -> list[HeldOut]:
     return [held[i] for i in np.linspace(0, len(held) - 1, most).round().astype(int)]
 
 
-def interleaved(held: list[HeldOut]) -> list[HeldOut]:
+def interleaved(held: list[Item]) -> list[Item]:
     """The same frames in an order whose every beginning is spread over the stream."""
     order: list[int] = []
     for stride in (8, 4, 2, 1):

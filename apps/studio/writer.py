@@ -22,6 +22,7 @@ from apps.studio.shade import over
 from apps.studio.tracker import tracked
 from capture.camera import Camera
 from capture.errors import BadInput
+from capture.quiet import silence_opencv
 from preprocess.pose import BodyPose, Motion
 from preprocess.pose_file import write_motion
 
@@ -192,6 +193,7 @@ def _write_video(
     (folder / "masks").mkdir()
     path = folder / "video.mp4"
     # The default mp4v costs 30 dB on stripes; FFV1 is exact, fast, and OpenCV reads it.
+    silence_opencv()
     code = cv2.VideoWriter.fourcc(*"FFV1")
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, studio.camera.size_px)
     generator = np.random.default_rng([config.seed, 5])

@@ -106,7 +106,9 @@ class Learnt:
 @pytest.fixture(scope="session")
 def learnt(rig, clip) -> Learnt:
     """Trained once for all tests, with a rate that falls after half of the steps."""
-    config = TrainConfig(rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14)
+    config = TrainConfig(
+        rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
+    )
     trainer = Trainer(rig, config, torch.device("cpu"))
     held = []
     for item in prepared(iter(clip.observations), rig, every=6, total=None):

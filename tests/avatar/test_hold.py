@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 
 from avatar.cells import WarpCells
 from avatar.config import TrainConfig
-from avatar.hold import HeldOut, is_held_out, on_white, prepared, score, spread, truth_on_white
+from avatar.hold import (
+    HeldOut,
+    interleaved,
+    is_held_out,
+    on_white,
+    prepared,
+    score,
+    spread,
+    truth_on_white,
+)
 from avatar.metrics import psnr, ssim
 from avatar.prepare import PreparedFrame
 from avatar.train import Trainer
@@ -117,3 +126,10 @@ def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
         assert gaps.max() - gaps.min() <= 1
     else:
         assert chosen == list(range(count))
+
+
+def test_every_beginning_of_the_interleaved_order_is_spread_over_the_stream():
+    order = interleaved(list(range(12)))
+    assert sorted(order) == list(range(12))
+    assert order[:2] == [0, 8]
+    assert max(np.diff(sorted([*order[:3], 12]))) <= 4

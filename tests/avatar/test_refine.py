@@ -1,17 +1,25 @@
 """Pose refinement: kernels, the implicit gradient, cells that follow, and poses that come back."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from avatar import checkpoint
 from avatar.cells import WarpCells
+from avatar.config import TrainConfig
+from avatar.fit import fitted_scores
+from avatar.hold import HeldOut, prepared, score
 from avatar.kernels import pose as pose_kernels
 from avatar.kernels.backend import CellTables, Samples, TorchBackend
 from avatar.kernels.cpu import NumbaBackend
 from avatar.levels import FEATURES
 from avatar.refine import PoseTable
 from avatar.render import cell_tables
+from avatar.step import cosine
+from avatar.train import Trainer
 from preprocess.pose import BodyPose
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
@@ -153,3 +161,68 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
             measured = (pulled(joint, axis, 2e-3) - pulled(joint, axis, -2e-3)) / 4e-3
             scale = np.abs(gradient[joint]).max() + 0.1
             assert gradient[joint, axis] == pytest.approx(measured, abs=0.08 * scale), joint
+
+
+@pytest.fixture(scope="module")
+def jittered(clip):
+    """The clip with poses as a poor tracker gives them, but for every sixth frame."""
+    rng = np.random.default_rng(0)
+
+    def shaken(pose: BodyPose) -> BodyPose:
+        def noise(shape, size):
+            return rng.normal(size=shape) * size
+
+        return BodyPose(
+            root_rotation=pose.root_rotation + noise(3, 0.03),
+            root_translation=pose.root_translation + noise(3, 0.02),
+            joint_rotations=pose.joint_rotations + noise((23, 3), 0.05),
+        )
+
+    return [
+        dataclasses.replace(o, pose=o.pose if o.frame.index % 6 == 5 else shaken(o.pose))
+        for o in clip.observations
+    ]
+
+
+def test_refining_poses_makes_up_for_a_trackers_jitter(rig, clip, jittered):
+    """Scored in true poses: the canonical body itself must have become sharper."""
+    config = TrainConfig(rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14)
+    frames = list(prepared(iter(jittered), rig, every=6, total=None))
+    held = [frame for frame in frames if isinstance(frame, HeldOut)]
+    reached = {}
+    for refine_poses in (False, True):
+        trainer = Trainer(rig, dataclasses.replace(config, refine_poses=refine_poses), CPU)
+        for frame in frames:
+            if not isinstance(frame, HeldOut):
+                trainer.add(frame)
+        for step in range(600):
+            trainer.step(rate=cosine(step / 600), hard_share=1.0)
+        scores = [score(trainer.avatar, frame) for frame in held]
+        reached[refine_poses] = np.mean([s.psnr_mask for s in scores])
+    assert reached[True] > reached[False] + 0.8
+
+
+def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_off(learnt, clip):
+    pose = clip.observations[11].pose
+    off = dataclasses.replace(pose, root_translation=pose.root_translation + np.array([0.03, 0, 0]))
+    observation = dataclasses.replace(clip.observations[11], pose=off)
+    cells = WarpCells.of(learnt.trainer.avatar.rig, off.joint_rotations)
+    held = HeldOut(observation=observation, cells=cells)
+    table = learnt.trainer.avatar.field.table.detach().clone()
+    (fitted,) = fitted_scores(learnt.trainer, [held])
+    assert fitted.psnr_mask > score(learnt.trainer.avatar, held).psnr_mask + 2.0
+    assert torch.equal(table, learnt.trainer.avatar.field.table)
+
+
+def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
+    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=3, finest_m=0.05), CPU)
+    frame = next(prepared(iter(clip.observations), rig, every=0, total=None))
+    correction = np.full((25, 3), 0.02)
+    trainer.corrections[frame.index] = correction
+    checkpoint.save(trainer, tmp_path)
+    again, _ = checkpoint.load(tmp_path, CPU)
+    again.add(frame, again=True)
+    assert again.frames_seen == 0
+    np.testing.assert_allclose(again.poses.corrections[0], correction)
+    moved = again.poses.pose(0).root_translation - frame.pose.root_translation
+    assert np.linalg.norm(moved) == pytest.approx(0.02 * np.sqrt(3))
