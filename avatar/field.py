@@ -73,6 +73,12 @@ class Field:
         """The table, then weights and biases of both layers."""
         return [self.table, *self.layers]
 
+    @property
+    def table_grad(self) -> Float32[Tensor, "entries 4"]:
+        """Where the gradient of the table adds up until it is zeroed."""
+        assert self.table.grad is not None, "the table's gradient is zeroed, never taken away"
+        return self.table.grad
+
     @torch.no_grad()
     def forward(self, points: Float32[Tensor, "points 3"]) -> Activations:
         """Raw outputs at canonical points, and what their gradient will need."""
@@ -101,7 +107,7 @@ class Field:
         ):
             parameter.grad = grad
         grad_features = grad_hidden @ first.T
-        self.backend.encode_backward(seen.points, grad_features, self.levels, self.table.grad)
+        self.backend.encode_backward(seen.points, grad_features, self.levels, self.table_grad)
         return grad_features
 
     @torch.no_grad()

@@ -47,7 +47,7 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
             field, avatar.occupancy, replay.cells, batch, config,
             hard_share=1.0, remember=False, poses=poses, generator=generator,
         )  # fmt: skip
-        field.table.grad.zero_()
+        field.table_grad.zero_()
         for _ in range(2):
             let_follow(avatar.rig, trainer.backend, replay, poses, rate=cosine(step / steps))
     scores = []

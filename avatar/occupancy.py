@@ -131,7 +131,8 @@ def specks(
         firm: What is solid.
         near_skin: Only such cells count towards a piece's size.
     """
-    pieces, count = label(firm.cpu().numpy())
+    # scipy has no types, and what pyright guesses of this function is wrong
+    pieces, count = label(firm.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
         return torch.zeros_like(firm, dtype=torch.uint8)
     sizes = np.bincount(pieces.ravel(), weights=near_skin.ravel())

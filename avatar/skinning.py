@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import uniform_filter
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 NEIGHBOURS = 30
 """Vertices blended at each node; 1 would be the paper's variant (nearest vertex)."""
@@ -47,7 +47,7 @@ def skinning_volume(
     shape = tuple(n + 1 for n in volume_shape(low, high, cell_m))
     axes = [np.linspace(low[k], high[k], shape[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    tree = cKDTree(vertices)
+    tree = KDTree(vertices)
     nearest_m, _ = tree.query(nodes, distance_upper_bound=reach_m, workers=-1)
     near = np.flatnonzero(np.isfinite(nearest_m))
 
@@ -66,7 +66,7 @@ def _smoothed(
     weights: Float32[np.ndarray, "x y z 24"], far: Bool[np.ndarray, "x y z 1"]
 ) -> Float32[np.ndarray, "x y z 24"]:
     for _ in range(SMOOTHINGS):
-        mean = uniform_filter(weights, (3, 3, 3, 1))
+        mean = uniform_filter(weights, 3, axes=(0, 1, 2))
         weights = np.where(far, mean, 0.7 * weights + 0.3 * mean)
     weights[weights < 1e-4] = 0.0
     return np.ascontiguousarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)
@@ -84,5 +84,5 @@ def distance_volume(
     size = (high - low) / shape
     axes = [low[k] + (np.arange(shape[k]) + 0.5) * size[k] for k in range(3)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance_m, _ = cKDTree(vertices).query(centers, distance_upper_bound=reach_m, workers=-1)
+    distance_m, _ = KDTree(vertices).query(centers, distance_upper_bound=reach_m, workers=-1)
     return np.minimum(distance_m, 1.0).astype(np.float32).reshape(shape)

@@ -119,7 +119,7 @@ class Trainer:
         for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE), strict=True):
             group["lr"] = config.learning_rate * base * rate
         self.optimizer.step()
-        field.table.grad.zero_()
+        field.table_grad.zero_()
         if refines:
             for _ in range(CORRECTIONS_PER_STEP):
                 slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)

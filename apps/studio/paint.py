@@ -38,7 +38,7 @@ STRIPE_M = 0.04
 
 
 @compile_kernel(nogil=True, inline="always")
-def _hash(i: int, j: int, k: int, seed: int) -> float:
+def _hash(i: int, j: int, k: int, seed: int) -> np.float32:
     """A number in [-1, 1) that depends on all its bits."""
     h = np.uint32(i) * np.uint32(374761393) + np.uint32(j) * np.uint32(668265263)
     h = np.uint32(

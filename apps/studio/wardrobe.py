@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from apps.studio.cut import EYE, HAIR, SHIRT, SHOE, SKIN, TROUSERS
 from apps.studio.outfit import Outfit
@@ -215,7 +215,7 @@ def _hung(
     for _ in range(refined):
         rest = 0.5 * rest + 0.5 * (average @ rest)
     rest = rest + grown * vertex_normals(rest, layer.faces)
-    _, nearest = cKDTree(body.template[among]).query(layer.rest)
+    _, nearest = KDTree(body.template[among]).query(layer.rest)
     return Layer(
         kind=kind,
         rest=rest,

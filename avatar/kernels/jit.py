@@ -10,8 +10,10 @@ from typing import Any
 import numba
 
 
-def compile_kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator: `numba.njit(**options)` with the machine code kept on disk (`cache=True`).
+def compile_kernel(
+    *, cache: bool = True, **options: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """A decorator: `numba.njit(**options)` with the machine code kept on disk.
 
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
     wrapper; so the function is unwrapped first. Numba recompiles when the function's own file has
@@ -21,9 +23,9 @@ def compile_kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         plain = inspect.unwrap(function)
-        kernel = numba.njit(**{"cache": True, **options})(plain)
+        kernel = numba.njit(cache=cache, **options)(plain)
         file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-        if hasattr(file, "_source_stamp"):
+        if file is not None:
             file._source_stamp = _sources(Path(plain.__code__.co_filename).parent)
         return kernel
 

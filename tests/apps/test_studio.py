@@ -3,7 +3,7 @@ import functools
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from apps.studio import motions
@@ -80,11 +80,11 @@ def test_the_shirt_stands_off_the_body_by_one_to_four_centimetres():
         shirt = next(layer for layer in dressed(body, outfit) if layer.kind == SHIRT)
         x, y, _ = shirt.place.T
         worn = (y > outfit.hem) & (y < 0.2) & (np.abs(x) < 0.16)
-        away, _ = cKDTree(body.template).query(shirt.rest[worn])
+        away, _ = KDTree(body.template).query(shirt.rest[worn])
         assert np.percentile(away, 2) > 0.007
         assert np.percentile(away, 98) < 0.065
         hem = worn & (y < outfit.hem + 0.05)
-        assert 0.02 < np.median(cKDTree(body.template).query(shirt.rest[hem])[0]) < 0.06
+        assert 0.02 < np.median(KDTree(body.template).query(shirt.rest[hem])[0]) < 0.06
 
 
 def test_skinning_is_the_bodys_own(actor):

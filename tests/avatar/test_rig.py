@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from avatar.rig import PARTS, canonical_rotations
@@ -118,7 +118,7 @@ def test_far_from_creases_the_weights_are_those_of_the_nearest_vertex(rig, shape
     weights = shaped.body.weights
     bone, stiff = weights.argmax(axis=1), weights.max(axis=1) > 0.999
     some = np.arange(0, len(skin), 10)
-    around = cKDTree(skin).query_ball_point(skin[some], 0.10)
+    around = KDTree(skin).query_ball_point(skin[some], 0.10)
     same = [stiff[near].all() and (bone[near] == bone[near[0]]).all() for near in around]
     place = some[np.array(same)]
     assert len(place) > 10
@@ -139,8 +139,8 @@ def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
 
 
 def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin):
-    seeds = cKDTree(rig.seeds)
-    on_skin, _ = cKDTree(skin).query(rig.seeds)
+    seeds = KDTree(rig.seeds)
+    on_skin, _ = KDTree(skin).query(rig.seeds)
     reach, nearest = seeds.query(skin)
     assert on_skin.max() < 1e-6
     assert reach.max() < 0.02 * np.sqrt(3.0)  # a voxel's diagonal

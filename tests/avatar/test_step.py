@@ -54,7 +54,7 @@ def one_step(trainer, backend):
     field.backend = backend
     batch = trainer.replay.draw(CONFIG.rays, torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(4)
-    field.table.grad.zero_()
+    field.table_grad.zero_()
     gradients(
         field, occupancy, trainer.replay.cells, batch, CONFIG,
         hard_share=1.0, remember=False, generator=generator,

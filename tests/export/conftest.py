@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from avatar.rig import Rig
 from capture.camera import Camera
@@ -46,7 +46,7 @@ class StandIn:
         origin = (camera.center_world - root[:3, 3]) @ root[:3, :3]
         bones = self.rig.body_from_canonical(pose.joint_rotations)
         skin, nearest = _posed(self.rig, self.rig.seeds, bones), 0.10
-        tree = cKDTree(skin)
+        tree = KDTree(skin)
         far = np.linalg.norm(skin - origin, axis=1)
         steps = np.arange(far.min() - nearest, far.max() + nearest, STEP_M)
         picture = np.zeros((width * height, 4))
