@@ -55,7 +55,9 @@ class WarpCells:
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         bones = bones.astype(np.float32)
-        transforms = (rig.weights.reshape(-1, 24) @ bones).reshape(*rig.weights.shape[:3], 12)
+        near, near_weights = rig.near_nodes
+        transforms = np.zeros((*rig.weights.shape[:3], 12), dtype=np.float32)
+        transforms.reshape(-1, 12)[near] = near_weights @ bones
         seeds, inverses = _posed_seeds(rig, bones)
         low = seeds.min(axis=0) - band_m
         shape = np.ceil((seeds.max(axis=0) + band_m - low) / cell_m).astype(int)

@@ -1,6 +1,7 @@
 """What moves the avatar: one person's joints, canonical pose, box and skinning volume."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
@@ -16,6 +17,8 @@ PARTS = np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 
 SEED_SPACING_M = 0.02
 WEIGHT_CELL_M = 0.023
 OCCUPANCY_CELL_M = 0.015
+VISITED_M = 0.14
+"""Root finding may look this far from the skin: the band of the warp cells, and some way beyond."""
 
 
 def canonical_rotations() -> Float[np.ndarray, "23 3"]:
@@ -85,6 +88,18 @@ class Rig:
             seed_weights=body.weights[seeds].astype(np.float32),
             seed_parts=PARTS[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
+
+    @cached_property
+    def near_nodes(self) -> tuple[Int[np.ndarray, "near"], Float32[np.ndarray, "near 24"]]:
+        """Flat numbers and weights of the weight volume's nodes that root finding may visit."""
+        shape = np.array(self.weights.shape[:3])
+        cells = np.array(self.distance.shape)
+        nearest = [
+            np.minimum(np.linspace(0, cells[k], shape[k]).astype(int), cells[k] - 1)
+            for k in range(3)
+        ]
+        near = np.flatnonzero(self.distance[np.ix_(*nearest)] < VISITED_M)
+        return near, np.ascontiguousarray(self.weights.reshape(-1, 24)[near])
 
     def body_from_canonical(
         self, joint_rotations: Float[np.ndarray, "23 3"]

@@ -18,6 +18,7 @@ ROOTS = 3
 SAME_ROOT_M = 0.02
 TOLERANCE_M = 1e-4
 ITERATIONS = 12
+LONGEST_STEP_M = 0.3
 PROBE_M = 5e-3
 """Half the base of the central differences that give the Jacobian."""
 
@@ -78,6 +79,8 @@ def _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
         dx = -(inverse[0] * fx + inverse[1] * fy + inverse[2] * fz)
         dy = -(inverse[3] * fx + inverse[4] * fy + inverse[5] * fz)
         dz = -(inverse[6] * fx + inverse[7] * fy + inverse[8] * fz)
+        if dx * dx + dy * dy + dz * dz > F32(LONGEST_STEP_M * LONGEST_STEP_M):
+            return False  # off the volume, or in a fold: nothing that follows would be sound
         x[0] += dx
         x[1] += dy
         x[2] += dz
@@ -178,7 +181,8 @@ def build_cells(
     """Fills `index` and `roots` of one frame; returns how many roots there are.
 
     Args:
-        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12).
+        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12); zero on
+            nodes too far from the skin to matter.
         low, nodes_per_m: Place and scale of those nodes.
         seeds, seed_inverses, parts: Posed seeds, their inverse transforms, their body parts.
         grid_low, cell_m: Corner of the frame's grid and its cell size, body frame.

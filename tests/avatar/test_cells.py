@@ -83,3 +83,18 @@ def test_no_cell_is_far_from_the_body(rig, bent_pose):
     place = (cells.roots[1:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
     cell = (place * rig.distance.shape).astype(int)
     assert rig.distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
+
+
+def test_wild_poses_are_solved_without_harm(rig, rng):
+    """Far from anything a body does: roots may be lost, but all that is kept is finite."""
+    for _ in range(20):
+        cells = WarpCells.of(rig, rng.normal(size=(23, 3)) * 2.0)
+        assert np.isfinite(cells.roots[1:]).all()
+        place = (cells.roots[1:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
+        assert ((place >= 0.0) & (place <= 1.0)).all()
+
+
+def test_only_nodes_near_the_skin_are_blended(rig):
+    near, weights = rig.near_nodes
+    assert len(near) < 0.4 * rig.weights[..., 0].size
+    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near])
