@@ -172,7 +172,7 @@ class Lesson:
                 if time.perf_counter() - self._saved_at > CHECKPOINT_EVERY_S:
                     self._save()
             case Evaluated():
-                point = self._mark(event.scores)
+                point = self._mark(event.scores, event.wall_seconds, event.cpu_seconds)
                 if point.psnr is not None:
                     self._console.say(f"{event.wall_seconds:6.1f} s   {point.psnr:.2f} dB")
             case Warned(message=message):
@@ -190,12 +190,11 @@ class Lesson:
         ]
         return " · ".join(parts if psnr is None else [*parts, f"held out {psnr:.1f} dB"])
 
-    def _mark(self, scores: tuple[Score, ...]) -> CurvePoint:
-        trainer = self._trainer
+    def _mark(self, scores: tuple[Score, ...], wall_s: float, cpu_s: float) -> CurvePoint:
         point = CurvePoint(
-            wall_seconds=trainer.wall_seconds,
-            cpu_seconds=trainer.cpu_seconds,
-            frames_seen=trainer.frames_seen,
+            wall_seconds=wall_s,
+            cpu_seconds=cpu_s,
+            frames_seen=self._trainer.frames_seen,
             psnr=mean([s.psnr for s in scores]),
             psnr_mask=mean([s.psnr_mask for s in scores]),
         )
@@ -209,7 +208,7 @@ class Lesson:
             scores = tuple(score(self._trainer.avatar, held) for held in self._held)
         last = self._curve[-1].wall_seconds if self._curve else -1.0
         if self._trainer.wall_seconds > last:
-            self._mark(scores)
+            self._mark(scores, self._trainer.wall_seconds, self._trainer.cpu_seconds)
         return scores
 
     def _save(self) -> None:
