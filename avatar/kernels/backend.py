@@ -10,6 +10,17 @@ from torch import Tensor
 from avatar.kernels import pose, reference
 from avatar.levels import HashLevels
 
+Points = Float32[Tensor, "points 3"]
+"""Canonical positions, metres."""
+Features = Float32[Tensor, "points width"]
+"""What the hash grid holds at points."""
+Table = Float32[Tensor, "entries 4"]
+"""The hash grid's entries, level after level."""
+Raw = Float32[Tensor, "samples 4"]
+"""The network's outputs: colour logits and log density (log 1/m)."""
+Pixels = Float32[Tensor, "rays 4"]
+"""Premultiplied colour and alpha."""
+
 
 class Samples(NamedTuple):
     """Canonical samples of a batch of rays, packed ray by ray.
@@ -118,65 +129,47 @@ class Backend(Protocol):
 
     name: str
 
-    def encode(
-        self,
-        points: Float32[Tensor, "points 3"],
-        table: Float32[Tensor, "entries 4"],
-        levels: HashLevels,
-    ) -> Float32[Tensor, "points width"]:
+    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
         """Hash-grid features."""
         ...
 
     def encode_backward(
-        self,
-        points: Float32[Tensor, "points 3"],
-        grad_features: Float32[Tensor, "points width"],
-        levels: HashLevels,
-        grad_table: Float32[Tensor, "entries 4"],
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
     ) -> None:
         """Adds the table's gradient to `grad_table`."""
+        ...
+
+    def encode_points_backward(
+        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+    ) -> Points:
+        """Gradient of the features with respect to the points."""
         ...
 
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         """Canonical samples along rays."""
         ...
 
-    def composite(
-        self, raw: Float32[Tensor, "samples 4"], samples: Samples, step_m: float
-    ) -> Float32[Tensor, "rays 4"]:
+    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         """Premultiplied colour and alpha of each ray."""
         ...
 
     def composite_loss(
         self,
-        raw: Float32[Tensor, "samples 4"],
+        raw: Raw,
         samples: Samples,
         step_m: float,
-        target: Float32[Tensor, "rays 4"],
+        target: Pixels,
         background: Float32[Tensor, "rays 3"],
         alpha_weight: float,
         hard_weight: float,
-    ) -> tuple[Float32[Tensor, "rays 4"], Float32[Tensor, "rays"], Float32[Tensor, "samples 4"]]:
+    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
         """Rendering, loss of each ray, and the gradient of the mean loss for `raw`."""
         ...
 
     def keep_highest(
-        self,
-        points: Float32[Tensor, "points 3"],
-        log_density: Float32[Tensor, "points"],
-        grid: Grid,
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
     ) -> None:
         """Raises the grid's cached density, in place, to that of the samples."""
-        ...
-
-    def encode_points_backward(
-        self,
-        points: Float32[Tensor, "points 3"],
-        grad_features: Float32[Tensor, "points width"],
-        table: Float32[Tensor, "entries 4"],
-        levels: HashLevels,
-    ) -> Float32[Tensor, "points 3"]:
-        """Gradient of the features with respect to the points."""
         ...
 
     def add_wrenches(
@@ -193,11 +186,7 @@ class Backend(Protocol):
         ...
 
     def follow(
-        self,
-        cells: CellTables,
-        slot: int,
-        skin: Skin,
-        bones: Float32[Tensor, "24 12"],
+        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
     ) -> None:
         """Moves a slot's roots, in place, after its pose."""
         ...
@@ -209,30 +198,39 @@ class TorchBackend:
 
     name = "torch"
 
-    def encode(self, points, table, levels):  # noqa: D102 - see the protocol
+    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
         with torch.no_grad():
             return reference.encode(points, table, levels)
 
-    def encode_backward(self, points, grad_features, levels, grad_table):  # noqa: D102
+    def encode_backward(
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
+    ) -> None:
         table = torch.zeros_like(grad_table, requires_grad=True)
         with torch.enable_grad():
             features = reference.encode(points, table, levels)
             (grad,) = torch.autograd.grad(features, table, grad_features)
         grad_table += grad
 
-    def march(self, rays, cells, grid, how):  # noqa: D102
+    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         points, rows, count = reference.march(
             *rays, how.step_m, *cells, *grid, how.grace_steps, how.most
         )
         return Samples(points, torch.cumsum(count, 0) - count, count, rows)
 
-    def composite(self, raw, samples, step_m):  # noqa: D102
+    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         with torch.no_grad():
             return reference.composite(raw, samples.first, samples.count, step_m)
 
-    def composite_loss(  # noqa: D102
-        self, raw, samples, step_m, target, background, alpha_weight, hard_weight
-    ):
+    def composite_loss(
+        self,
+        raw: Raw,
+        samples: Samples,
+        step_m: float,
+        target: Pixels,
+        background: Float32[Tensor, "rays 3"],
+        alpha_weight: float,
+        hard_weight: float,
+    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
         leaf = raw.detach().requires_grad_()
         with torch.enable_grad():
             rendered = reference.composite(leaf, samples.first, samples.count, step_m)
@@ -240,23 +238,38 @@ class TorchBackend:
             (grad,) = torch.autograd.grad(loss.mean(), leaf)
         return rendered.detach(), loss.detach(), grad
 
-    def keep_highest(self, points, log_density, grid):  # noqa: D102
+    def keep_highest(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
+    ) -> None:
         reference.keep_highest(points, log_density, grid.low, grid.cells_per_m, grid.density)
 
-    def encode_points_backward(self, points, grad_features, table, levels):  # noqa: D102
+    def encode_points_backward(
+        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+    ) -> Points:
         leaf = points.detach().requires_grad_()
         with torch.enable_grad():
             features = reference.encode(leaf, table.detach(), levels)
             (grad,) = torch.autograd.grad(features, leaf, grad_features)
         return grad
 
-    def add_wrenches(self, samples, grad_points, slots, cells, skin, bones, wrenches):  # noqa: D102
+    def add_wrenches(
+        self,
+        samples: Samples,
+        grad_points: Float32[Tensor, "samples 3"],
+        slots: Int32[Tensor, "rays"],
+        cells: CellTables,
+        skin: Skin,
+        bones: Float32[Tensor, "slots 24 12"],
+        wrenches: Float32[Tensor, "slots 24 6"],
+    ) -> None:
         slot = slots.repeat_interleave(samples.count).long()
         roots = cells.roots[slot, samples.rows.long()]
         wrench = pose.wrenches(samples.points, grad_points, roots, bones[slot], *skin)
         wrenches.index_add_(0, slot, wrench)
 
-    def follow(self, cells, slot, skin, bones):  # noqa: D102
+    def follow(
+        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
+    ) -> None:
         nx, ny, nz = cells.shape[slot].tolist()
         index = cells.index[slot, : nx * ny * nz].view(nx, ny, nz)
         pose.follow(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)

@@ -4,13 +4,35 @@ from typing import final
 
 import numpy as np
 import torch
+from jaxtyping import Float32, Int32, Int64
+from torch import Tensor
 
 from avatar.kernels import cpu_composite, cpu_grid, cpu_march, cpu_pose
-from avatar.kernels.backend import Samples
+from avatar.kernels.backend import (
+    CellTables,
+    Features,
+    Grid,
+    Marching,
+    Pixels,
+    Points,
+    Raw,
+    Rays,
+    Samples,
+    Skin,
+    Table,
+)
 from avatar.levels import HashLevels
 
 
-def _levels(levels: HashLevels):
+def _levels(
+    levels: HashLevels,
+) -> tuple[
+    Float32[np.ndarray, "3"],
+    Float32[np.ndarray, "levels"],
+    Int32[np.ndarray, "levels 3"],
+    Int32[np.ndarray, "levels"],
+    Int64[np.ndarray, "levels+1"],
+]:
     return levels.low, levels.cells_per_m, levels.counts, levels.dense, levels.offsets
 
 
@@ -20,17 +42,19 @@ class NumbaBackend:
 
     name = "numba"
 
-    def encode(self, points, table, levels):  # noqa: D102 - see the protocol
+    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
         features = torch.empty(len(points), levels.width)
         cpu_grid.encode(points.numpy(), *_levels(levels), table.detach().numpy(), features.numpy())
         return features
 
-    def encode_backward(self, points, grad_features, levels, grad_table):  # noqa: D102
+    def encode_backward(
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
+    ) -> None:
         cpu_grid.encode_backward(
             points.numpy(), *_levels(levels), grad_features.numpy(), grad_table.numpy()
         )
 
-    def march(self, rays, cells, grid, how):  # noqa: D102
+    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         padded = np.empty((len(rays.slots), how.most, 3), dtype=np.float32)
         padded_rows = np.empty((len(rays.slots), how.most), dtype=np.int32)
         count = torch.empty(len(rays.slots), dtype=torch.int32)
@@ -47,7 +71,7 @@ class NumbaBackend:
         )
         return Samples(points, first, count, rows)
 
-    def composite(self, raw, samples, step_m):  # noqa: D102
+    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         rendered = torch.empty(len(samples.count), 4)
         cpu_composite.composite(
             raw.numpy(), samples.first.numpy(), samples.count.numpy(), np.float32(step_m),
@@ -55,9 +79,16 @@ class NumbaBackend:
         )  # fmt: skip
         return rendered
 
-    def composite_loss(  # noqa: D102
-        self, raw, samples, step_m, target, background, alpha_weight, hard_weight
-    ):
+    def composite_loss(
+        self,
+        raw: Raw,
+        samples: Samples,
+        step_m: float,
+        target: Pixels,
+        background: Float32[Tensor, "rays 3"],
+        alpha_weight: float,
+        hard_weight: float,
+    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
         rendered, loss = torch.empty(len(samples.count), 4), torch.empty(len(samples.count))
         grad = torch.empty_like(raw)
         cpu_composite.composite_loss(
@@ -67,13 +98,17 @@ class NumbaBackend:
         )  # fmt: skip
         return rendered, loss, grad
 
-    def keep_highest(self, points, log_density, grid):  # noqa: D102
+    def keep_highest(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
+    ) -> None:
         cpu_march.keep_highest(
             points.numpy(), log_density.numpy(), grid.low.numpy(), grid.cells_per_m.numpy(),
             grid.density.numpy(),
         )  # fmt: skip
 
-    def encode_points_backward(self, points, grad_features, table, levels):  # noqa: D102
+    def encode_points_backward(
+        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+    ) -> Points:
         grad = torch.empty_like(points)
         cpu_pose.encode_points_backward(
             points.numpy(), *_levels(levels), table.detach().numpy(), grad_features.numpy(),
@@ -81,14 +116,25 @@ class NumbaBackend:
         )  # fmt: skip
         return grad
 
-    def add_wrenches(self, samples, grad_points, slots, cells, skin, bones, wrenches):  # noqa: D102
+    def add_wrenches(
+        self,
+        samples: Samples,
+        grad_points: Float32[Tensor, "samples 3"],
+        slots: Int32[Tensor, "rays"],
+        cells: CellTables,
+        skin: Skin,
+        bones: Float32[Tensor, "slots 24 12"],
+        wrenches: Float32[Tensor, "slots 24 6"],
+    ) -> None:
         cpu_pose.add_wrenches(
             samples.points.numpy(), grad_points.numpy(), samples.rows.numpy(),
             samples.first.numpy(), samples.count.numpy(), slots.numpy(), cells.roots.numpy(),
             *(part.numpy() for part in skin), bones.numpy(), wrenches.numpy(),
         )  # fmt: skip
 
-    def follow(self, cells, slot, skin, bones):  # noqa: D102
+    def follow(
+        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
+    ) -> None:
         cpu_pose.follow(
             cells.index[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
