@@ -16,6 +16,7 @@ from torch import Tensor
 
 from avatar.cells import BAND_M
 from avatar.kernels.backend import Grid
+from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.rig import Rig
 
 DECAY = 0.9
@@ -80,7 +81,9 @@ class Occupancy:
             generator: Chooses cells and places.
         """
         chosen = self._draw(self.band, int(len(self.band) * share), generator)
-        density = torch.exp(log_density_at(self._somewhere_in(chosen, generator)).clamp(max=9.0))
+        density = torch.exp(
+            log_density_at(self._somewhere_in(chosen, generator)).clamp(max=MAX_LOG_DENSITY)
+        )
         flat = self.grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
         bar = min(OPACITY / step_m, float(flat[self.band].mean()))

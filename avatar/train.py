@@ -32,6 +32,10 @@ CLEARING_STEPS = 300
 REFINED_AFTER_STEPS = 150
 """Poses are corrected once there is something to compare them with."""
 CORRECTIONS_PER_STEP = 2
+READING_SHARE = 0.5
+"""Share of the time after which a video that is still being read comes before training."""
+FAREWELL_STEPS = 20
+"""Steps after the last frame, at the least: a new frame's rays are drawn first."""
 SCORING_SHARE = 0.015
 """Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
@@ -191,7 +195,9 @@ def train(
 ) -> Iterator[TrainEvent]:
     """Trains until the time is up, on whatever has arrived.
 
-    The learning rate is constant while frames arrive and falls as a cosine after the last.
+    The learning rate is constant while frames arrive and falls as a cosine after the last. No
+    frame is lost: where the time is too short to read them all beside training, reading comes
+    first, and ends after the time if it must.
 
     Args:
         trainer: Goes on from where it stands.
@@ -204,16 +210,19 @@ def train(
     """
     config, stream, marks = trainer.config, _Stream(trainer, inbox, held), _Marks(trainer)
     while True:
-        yield from stream.take_in()
+        now = stream.clock.read()
+        yield from stream.take_in(urgent=now > READING_SHARE * config.seconds)
         if len(trainer.replay) == 0:
             if stream.ended:
                 return
             continue
         now = stream.clock.read()
-        if now >= config.seconds or (config.steps and trainer.steps >= config.steps):
+        if stream.is_done(now):
             break
         if marks.due(now):
             yield marks.score(held, stream.clock)
+            continue
+        if stream.is_behind(now):
             continue
         result = trainer.step(
             rate=cosine(stream.progress(now)), hard_share=min(1.0, 4.0 * now / config.seconds)
@@ -225,10 +234,11 @@ def train(
             samples_per_ray=result.samples / config.rays,
             frames_seen=trainer.frames_seen,
         )
-    if not stream.ended and not config.steps:
+    if trainer.wall_seconds > 1.1 * config.seconds and not config.steps:
         yield Warned(
-            message=f"The time was up when {trainer.frames_seen} frames had been learnt from and "
-            "more were coming: give more --seconds, or fewer --frames"
+            message=f"Reading the video took longer than the {config.seconds:.0f} s that were "
+            f"given: training ended after {trainer.wall_seconds:.0f} s, when every frame had been "
+            "learnt from. Give more --seconds, or fewer --frames"
         )
     yield Finished(
         wall_seconds=trainer.wall_seconds,
@@ -251,6 +261,7 @@ class _Stream:
     ) -> None:
         self._trainer, self._inbox, self._held = trainer, inbox, held
         self._ended_at: float | None = None
+        self._last_steps = 0
         self.clock = Clock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
 
@@ -259,11 +270,16 @@ class _Stream:
         """Whether nothing more will arrive."""
         return self._ended_at is not None
 
-    def take_in(self) -> Iterator[Warned]:
-        """Hands what has arrived to the trainer; the clock starts with the first frame."""
+    def take_in(self, *, urgent: bool) -> Iterator[Warned]:
+        """Hands what has arrived to the trainer; the clock starts with the first frame.
+
+        Args:
+            urgent: Wait a little for something to arrive, so that the reader has the machine.
+        """
         if self.ended:
             return
-        for item in self._inbox.take(wait_s=0.0 if len(self._trainer.replay) else 0.1):
+        wait_s = 0.1 if urgent or len(self._trainer.replay) == 0 else 0.0
+        for item in self._inbox.take(wait_s=wait_s):
             if isinstance(item, Dropped):
                 yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
                 continue
@@ -275,6 +291,18 @@ class _Stream:
                 self._trainer.add(item)
         if self._inbox.finished:
             self._ended_at = self.clock.read()
+            self._last_steps = self._trainer.steps + FAREWELL_STEPS
+
+    def is_behind(self, now: float) -> bool:
+        """Whether reading must come first for a while."""
+        return not self.ended and now > READING_SHARE * self._trainer.config.seconds
+
+    def is_done(self, now: float) -> bool:
+        """Whether the time, or the number of steps asked for, is up and nothing is left over."""
+        config, steps = self._trainer.config, self._trainer.steps
+        if config.steps and steps >= config.steps:
+            return True
+        return now >= config.seconds and self.ended and steps >= self._last_steps
 
     def progress(self, now: float) -> float:
         """How much of the time after the last frame has gone by, in [0, 1]; 0 before it."""

@@ -110,7 +110,7 @@ class NumbaBackend:
         self, points: Points, grad_features: Features, table: Table, levels: HashLevels
     ) -> Points:
         grad = torch.empty_like(points)
-        cpu_pose.encode_points_backward(
+        cpu_grid.encode_points_backward(
             points.numpy(), *_levels(levels), table.detach().numpy(), grad_features.numpy(),
             grad.numpy(),
         )  # fmt: skip

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
-from avatar.kernels.jit import compile_kernel
+from avatar.kernels.cpu_skin import interpolate, moved
+from avatar.kernels.jit import FAST, compile_kernel
 
 F32, I32, I64 = np.float32, np.int32, np.int64
-FAST = {"fastmath": True, "error_model": "numpy", "nogil": True}
 STARTS = 4
 """Body parts tried per cell, nearest first."""
 ROOTS = 3
@@ -21,34 +21,6 @@ ITERATIONS = 12
 LONGEST_STEP_M = 0.3
 PROBE_M = 5e-3
 """Half the base of the central differences that give the Jacobian."""
-
-
-@compile_kernel(inline="always", **FAST)
-def _blended(transforms, low, nodes_per_m, x, y, z, out):
-    """Trilinear 3×4 transform at a canonical point; the border's value outside."""
-    a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(transforms.shape[0] - 1.001))
-    b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(transforms.shape[1] - 1.001))
-    c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(transforms.shape[2] - 1.001))
-    i, j, k = I32(a), I32(b), I32(c)
-    a, b, c = a - i, b - j, c - k
-    u, v, w = F32(1) - a, F32(1) - b, F32(1) - c
-    for q in range(12):
-        out[q] = (
-            u * v * w * transforms[i, j, k, q] + u * v * c * transforms[i, j, k + 1, q]
-            + u * b * w * transforms[i, j + 1, k, q] + u * b * c * transforms[i, j + 1, k + 1, q]
-            + a * v * w * transforms[i + 1, j, k, q] + a * v * c * transforms[i + 1, j, k + 1, q]
-            + a * b * w * transforms[i + 1, j + 1, k, q]
-            + a * b * c * transforms[i + 1, j + 1, k + 1, q]
-        )  # fmt: skip
-
-
-@compile_kernel(inline="always", **FAST)
-def _posed(m, x, y, z):
-    return (
-        m[0] * x + m[1] * y + m[2] * z + m[3],
-        m[4] * x + m[5] * y + m[6] * z + m[7],
-        m[8] * x + m[9] * y + m[10] * z + m[11],
-    )
 
 
 @compile_kernel(inline="always", **FAST)
@@ -66,9 +38,9 @@ def _inverse(m, out):
 @compile_kernel(**FAST)
 def _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
     """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest."""
-    _blended(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+    interpolate(transforms, low, nodes_per_m, x[0], x[1], x[2], 12, blend)
     _inverse(blend, inverse)
-    sx, sy, sz = _posed(blend, x[0], x[1], x[2])
+    sx, sy, sz = moved(blend, x[0], x[1], x[2])
     fx, fy, fz = sx - px, sy - py, sz - pz
     for _ in range(ITERATIONS):
         size = fx * fx + fy * fy + fz * fz
@@ -84,8 +56,8 @@ def _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
         x[0] += dx
         x[1] += dy
         x[2] += dz
-        _blended(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
-        sx, sy, sz = _posed(blend, x[0], x[1], x[2])
+        interpolate(transforms, low, nodes_per_m, x[0], x[1], x[2], 12, blend)
+        sx, sy, sz = moved(blend, x[0], x[1], x[2])
         gx, gy, gz = sx - px, sy - py, sz - pz
         yx, yy, yz = gx - fx, gy - fy, gz - fz
         jx = inverse[0] * yx + inverse[1] * yy + inverse[2] * yz
@@ -117,10 +89,10 @@ def _jacobian_inverse(transforms, low, nodes_per_m, x, blend, jacobian, out):
         hx = F32(PROBE_M) if axis == 0 else F32(0)
         hy = F32(PROBE_M) if axis == 1 else F32(0)
         hz = F32(PROBE_M) if axis == 2 else F32(0)
-        _blended(transforms, low, nodes_per_m, x[0] + hx, x[1] + hy, x[2] + hz, blend)
-        ax, ay, az = _posed(blend, x[0] + hx, x[1] + hy, x[2] + hz)
-        _blended(transforms, low, nodes_per_m, x[0] - hx, x[1] - hy, x[2] - hz, blend)
-        bx, by, bz = _posed(blend, x[0] - hx, x[1] - hy, x[2] - hz)
+        interpolate(transforms, low, nodes_per_m, x[0] + hx, x[1] + hy, x[2] + hz, 12, blend)
+        ax, ay, az = moved(blend, x[0] + hx, x[1] + hy, x[2] + hz)
+        interpolate(transforms, low, nodes_per_m, x[0] - hx, x[1] - hy, x[2] - hz, 12, blend)
+        bx, by, bz = moved(blend, x[0] - hx, x[1] - hy, x[2] - hz)
         jacobian[axis] = (ax - bx) / F32(2 * PROBE_M)
         jacobian[4 + axis] = (ay - by) / F32(2 * PROBE_M)
         jacobian[8 + axis] = (az - bz) / F32(2 * PROBE_M)
@@ -213,7 +185,7 @@ def build_cells(
                     seed = nearest[j, k, q]
                     if seed < 0 or found == ROOTS:
                         break
-                    x[0], x[1], x[2] = _posed(seed_inverses[seed], px, py, pz)
+                    x[0], x[1], x[2] = moved(seed_inverses[seed], px, py, pz)
                     if not _solve(
                         transforms, low, nodes_per_m, px, py, pz, x, blend, inverse
                     ) or not _in_band(x, low, cells_per_m, distance, band_m):

@@ -3,13 +3,10 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.jit import compile_kernel
+from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.reference import ALPHA_DEAD_ZONE, HUBER_DELTA, MAX_LOG_DENSITY
 
 F32 = np.float32
-FAST = {"fastmath": True, "error_model": "numpy", "nogil": True}
-MAX_LOG_DENSITY = 9.0
-HUBER_DELTA = 0.1
-ALPHA_DEAD_ZONE = 1e-3
 
 
 @compile_kernel(inline="always")

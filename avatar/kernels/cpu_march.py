@@ -3,12 +3,10 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.jit import compile_kernel
+from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.reference import MAX_LOG_DENSITY, OPAQUE_DEPTH
 
 F32, I32, I64 = np.float32, np.int32, np.int64
-FAST = {"fastmath": True, "error_model": "numpy", "nogil": True}
-OPAQUE_DEPTH = 12.0
-"""Optical depth, by cached densities, from which a training ray may end after its grace."""
 
 
 @compile_kernel(inline="always")
@@ -126,6 +124,6 @@ def keep_highest(points, log_density, low, cells_per_m, density):
         b = I32((points[i, 1] - low[1]) * cells_per_m[1])
         c = I32((points[i, 2] - low[2]) * cells_per_m[2])
         if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
-            here = np.exp(min(log_density[i], F32(9)))
+            here = np.exp(min(log_density[i], F32(MAX_LOG_DENSITY)))
             if here > density[a, b, c]:
                 density[a, b, c] = here

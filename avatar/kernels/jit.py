@@ -9,6 +9,9 @@ from typing import Any
 
 import numba
 
+FAST: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
+"""Of a kernel: sums may be reordered, nothing raises on a zero divisor, other threads run on."""
+
 
 def compile_kernel(
     *, cache: bool = True, **options: Any

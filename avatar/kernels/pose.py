@@ -5,6 +5,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 LONGEST_STEP_M = 0.05
+"""A root never moves farther than this at once: where the chord is longer the warp has a fold."""
 
 
 def weights_at(

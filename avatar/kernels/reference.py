@@ -15,6 +15,7 @@ MAX_LOG_DENSITY = 9.0
 HUBER_DELTA = 0.1
 ALPHA_DEAD_ZONE = 1e-3
 OPAQUE_DEPTH = 12.0
+"""Optical depth, by cached densities, from which a training ray may end after its grace."""
 
 
 def encode(
