@@ -81,9 +81,8 @@ class Occupancy:
             generator: Chooses cells and places.
         """
         chosen = self._draw(self.band, int(len(self.band) * share), generator)
-        density = torch.exp(
-            log_density_at(self._somewhere_in(chosen, generator)).clamp(max=MAX_LOG_DENSITY)
-        )
+        log_density = log_density_at(self._somewhere_in(chosen, generator))
+        density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
         flat = self.grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
         bar = min(OPACITY / step_m, float(flat[self.band].mean()))
