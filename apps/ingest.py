@@ -52,8 +52,11 @@ def ingest(given: IngestArguments, console: Console) -> int:
         from apps.deliver import RunNote, deliver
         from apps.learn import Lesson
         from apps.threads import use_threads
+        from avatar.kernels.backend import backend_for
 
         threads = use_threads(given.threads)
+    with console.waiting("compiling kernels (slow on the first run only)"):
+        backend_for(_device(given.device))  # a bad --device is said here, too
     trainer, recall, notes = _trainer(given, recording, run, console)
     _warm_up(trainer, console)
     run.begin(resume=given.resume)
@@ -136,7 +139,7 @@ def _trainer(
 def _warm_up(trainer: "Trainer", console: Console) -> None:
     from avatar.warm import warm_up
 
-    with console.waiting("compiling kernels (slow on the first run only)"):
+    with console.waiting("warming up"):
         warm_up(trainer)
 
 

@@ -31,8 +31,26 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
         OSError: If the disk is full, or the folder cannot be written. An older checkpoint stays.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    state = {**_state(trainer), "notes": notes or {}}
+    path, part = folder / FILE, folder / (FILE + ".part")
+    try:
+        with part.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except RuntimeError as error:  # torch stumbles once more after the disk has failed
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _state(trainer: Trainer) -> dict[str, Any]:
     occupancy, field = trainer.avatar.occupancy.grid, trainer.avatar.field
-    state = {
+    return {
         "format": FORMAT,
         "config": dataclasses.asdict(trainer.config),
         "rig": {
@@ -49,22 +67,7 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
         "corrections": {
             frame: torch.from_numpy(numbers) for frame, numbers in trainer.corrections.items()
         },
-        "notes": notes or {},
     }
-    path, part = folder / FILE, folder / (FILE + ".part")
-    try:
-        with part.open("wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except RuntimeError as error:  # torch stumbles once more after the disk has failed
-        if isinstance(error.__context__, OSError):
-            raise error.__context__ from None
-        raise
-    finally:
-        part.unlink(missing_ok=True)
-    return path
 
 
 def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
@@ -84,23 +87,7 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
                 f"The checkpoint {path} has format {state['format']}; this version reads {FORMAT}. "
                 "Train again with --overwrite."
             )
-        rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
-        trainer = Trainer(rig, TrainConfig(**state["config"]), device)
-        with torch.no_grad():
-            for parameter, values in zip(
-                trainer.avatar.field.parameters(), state["field"], strict=True
-            ):
-                parameter.copy_(values)
-        trainer.optimizer.load_state_dict(state["optimizer"])
-        grid = trainer.avatar.occupancy.grid
-        grid.density.copy_(state["density"])
-        grid.occupied.copy_(state["occupied"])
-        trainer.corrections = {
-            frame: tensor.numpy() for frame, tensor in state["corrections"].items()
-        }
-        for name in COUNTS:
-            setattr(trainer, name, state["counts"][name])
-        return trainer, state["notes"]
+        return _restored(state, device), state["notes"]
     except BadInput:
         raise
     except pickle.UnpicklingError as error:
@@ -113,3 +100,21 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
             f"The checkpoint {path} cannot be read ({error}). "
             "Expected one that ia-ingest wrote. Train again with --overwrite."
         ) from error
+
+
+def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
+    rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
+    trainer = Trainer(rig, TrainConfig(**state["config"]), device)
+    with torch.no_grad():
+        for parameter, values in zip(
+            trainer.avatar.field.parameters(), state["field"], strict=True
+        ):
+            parameter.copy_(values)
+    trainer.optimizer.load_state_dict(state["optimizer"])
+    grid = trainer.avatar.occupancy.grid
+    grid.density.copy_(state["density"])
+    grid.occupied.copy_(state["occupied"])
+    trainer.corrections = {frame: tensor.numpy() for frame, tensor in state["corrections"].items()}
+    for name in COUNTS:
+        setattr(trainer, name, state["counts"][name])
+    return trainer

@@ -4,12 +4,12 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from avatar.config import TrainConfig
 from avatar.field import Activations, Field
-from avatar.kernels.backend import CellTables, Marching
+from avatar.kernels.backend import CellTables, Marching, Samples
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.occupancy import Occupancy
 from avatar.refine import PoseTable
@@ -75,14 +75,7 @@ def gradients(
     grad_empty = _grad_of_emptiness(seen.raw[count:], config.empty_weight)
     grad_features = field.backward(seen, torch.cat([grad, grad_empty]))
     if poses is not None and count:
-        backend = field.backend
-        grad_points = backend.encode_points_backward(
-            samples.points, grad_features[:count], field.table, field.levels
-        )
-        backend.add_wrenches(
-            samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones, poses.wrenches
-        )
-        poses.count(batch.rays.slots.long())
+        _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells)
     if remember:
         _remember(field, occupancy, seen, count)
     return StepResult(loss, count)
@@ -94,6 +87,25 @@ def _grad_of_emptiness(raw: Float32[Tensor, "points 4"], weight: float) -> Tenso
     optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * EMPTY_STEP_M
     grad[:, 3] = weight / max(len(raw), 1) * optical * torch.exp(-optical)
     return grad
+
+
+def _pull(
+    poses: PoseTable,
+    field: Field,
+    samples: Samples,
+    grad_features: Float32[Tensor, "samples width"],
+    slots: Int32[Tensor, "rays"],
+    cells: CellTables,
+) -> None:
+    """Lets the samples pull at the poses that they were warped with."""
+    backend = field.backend
+    grad_points = backend.encode_points_backward(
+        samples.points, grad_features, field.table, field.levels
+    )
+    backend.add_wrenches(
+        samples, grad_points, slots, cells, poses.skin, poses.bones, poses.wrenches
+    )
+    poses.count(slots.long())
 
 
 def _remember(field: Field, occupancy: Occupancy, seen: Activations, count: int) -> None:

@@ -110,11 +110,11 @@ class Trainer:
             rate: Factor of the learning rates, in (0, 1].
             hard_share: Share of the hard-surface loss's weight, in [0, 1].
         """
-        config, field, occupancy = self.config, self.avatar.field, self.avatar.occupancy
+        config, field = self.config, self.avatar.field
         batch = self.replay.draw(config.rays, self._generator)
         refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
         result = gradients(
-            field, occupancy, self.replay.cells, batch, config,
+            field, self.avatar.occupancy, self.replay.cells, batch, config,
             hard_share=hard_share,
             remember=self.steps % config.occupancy_every < 2,
             poses=self.poses if refines else None,
@@ -125,26 +125,32 @@ class Trainer:
         self.optimizer.step()
         field.table_grad.zero_()
         if refines:
-            for _ in range(CORRECTIONS_PER_STEP):
-                slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
-                if slot is not None:
-                    correction = self.poses.corrections[slot].copy()
-                    self.corrections[self.replay.indices[slot]] = correction
+            self._correct_poses(rate)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
-            clearing = self.steps < CLEARING_STEPS
-            occupancy.update(
-                lambda points: field.raw_at(points)[:, 3],
-                share=0.5 if clearing else 0.25,
-                decay=FIRST_DECAY if clearing else DECAY,
-                drop_specks=not clearing,
-                step_m=config.step_m,
-                generator=self._generator,
-            )
+            self._update_occupancy()
         self.steps += 1
         self.rays += config.rays
         self.samples += result.samples
         return result
+
+    def _correct_poses(self, rate: float) -> None:
+        for _ in range(CORRECTIONS_PER_STEP):
+            slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
+            if slot is not None:
+                correction = self.poses.corrections[slot].copy()
+                self.corrections[self.replay.indices[slot]] = correction
+
+    def _update_occupancy(self) -> None:
+        clearing = self.steps < CLEARING_STEPS
+        self.avatar.occupancy.update(
+            lambda points: self.avatar.field.raw_at(points)[:, 3],
+            share=0.5 if clearing else 0.25,
+            decay=FIRST_DECAY if clearing else DECAY,
+            drop_specks=not clearing,
+            step_m=self.config.step_m,
+            generator=self._generator,
+        )
 
 
 def let_follow(
@@ -224,16 +230,25 @@ def train(
             continue
         if stream.is_behind(now):
             continue
-        result = trainer.step(
-            rate=cosine(stream.progress(now)), hard_share=min(1.0, 4.0 * now / config.seconds)
-        )
-        yield Stepped(
-            step=trainer.steps,
-            wall_seconds=stream.clock.read(),
-            loss=float(result.loss.mean()),
-            samples_per_ray=result.samples / config.rays,
-            frames_seen=trainer.frames_seen,
-        )
+        yield _stepped(trainer, stream, now)
+    yield from _farewell(trainer)
+
+
+def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
+    result = trainer.step(
+        rate=cosine(stream.progress(now)), hard_share=min(1.0, 4.0 * now / trainer.config.seconds)
+    )
+    return Stepped(
+        step=trainer.steps,
+        wall_seconds=stream.clock.read(),
+        loss=float(result.loss.mean()),
+        samples_per_ray=result.samples / trainer.config.rays,
+        frames_seen=trainer.frames_seen,
+    )
+
+
+def _farewell(trainer: Trainer) -> Iterator[Warned | Finished]:
+    config = trainer.config
     if trainer.wall_seconds > 1.1 * config.seconds and not config.steps:
         yield Warned(
             message=f"Reading the video took longer than the {config.seconds:.0f} s that were "
