@@ -12,6 +12,7 @@ import numpy as np
 from apps.console import Console
 from apps.follow import FollowingCamera
 from apps.learn import Learnt
+from apps.meter import Meter
 from apps.novel import novel_motion
 from apps.pictures import data_uri, eight_bit, moving_data_uri
 from apps.recording import Recording
@@ -171,16 +172,12 @@ def _report(
     package: PackageNote | None,
     ready_at: float | None,
 ) -> Report:
-    trainer, meter = learnt.trainer, learnt.meter
-    dropped = tuple(meter.dropped)
+    trainer = learnt.trainer
     recipe = asdict(trainer.config) | {
         "camera": recording.cameras.source,
         "body": recording.shaped.body.family,
         "pose_model": recording.motion.model,
     }
-    ready = None
-    if ready_at is not None and meter.first_at is not None:
-        ready = ready_at - (meter.first_at + meter.last_time_s)
     return Report(
         command=note.command,
         recipe=recipe,
@@ -189,24 +186,36 @@ def _report(
             backend=trainer.backend.name,
             threads=note.threads,
         ),
-        frames=FramesNote(
-            read=learnt.added + len(learnt.held) + len(dropped),
-            used=learnt.added,
-            held_out=len(learnt.held),
-            dropped=dropped,
-            not_replayed=learnt.added - len(trainer.replay),
-        ),
+        frames=_frames_note(learnt),
         training=_training_note(learnt, note),
         held_out=held,
         held_out_refined=_fitted_note(learnt),
         curve=learnt.curve,
-        stream=StreamNote(
-            realtime=False,
-            ingest_ms=meter.ingest_ms(),
-            inbox_dropped=0,
-            ready_after_last_frame_seconds=ready,
-        ),
+        stream=_stream_note(learnt.meter, ready_at),
         package=package,
+    )
+
+
+def _frames_note(learnt: Learnt) -> FramesNote:
+    dropped = tuple(learnt.meter.dropped)
+    return FramesNote(
+        read=learnt.added + len(learnt.held) + len(dropped),
+        used=learnt.added,
+        held_out=len(learnt.held),
+        dropped=dropped,
+        not_replayed=learnt.added - len(learnt.trainer.replay),
+    )
+
+
+def _stream_note(meter: Meter, ready_at: float | None) -> StreamNote:
+    ready = None
+    if ready_at is not None and meter.first_at is not None:
+        ready = ready_at - (meter.first_at + meter.last_time_s)
+    return StreamNote(
+        realtime=False,
+        ingest_ms=meter.ingest_ms(),
+        inbox_dropped=0,
+        ready_after_last_frame_seconds=ready,
     )
 
 

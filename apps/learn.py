@@ -123,15 +123,13 @@ class Lesson:
         for warning in self._recording.source.warnings:
             self._console.warn(warning)
         self._console.count_the_rest()
-        scores: tuple[Score, ...] = ()
-        fitted: tuple[Score, ...] = ()
+        scores = fitted = ()
         if len(self._trainer.replay):
             self._save()  # scoring takes a while
             scores = self._final_scores()
             self._save()
-            if self._trainer.config.refine_poses and scores and not interrupted:
-                with self._console.waiting("fitting poses to the held-out frames"):
-                    fitted = fitted_scores(self._trainer, self._held)
+            if not interrupted:
+                fitted = self._fitted_scores()
         return Learnt(
             trainer=self._trainer,
             held=self._held,
@@ -210,6 +208,12 @@ class Lesson:
         if self._trainer.wall_seconds > last:
             self._mark(scores, self._trainer.wall_seconds, self._trainer.cpu_seconds)
         return scores
+
+    def _fitted_scores(self) -> tuple[Score, ...]:
+        if not (self._held and self._trainer.config.refine_poses):
+            return ()
+        with self._console.waiting("fitting poses to the held-out frames"):
+            return fitted_scores(self._trainer, self._held)
 
     def _save(self) -> None:
         notes = {**self._notes, "curve": [vars(point) for point in self._curve]}
