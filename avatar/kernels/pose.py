@@ -4,24 +4,10 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+from avatar.kernels.skin import skinned, weights_at
+
 LONGEST_STEP_M = 0.05
 """A root never moves farther than this at once: where the chord is longer the warp has a fold."""
-
-
-def weights_at(
-    points: Float[Tensor, "points 3"],
-    weights: Float[Tensor, "x y z 24"],
-    low: Float[Tensor, "3"],
-    nodes_per_m: Float[Tensor, "3"],
-) -> Float[Tensor, "points 24"]:
-    """Trilinear skinning weights at canonical points; the border's outside."""
-    last = torch.tensor(weights.shape[:3], device=points.device) - 1
-    place = ((points - low) * nodes_per_m / last * 2.0 - 1.0).flip(-1)[None, :, None, None]
-    volume = weights.permute(3, 0, 1, 2)[None]
-    read = torch.nn.functional.grid_sample(
-        volume, place, mode="bilinear", padding_mode="border", align_corners=True
-    )
-    return read[0, :, :, 0, 0].T
 
 
 def wrenches(
@@ -44,18 +30,6 @@ def wrenches(
     carried = (matrix[..., :3] @ points[:, None, :, None])[..., 0] + matrix[..., 3]
     moment = torch.linalg.cross(carried, force.expand_as(carried))
     return torch.cat([share * force, share * moment], dim=2)
-
-
-def skinned(
-    points: Float[Tensor, "points 3"],
-    weights: Float[Tensor, "x y z 24"],
-    low: Float[Tensor, "3"],
-    nodes_per_m: Float[Tensor, "3"],
-    bones: Float[Tensor, "24 12"],
-) -> Float[Tensor, "points 3"]:
-    """Linear blend skinning."""
-    blend = (weights_at(points, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
-    return (blend[..., :3] @ points[..., None])[..., 0] + blend[..., 3]
 
 
 def follow(

@@ -4,15 +4,20 @@ import numpy as np
 import torch
 
 from avatar.cells import WarpCells
-from avatar.kernels import reference
+from avatar.kernels import skin
+
+
+def skinning(rig, rotations):
+    """The skinning volume and a pose's bones, as the reference takes them."""
+    nodes_per_m = (np.array(rig.weights.shape[:3]) - 1) / (rig.box_high - rig.box_low)
+    bones = rig.body_from_canonical(rotations)[:, :3].reshape(24, 12)
+    parts = rig.weights, rig.box_low, nodes_per_m, bones
+    return tuple(torch.from_numpy(part).float() for part in parts)
 
 
 def posed(rig, rotations, canonical):
     """Skins canonical points, with the reference."""
-    bones = torch.from_numpy(rig.body_from_canonical(rotations)[:, :3]).float()
-    box = torch.from_numpy(rig.box_low), torch.from_numpy(rig.box_high)
-    weights = torch.from_numpy(rig.weights)
-    return reference.skin(torch.from_numpy(canonical), weights, bones, *box)
+    return skin.skinned(torch.from_numpy(canonical), *skinning(rig, rotations))
 
 
 def nearest_root_error(cells, targets, canonical):
@@ -57,11 +62,7 @@ def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
     place = np.argwhere((cells.index & 3) == 1)[::37]
     centers = torch.from_numpy((cells.low + (place + 0.5) * cells.cell_m).astype(np.float32))
     roots = torch.from_numpy(cells.roots[cells.index[tuple(place.T)] >> 2])
-    bones = torch.from_numpy(rig.body_from_canonical(bent_pose)[:, :3]).float()
-    found, rested = reference.find_roots(
-        centers, roots[:, :3] + 0.004, torch.from_numpy(rig.weights), bones,
-        torch.from_numpy(rig.box_low), torch.from_numpy(rig.box_high),
-    )  # fmt: skip
+    found, rested = skin.find_roots(centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose))
     assert rested.float().mean() > 0.95
     off = (found - roots[:, :3]).norm(dim=1)[rested]
     assert float(off.quantile(0.95)) < 1e-3

@@ -12,7 +12,7 @@ from avatar.cells import WarpCells
 from avatar.config import TrainConfig
 from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
-from avatar.kernels import pose as pose_kernels
+from avatar.kernels import skin
 from avatar.kernels.backend import CellTables, Samples, TorchBackend
 from avatar.kernels.cpu import NumbaBackend
 from avatar.levels import FEATURES
@@ -59,7 +59,7 @@ def samples_near_the_skin(rig, count, generator):
 def jacobians(table, points, slot):
     """Inverse Jacobians of skinning at the points, by autograd."""
     leaf = points.clone().requires_grad_()
-    posed = pose_kernels.skinned(leaf, *table.skin, table.bones[slot])
+    posed = skin.skinned(leaf, *table.skin, table.bones[slot])
     rows = [torch.autograd.grad(posed[:, k].sum(), leaf, retain_graph=True)[0] for k in range(3)]
     return torch.linalg.inv(torch.stack(rows, dim=1))
 
@@ -125,7 +125,7 @@ def residual(rig, table, cells, roots, bones):
     """How far each root, skinned, is from its cell's centre."""
     place = np.argwhere(cells.index > 0)
     rows = cells.index[tuple(place.T)] >> 2
-    posed = pose_kernels.skinned(roots[rows, :3], *table.skin, bones).numpy()
+    posed = skin.skinned(roots[rows, :3], *table.skin, bones).numpy()
     return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
 
 
@@ -139,7 +139,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     slots = torch.ones(1, dtype=torch.int32)
     NUMBA.add_wrenches(samples, pull, slots, cells, table.skin, table.bones, table.wrenches)
     gradient = table.gradient(1)
-    given = pose_kernels.skinned(samples.points, *table.skin, table.bones[1]).double().numpy()
+    given = skin.skinned(samples.points, *table.skin, table.bones[1]).double().numpy()
 
     def pulled(joint: int, axis: int, size: float) -> float:
         table.corrections[1, joint, axis] = size
@@ -148,9 +148,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
         x = samples.points.clone()
         for _ in range(8):
-            off = torch.from_numpy(target).float() - pose_kernels.skinned(
-                x, *table.skin, table.bones[1]
-            )
+            off = torch.from_numpy(target).float() - skin.skinned(x, *table.skin, table.bones[1])
             x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
         table.corrections[1, joint, axis] = 0.0
         table._move(1)
