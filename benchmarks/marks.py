@@ -1,0 +1,44 @@
+"""What was measured beside what was asked for, as one table."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """One figure.
+
+    Attributes:
+        name: What was measured, with its unit.
+        value: None where there is none.
+        least, moonshot: What was asked for; empty where nothing was.
+        beside: What to read it beside.
+    """
+
+    name: str
+    value: float | None
+    least: str = ""
+    moonshot: str = ""
+    beside: str = ""
+
+
+def table(marks: list[Mark]) -> list[str]:
+    """The marks as Markdown."""
+    cells = [("what", "measured", "at least", "moonshot", "beside it")]
+    cells += [(m.name, written(m.value), m.least, m.moonshot, m.beside) for m in marks]
+    *widths, _ = (max(map(len, column)) for column in zip(*cells, strict=True))
+    lines = [
+        "| " + " | ".join([a.ljust(widths[0]), b.rjust(widths[1]), c.ljust(widths[2]),
+                           d.ljust(widths[3]), e]) + " |"
+        for a, b, c, d, e in cells
+    ]  # fmt: skip
+    rule = ["-" * (width + 2) for width in widths]
+    rule[1] = rule[1][:-1] + ":"
+    return [lines[0], "|" + "|".join(rule) + "|---|", *lines[1:]]
+
+
+def written(value: float | None) -> str:
+    """A number with as many digits as anybody reads."""
+    if value is None:
+        return "-"
+    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2 if abs(value) >= 0.1 else 3
+    return f"{value:,.{digits}f}"
