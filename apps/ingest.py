@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
     from apps.deliver import Delivered
     from apps.learn import Learnt
-    from avatar.train import Trainer
+    from avatar.trainer import Trainer
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,7 +52,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
         from apps.deliver import RunNote, deliver
         from apps.learn import Lesson
         from apps.threads import use_threads
-        from avatar.kernels.backend import backend_for
+        from avatar.kernels.choice import backend_for
 
         threads = use_threads(given.threads)
     with console.waiting("compiling kernels (slow on the first run only)"):

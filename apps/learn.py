@@ -20,7 +20,8 @@ from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
-from avatar.train import Trainer, train
+from avatar.train import train
+from avatar.trainer import Trainer
 from capture.inbox import Inbox
 from preprocess.observe import Dropped
 

@@ -11,7 +11,7 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.rig import Rig
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.errors import BadInput
 
 FORMAT = 1

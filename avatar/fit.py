@@ -13,7 +13,7 @@ from avatar.prepare import prepare
 from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.step import cosine, gradients
-from avatar.train import Trainer, let_follow
+from avatar.trainer import Trainer, let_follow
 
 CORRECTIONS = 40
 """Corrections that each frame's pose gets."""

@@ -10,7 +10,7 @@ from avatar.cells import WarpCells
 from avatar.prepare import BodyRays, PreparedFrame
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 

@@ -21,7 +21,8 @@ from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished, Warned
 from avatar.hold import prepared
 from avatar.rig import Rig
-from avatar.train import Trainer, train
+from avatar.train import train
+from avatar.trainer import Trainer
 from avatar.warm import warm_up
 from capture.inbox import Inbox
 from export.build import export_avatar

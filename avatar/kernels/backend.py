@@ -1,8 +1,5 @@
 """One seam for the fast path: the operations of a step, on whatever runs them."""
 
-import functools
-import os
-import warnings
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
@@ -275,41 +272,3 @@ class TorchBackend:
         nx, ny, nz = cells.shape[slot].tolist()
         index = cells.index[slot, : nx * ny * nz].view(nx, ny, nz)
         pose.follow(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
-
-
-def backend_for(device: torch.device) -> Backend:
-    """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
-
-    Raises:
-        ValueError: If the forced backend is unknown or cannot run on the device.
-    """
-    forced = os.environ.get("IA_BACKEND", "")
-    if forced not in ("", "torch", "numba"):
-        raise ValueError(f"IA_BACKEND is '{forced}'; it may be 'torch' or 'numba'.")
-    if forced == "numba" and device.type != "cpu":
-        raise ValueError(f"IA_BACKEND=numba runs on the CPU only, not on {device}.")
-    if forced == "torch" or device.type != "cpu":
-        return TorchBackend()
-    return _numba() if _numba_is_sound() else TorchBackend()
-
-
-def _numba() -> Backend:
-    from avatar.kernels.cpu import NumbaBackend  # compiles: only where it is used
-
-    return NumbaBackend()
-
-
-@functools.cache
-def _numba_is_sound() -> bool:
-    """Whether the compiled kernels do here what they should; asked once, answered aloud if not."""
-    from avatar.kernels.selftest import strays
-
-    operation = strays(_numba())
-    if operation is not None:
-        warnings.warn(
-            f"The compiled kernel '{operation}' differs from its meaning on this machine; plain "
-            "torch is used instead, many times slower. Please report it with your processor and "
-            "the version of numba; IA_BACKEND=torch keeps it quiet.",
-            stacklevel=3,
-        )
-    return operation is None

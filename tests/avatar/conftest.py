@@ -16,7 +16,7 @@ from avatar.hold import HeldOut, prepared, score
 from avatar.levels import HashLevels
 from avatar.rig import Rig
 from avatar.step import cosine
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.frame import Frame
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose

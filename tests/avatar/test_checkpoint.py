@@ -15,7 +15,7 @@ from avatar.config import TrainConfig
 from avatar.prepare import prepare
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.errors import BadInput
 
 CPU = torch.device("cpu")

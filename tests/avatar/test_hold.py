@@ -22,7 +22,7 @@ from avatar.hold import (
 )
 from avatar.metrics import psnr, ssim
 from avatar.prepare import PreparedFrame
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.observation import Observation

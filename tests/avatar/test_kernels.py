@@ -9,7 +9,8 @@ import torch
 
 from avatar.cells import WarpCells
 from avatar.kernels import reference
-from avatar.kernels.backend import Grid, Marching, Rays, Samples, TorchBackend, backend_for
+from avatar.kernels.backend import Grid, Marching, Rays, Samples, TorchBackend
+from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
 from avatar.levels import FEATURES
 from avatar.occupancy import Occupancy

@@ -19,7 +19,7 @@ from avatar.levels import FEATURES
 from avatar.refine import PoseTable
 from avatar.render import cell_tables
 from avatar.step import cosine
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from preprocess.pose import BodyPose
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()

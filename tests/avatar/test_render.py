@@ -13,7 +13,7 @@ from avatar.config import TrainConfig
 from avatar.kernels.backend import Marching, Rays
 from avatar.prepare import BodyRays
 from avatar.render import cell_tables, render
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 

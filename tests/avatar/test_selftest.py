@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from avatar.kernels import backend as backend_module
-from avatar.kernels.backend import TorchBackend, backend_for
+from avatar.kernels import choice
+from avatar.kernels.backend import TorchBackend
+from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.selftest import strays
 
@@ -49,8 +50,8 @@ def test_an_operation_that_is_off_is_named(operation, factor):
 
 def test_a_straying_backend_is_replaced_with_one_warning(monkeypatch):
     monkeypatch.delenv("IA_BACKEND", raising=False)
-    monkeypatch.setattr(backend_module, "_numba", lambda: Spoiled("encode", 1.01))
-    backend_module._numba_is_sound.cache_clear()
+    monkeypatch.setattr(choice, "_numba", lambda: Spoiled("encode", 1.01))
+    choice._numba_is_sound.cache_clear()
     cpu = torch.device("cpu")
     try:
         with pytest.warns(UserWarning, match="'encode' differs from its meaning") as said:
@@ -58,4 +59,4 @@ def test_a_straying_backend_is_replaced_with_one_warning(monkeypatch):
         assert all(isinstance(one, TorchBackend) for one in chosen)
         assert len(said) == 1
     finally:
-        backend_module._numba_is_sound.cache_clear()
+        choice._numba_is_sound.cache_clear()

@@ -12,7 +12,7 @@ from avatar.kernels.backend import Marching, Samples, TorchBackend
 from avatar.kernels.cpu import NumbaBackend
 from avatar.prepare import prepare
 from avatar.step import cosine, gradients
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 
 CONFIG = TrainConfig(
     rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,

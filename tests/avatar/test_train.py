@@ -16,7 +16,8 @@ from avatar.events import Evaluated, Finished, Stepped, Warned
 from avatar.hold import HeldOut, prepared
 from avatar.prepare import prepare
 from avatar.render import render
-from avatar.train import Trainer, train
+from avatar.train import train
+from avatar.trainer import Trainer
 from capture.inbox import Inbox
 from preprocess.observe import Dropped
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.train import Trainer
+from avatar.trainer import Trainer
 from capture.errors import BadInput
 from export import build
 from export.bake import BakeConfig

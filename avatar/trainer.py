@@ -1,0 +1,166 @@
+"""The trainer: everything that training changes, and one step of it."""
+
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from avatar.cells import WarpCells
+from avatar.config import COARSEST_M, TrainConfig
+from avatar.field import Field
+from avatar.kernels.backend import Backend
+from avatar.kernels.choice import backend_for
+from avatar.levels import HashLevels
+from avatar.model import Avatar
+from avatar.occupancy import DECAY, FIRST_DECAY, Occupancy
+from avatar.prepare import PreparedFrame
+from avatar.refine import PoseTable
+from avatar.replay import Replay
+from avatar.rig import Rig
+from avatar.step import StepResult, gradients
+
+NETWORK_RATE = 0.3
+"""The network's learning rate as a share of the table's."""
+CLEARING_STEPS = 300
+"""Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
+REFINED_AFTER_STEPS = 150
+"""Poses are corrected once there is something to compare them with."""
+CORRECTIONS_PER_STEP = 2
+
+
+@final
+class Trainer:
+    """Everything that training changes, and one step of it.
+
+    Attributes:
+        avatar: As it stands.
+        config: The recipe.
+        replay: The frames it learns from.
+        poses: Their poses, corrected if the recipe says so.
+        corrections: How each frame's pose was corrected, by the frame's number in its source; a
+            frame that comes again starts from there. Clear it before another source is read.
+        steps, rays, samples: How much has been done.
+        wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
+        frames_seen: Frames taken in so far, whether or not they are still kept.
+    """
+
+    def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
+        """A trainer that has seen nothing."""
+        self.config = config
+        self.backend: Backend = backend_for(device)
+        levels = HashLevels.over(
+            rig.box_low, rig.box_high, coarsest_m=COARSEST_M, finest_m=config.finest_m,
+            levels=config.levels, table_size=config.table_size,
+        )  # fmt: skip
+        start = torch.Generator().manual_seed(config.seed)
+        field = Field(levels, self.backend, device, start)
+        self.avatar = Avatar(
+            rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
+        )
+        self.replay = Replay(config.key_frames, device)
+        self.poses = PoseTable(rig, config.key_frames, device)
+        self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
+        self.steps = self.rays = self.samples = self.frames_seen = 0
+        self.wall_seconds = self.cpu_seconds = 0.0
+        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        rate = config.learning_rate
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [field.table], "lr": rate, "eps": 1e-15},
+                {"params": field.layers, "lr": rate * NETWORK_RATE},
+            ],
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+
+    def add(self, frame: PreparedFrame, *, again: bool = False) -> None:
+        """Takes in a frame to learn from.
+
+        Args:
+            frame: Made ready.
+            again: It was learnt from before a checkpoint, and counts no second time.
+        """
+        slot = self.replay.add(frame)
+        known = self.corrections.get(frame.index)
+        self.poses.put(slot, frame.pose, correction=known)
+        if known is not None:
+            joints = self.poses.pose(slot).joint_rotations
+            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
+            self.replay.move_root(slot, self.poses.root(slot))
+        self.frames_seen += not again
+
+    def step(self, *, rate: float, hard_share: float) -> StepResult:
+        """Draws rays, follows their gradient once, and keeps the occupancy up to date.
+
+        Args:
+            rate: Factor of the learning rates, in (0, 1].
+            hard_share: Share of the hard-surface loss's weight, in [0, 1].
+        """
+        config, field = self.config, self.avatar.field
+        batch = self.replay.draw(config.rays, self._generator)
+        refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
+        result = gradients(
+            field, self.avatar.occupancy, self.replay.cells, batch, config,
+            hard_share=hard_share,
+            remember=self.steps % config.occupancy_every < 2,
+            poses=self.poses if refines else None,
+            generator=self._generator,
+        )  # fmt: skip
+        for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE), strict=True):
+            group["lr"] = config.learning_rate * base * rate
+        self.optimizer.step()
+        field.table_grad.zero_()
+        if refines:
+            self._correct_poses(rate)
+        self.replay.learn_errors(batch.rays.slots.long(), result.loss)
+        if self.steps % config.occupancy_every == 0:
+            self._update_occupancy()
+        self.steps += 1
+        self.rays += config.rays
+        self.samples += result.samples
+        return result
+
+    def _correct_poses(self, rate: float) -> None:
+        for _ in range(CORRECTIONS_PER_STEP):
+            slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
+            if slot is not None:
+                correction = self.poses.corrections[slot].copy()
+                self.corrections[self.replay.indices[slot]] = correction
+
+    def _update_occupancy(self) -> None:
+        clearing = self.steps < CLEARING_STEPS
+        self.avatar.occupancy.update(
+            lambda points: self.avatar.field.raw_at(points)[:, 3],
+            share=0.5 if clearing else 0.25,
+            decay=FIRST_DECAY if clearing else DECAY,
+            drop_specks=not clearing,
+            step_m=self.config.step_m,
+            generator=self._generator,
+        )
+
+
+def let_follow(
+    rig: Rig, backend: Backend, replay: Replay, poses: PoseTable, *, rate: float
+) -> int | None:
+    """Corrects one pose; its frame's warp and rays follow.
+
+    Args:
+        rig: Whose body.
+        backend: Moves the warp cells.
+        replay: Holds the frames.
+        poses: Holds their poses, slot by slot.
+        rate: Factor of the step, in (0, 1].
+
+    Returns:
+        The slot whose pose moved, or None if too little is known about any.
+    """
+    slot = poses.correct_one(rate=rate)
+    if slot is None:
+        return None
+    if poses.strayed(slot):
+        replay.put_cells(slot, WarpCells.of(rig, poses.pose(slot).joint_rotations))
+    else:
+        backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
+    replay.move_root(slot, poses.root(slot))
+    return slot
