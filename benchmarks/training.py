@@ -6,10 +6,11 @@ Alternatives take turns in one process; times are those of one core unless the r
 There are no thresholds here: whether a mark is reached is for the reader to see.
 """
 
+import itertools
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,9 +20,14 @@ import tyro
 from avatar.rig import Rig
 from benchmarks.hardware import Hardware
 from benchmarks.marks import Mark, table
+from benchmarks.quality import core_second_marks, refinement_marks, wall_marks
+from benchmarks.skipping import skipping_marks
 from benchmarks.stage import assembled, filmed, opened, recipe, train_for_core_seconds
+from benchmarks.startup import memory_marks, start_marks
 from benchmarks.steps import encode_marks, step_marks
 from benchmarks.stopwatch import use_threads
+from benchmarks.warps import warp_marks
+from preprocess.pose_file import read_motion
 
 SIZE_PX = 256
 LEARNT_SECONDS = 15.0
@@ -56,21 +62,43 @@ def main() -> None:
 
 def measured(job: Training, folder: Path) -> Iterator[Mark]:
     """All rows; each is also told on standard error as soon as it is known."""
-    for measure in _measures(job, folder):
-        for mark in measure():
-            print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
-            yield mark
-
-
-def _measures(job: Training, folder: Path) -> Iterator[Callable[[], list[Mark]]]:
     device = torch.device(job.device)
-    recording = opened(filmed(folder / f"sample{SIZE_PX}", SIZE_PX))
+    small = filmed(folder / f"sample{SIZE_PX}", SIZE_PX)
+    groups = [operation_marks(small, device)]
+    if not job.quick:
+        groups += [
+            core_second_marks(folder, device),
+            wall_marks(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device),
+            refinement_marks(folder, device),
+            large_marks(folder, device),
+        ]
+    for mark in itertools.chain.from_iterable(groups):
+        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        yield mark
+
+
+def operation_marks(capture: Path, device: torch.device) -> Iterator[Mark]:
+    """Single operations, on an avatar that has been learnt for a while."""
+    recording = opened(capture)
     rig = Rig.of(recording.shaped)
     seen = assembled(recording, rig, recipe(recording, 60.0, refine_poses=False), device)
     use_threads(1)
     train_for_core_seconds(seen.trainer, LEARNT_SECONDS)
-    yield lambda: step_marks(seen, device)
-    yield lambda: encode_marks(seen, device)
+    yield from step_marks(seen, device)
+    yield from encode_marks(seen, device)
+    if device.type == "cpu":  # the other side of the ratio runs there only
+        novel = read_motion(capture / "truth" / "novel" / "poses.npz")
+        yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
+    yield from skipping_marks(seen, device)
+
+
+def large_marks(folder: Path, device: torch.device) -> Iterator[Mark]:
+    """What a long video of large pictures takes; its first 120 frames turn as the others do."""
+    large = filmed(folder / "sample540", 540, frames=300, turns=5.0)
+    asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
+    yield from wall_marks(large, asked, device)
+    yield from start_marks(large)
+    yield from memory_marks(large, folder / "run540")
 
 
 if __name__ == "__main__":

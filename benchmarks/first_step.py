@@ -1,0 +1,48 @@
+"""A process that starts, learns one step from a capture folder, and says how long that took.
+
+    python -m benchmarks.first_step CAPTURE BEGAN
+
+BEGAN is the time, in seconds of the epoch, at which the process was started. It does what
+ia-ingest does until its first step, and imports as late.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+
+def main() -> None:
+    from apps.recording import Recording, RecordingPaths
+
+    capture, began = Path(sys.argv[1]), float(sys.argv[2])
+    recording = Recording.open(RecordingPaths(video=capture))
+
+    import torch
+
+    from apps.threads import use_threads
+    from avatar.config import TrainConfig
+    from avatar.events import Stepped
+    from avatar.hold import HeldOut, prepared
+    from avatar.rig import Rig
+    from avatar.train import Trainer, train
+    from avatar.warm import warm_up
+    from capture.inbox import Inbox
+
+    use_threads(None)
+    rig = Rig.of(recording.shaped)
+    config = TrainConfig.within(60.0, footprint_m=recording.footprint_m())
+    trainer = Trainer(rig, config, torch.device("cpu"))
+    warm_up(trainer)
+    total, held = recording.source.frame_count, list[HeldOut]()
+    begun = time.time()
+    inbox = Inbox(prepared(recording.observations(), rig, every=config.hold_every, total=total))
+    for event in train(trainer, inbox, held):
+        if isinstance(event, Stepped):
+            now = time.time()
+            print(f"{now - began:.3f} {now - begun:.3f}")
+            break
+    inbox.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""The warp: cells looked up as marching does it, beside Broyden's method for every sample."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+
+from avatar.cells import WarpCells
+from avatar.kernels.backend import CellTables, Grid, Marching, Rays
+from avatar.render import cell_tables
+from avatar.rig import Rig
+from benchmarks.broyden import Broyden
+from benchmarks.marks import Mark
+from benchmarks.stage import Class
+from benchmarks.stopwatch import interleaved
+
+POINTS = 65_536
+BANDS_M = (0.08, 0.15)
+FAR_M = 1e3
+"""A step that leaves the body's box at once: each ray is asked at its origin alone."""
+LOST_M = 0.01
+"""A point warped farther off than this was warped with another root."""
+
+
+class Posed(NamedTuple):
+    """Points of the avatar in one pose.
+
+    Attributes:
+        canonical: Where they were drawn: in cells that hold something.
+        posed: Where skinning carries them, body frame, metres.
+    """
+
+    canonical: Float32[np.ndarray, "points 3"]
+    posed: Float32[np.ndarray, "points 3"]
+
+
+def warp_marks(seen: Class, novel: Float[np.ndarray, "23 3"]) -> list[Mark]:
+    """Speed and error of the look-up in a training pose and in one that was never filmed."""
+    rig, cpu = seen.trainer.avatar.rig, torch.device("cpu")
+    poses = {"training": seen.frames[len(seen.frames) // 3].pose.joint_rotations, "novel": novel}
+    marks: list[Mark] = []
+    for name, pose in poses.items():
+        points = drawn(seen, pose)
+        cells = cell_tables(WarpCells.of(rig, pose), cpu)
+        broyden = Broyden(rig, pose, _grid(seen))
+        times = interleaved(
+            {
+                "look-up": lambda points=points, cells=cells: looked_up(seen, points, cells),
+                "Broyden": lambda points=points, broyden=broyden: broyden(points.posed),
+            },
+            cpu,
+        )
+        marks += _compared(
+            name, times, _errors(looked_up(seen, points, cells), points),
+            _errors(broyden(points.posed), points), along_rays(seen, cells),
+        )  # fmt: skip
+    return [*marks, *_built(rig, poses)]
+
+
+def drawn(seen: Class, pose: Float[np.ndarray, "23 3"]) -> Posed:
+    """Random points of cells that hold something dense, carried to a pose."""
+    rig, grid, chance = seen.trainer.avatar.rig, _grid(seen), np.random.default_rng(0)
+    cells = (grid.occupied != 0).nonzero().numpy()
+    cells = cells[chance.integers(len(cells), size=POINTS)]
+    inside = cells + chance.random((POINTS, 3))
+    canonical = (inside / grid.cells_per_m.numpy() + grid.low.numpy()).astype(np.float32)
+    bones = rig.body_from_canonical(pose)[:, :3].reshape(24, 12)
+    blended = (rig.weights_at(canonical) @ bones).reshape(-1, 3, 4)
+    posed = (blended[:, :, :3] @ canonical[:, :, None])[..., 0] + blended[:, :, 3]
+    return Posed(canonical, posed.astype(np.float32))
+
+
+def looked_up(seen: Class, points: Posed, cells: CellTables) -> Float32[np.ndarray, "points 3"]:
+    """Canonical points by the trainer's own march, one ray a point, asked at its origin alone."""
+    count = len(points.posed)
+    rays = Rays(
+        torch.from_numpy(points.posed),
+        torch.tensor([[0.6, 0.64, 0.48]]).expand(count, 3).contiguous(),
+        torch.zeros(count, dtype=torch.int32),
+        torch.zeros(count),
+    )
+    how = Marching(FAR_M, math.inf, 1)
+    samples = seen.trainer.backend.march(rays, cells, _grid(seen), how)
+    found = samples.count.numpy() > 0
+    out = np.full((count, 3), FAR_M, dtype=np.float32)
+    out[found] = samples.points.numpy()
+    return out
+
+
+def along_rays(seen: Class, cells: CellTables) -> float:
+    """Look-ups a second of core time along whole rays, when every sample that has a root stays."""
+    trainer, grid = seen.trainer, _grid(seen)
+    batch = trainer.replay.draw(8 * trainer.config.rays, torch.Generator().manual_seed(0))
+    rays = batch.rays._replace(slots=torch.zeros_like(batch.rays.slots))
+    everywhere = grid._replace(occupied=torch.ones_like(grid.occupied))
+    how = Marching(trainer.config.step_m, math.inf, 256)
+    kept = len(trainer.backend.march(rays, cells, everywhere, how).points)
+    work = {"march": lambda: trainer.backend.march(rays, cells, everywhere, how)}
+    return kept / interleaved(work, torch.device("cpu"))["march"]
+
+
+def _grid(seen: Class) -> Grid:
+    return seen.trainer.avatar.occupancy.grid
+
+
+def _errors(found: Float32[np.ndarray, "points 3"], points: Posed) -> Float[np.ndarray, "points"]:
+    return np.linalg.norm(found - points.canonical, axis=1)
+
+
+def _compared(
+    pose: str,
+    times: dict[str, float],
+    errors: Float[np.ndarray, "points"],
+    broyden: Float[np.ndarray, "points"],
+    along: float,
+) -> list[Mark]:
+    mega = {name: POINTS / time / 1e6 for name, time in times.items()}
+
+    def told(error: Float[np.ndarray, "points"]) -> str:
+        p50, p99 = 1000.0 * np.quantile(error, (0.5, 0.99))
+        lost = 100.0 * float((error > LOST_M).mean())
+        return f"p50 {p50:.3f} mm, p99 {p99:.2f} mm, {lost:.2f} % off by more than 1 cm"
+
+    true = errors[errors <= LOST_M]
+    return [
+        Mark(
+            name=f"warp-cell look-up vs numba Broyden, {pose} pose, times",
+            value=times["Broyden"] / times["look-up"], least="30", moonshot="80",
+            beside=f"one-sample rays {mega['look-up']:.1f}, Broyden (9 starts) "
+            f"{mega['Broyden']:.2f} million points/s; along whole rays {along / 1e6:.1f}: "
+            f"{along / 1e6 / mega['Broyden']:.0f} times",
+        ),
+        Mark(
+            name=f"error of that look-up, {pose} pose, p99 mm",
+            value=1000.0 * float(np.quantile(errors, 0.99)), least="< 2", moonshot="< 1",
+            beside=f"{told(errors)}; p99 of the others {1000 * np.quantile(true, 0.99):.2f} mm; "
+            f"Broyden: {told(broyden)}; points of occupied cells, no correction in any cell",
+        ),
+    ]  # fmt: skip
+
+
+def _built(rig: Rig, poses: dict[str, Float[np.ndarray, "23 3"]]) -> list[Mark]:
+    """CPU time of one frame's cells."""
+    asked = {BANDS_M[0]: ("≤ 30", "≤ 12")}
+    marks = []
+    for band_m in BANDS_M:
+        work = {
+            name: (lambda pose=pose, band_m=band_m: WarpCells.of(rig, pose, band_m=band_m))
+            for name, pose in poses.items()
+        }
+        ms = {
+            name: 1000.0 * t
+            for name, t in interleaved(work, torch.device("cpu"), rounds=15).items()
+        }
+        held = len(WarpCells.of(rig, poses["training"], band_m=band_m).roots)
+        least, moonshot = asked.get(band_m, ("printed", ""))
+        note = "" if band_m <= 0.14 else "; roots beyond 14 cm are not sought"
+        marks.append(
+            Mark(
+                name=f"build of a frame's cells, {100 * band_m:.0f}-cm band, core-ms",
+                value=ms["training"],
+                least=least,
+                moonshot=moonshot,
+                beside=f"training pose, {held:,} roots; novel pose {ms['novel']:.1f} ms{note}",
+            )
+        )
+    return marks
