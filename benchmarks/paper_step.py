@@ -132,7 +132,7 @@ def stratified(
 
 
 def _posed(scene: PaperScene, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
-    place = ((points - scene.low) / (scene.high - scene.low) * 2.0 - 1.0).flip(-1)
+    place = (points - scene.low) / (scene.high - scene.low) * 2.0 - 1.0
     read = torch.nn.functional.grid_sample(
         scene.volume, place[None, :, None, None], padding_mode="border", align_corners=True
     )
