@@ -64,7 +64,12 @@ def new_trainer(
     recording: Recording, *, seconds: float, seed: int, refine_poses: bool, device: torch.device
 ) -> Trainer:
     """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
-    config = TrainConfig.within(seconds, footprint_m=recording.footprint_m(), seed=seed)
+    config = TrainConfig.within(
+        seconds,
+        footprint_m=recording.footprint_m(),
+        frames=recording.source.frame_count,
+        seed=seed,
+    )
     config = replace(config, refine_poses=refine_poses)
     return Trainer(Rig.of(recording.shaped), config, device)
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 COARSEST_M = 0.13
 """Cells of the coarsest hash level: 16 along a two-metre box."""
+ENOUGH_FRAMES = 24
+"""So many frames, all round, determine the detail that their pixels show."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,16 +54,27 @@ class TrainConfig:
 
     @classmethod
     def within(
-        cls, seconds: float, *, footprint_m: float, seed: int = 0, hold_every: int = 10
+        cls,
+        seconds: float,
+        *,
+        footprint_m: float,
+        frames: int | None = None,
+        seed: int = 0,
+        hold_every: int = 10,
     ) -> "TrainConfig":
         """The recipe for a waiting time and a picture size.
 
         Args:
             seconds: How long the user will wait.
             footprint_m: What one pixel covers on the body, metres.
+            frames: How many frames there are, if that is known. Few of them, seen in poses that
+                are a little off, do not determine the finest detail: what they leave open would
+                be noise.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
+        if frames is not None:
+            footprint_m *= max(1.0, ENOUGH_FRAMES / max(frames, 1)) ** 0.5
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         wanted = 4.0 * 2.0 / finest_m**2

@@ -1,0 +1,30 @@
+"""The recipe follows from the waiting time, the picture's size and the number of frames."""
+
+import pytest
+
+from avatar.config import COARSEST_M, ENOUGH_FRAMES, TrainConfig
+
+
+@pytest.mark.parametrize("footprint_m", [1e-4, 0.004, 0.009, 0.02, 0.5])
+def test_every_recipe_can_be_built(footprint_m):
+    config = TrainConfig.within(60.0, footprint_m=footprint_m, frames=1)
+    assert config.table_size & (config.table_size - 1) == 0
+    assert 1 << 15 <= config.table_size <= 1 << 19
+    assert 0.002 <= config.finest_m < COARSEST_M
+    assert 0.004 <= config.step_m <= 0.015
+
+
+def test_detail_follows_the_pixels():
+    far, near = (TrainConfig.within(60.0, footprint_m=size) for size in (0.012, 0.004))
+    assert near.finest_m == 0.004
+    assert far.finest_m == 0.012
+    assert near.step_m < far.step_m
+    assert near.table_size >= far.table_size
+
+
+def test_few_frames_determine_less_detail():
+    def finest(frames):
+        return TrainConfig.within(60.0, footprint_m=0.004, frames=frames).finest_m
+
+    assert finest(6) == pytest.approx(0.004 * (ENOUGH_FRAMES / 6) ** 0.5)
+    assert finest(6) > finest(12) > finest(24) == finest(300) == finest(None)
