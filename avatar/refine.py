@@ -21,8 +21,10 @@ from preprocess.kinematics import body_from_rest, rotation_matrices
 from preprocess.pose import BodyPose
 
 STEP_M = 1.2e-2
-"""Adam's step: how far a correction moves what hangs on a joint, metres."""
+"""How far a correction that is sure of itself moves what hangs on a joint, metres."""
 MOMENTS = 0.9, 0.95
+"""Memory of the gradient's mean and of its square, as Adam's. The mean starts at 0, uncorrected:
+the first gradients, of a field that knows little, move nothing much."""
 ENOUGH_RAYS = 256
 """A frame's pose moves when this many of its rays have been seen since it last did."""
 STRAYED_M = 0.04
@@ -39,8 +41,8 @@ FARTHEST = 0.35
 class PoseTable:
     """The poses of the frames in replay, each with its correction.
 
-    Corrections are kept as 75 numbers a slot: axis-angle of the root and of 23 joints (turned
-    after the given rotation's own frame), and the root's shift in the given body frame, metres.
+    A correction is 75 numbers: axis-angles of the root and of 23 joints, applied in each one's own
+    frame before the given rotation, and the root's shift in the given body frame, metres.
 
     Attributes:
         corrections: (slots, 25, 3): root rotation, joint rotations, root shift.
@@ -182,6 +184,7 @@ class PoseTable:
         first += (1.0 - MOMENTS[0]) * gradient
         second *= MOMENTS[1]
         second += (1.0 - MOMENTS[1]) * gradient**2
+        # how sure the step is, in [-1, 1]: noise has |s| of about 0.2, and moves by its square
         surely = first / (np.sqrt(second / (1.0 - MOMENTS[1] ** times)) + 1e-12)
         step = surely * np.abs(surely) * STEP_M * rate / self._lever[:, None]
         held = [i for i, pose in enumerate(self._given) if pose is not None]
