@@ -18,6 +18,7 @@ import torch
 import tyro
 
 from avatar.rig import Rig
+from benchmarks.builds import build_marks
 from benchmarks.hardware import Hardware
 from benchmarks.marks import Mark, table
 from benchmarks.quality import core_second_marks, refinement_marks, wall_marks
@@ -89,6 +90,7 @@ def operation_marks(capture: Path, device: torch.device) -> Iterator[Mark]:
     if device.type == "cpu":  # the other side of the ratio runs there only
         novel = read_motion(capture / "truth" / "novel" / "poses.npz")
         yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
+        yield from build_marks(capture)
     yield from skipping_marks(seen, device)
 
 

@@ -10,14 +10,12 @@ from jaxtyping import Float, Float32
 from avatar.cells import WarpCells
 from avatar.kernels.backend import CellTables, Grid, Marching, Rays
 from avatar.render import cell_tables
-from avatar.rig import Rig
 from benchmarks.broyden import Broyden
 from benchmarks.marks import Mark
 from benchmarks.stage import Class
 from benchmarks.stopwatch import interleaved
 
 POINTS = 65_536
-BANDS_M = (0.08, 0.15)
 FAR_M = 1e3
 """A step that leaves the body's box at once: each ray is asked at its origin alone."""
 LOST_M = 0.01
@@ -56,7 +54,7 @@ def warp_marks(seen: Class, novel: Float[np.ndarray, "23 3"]) -> list[Mark]:
             name, times, _errors(looked_up(seen, points, cells), points),
             _errors(broyden(points.posed), points), along_rays(seen, cells),
         )  # fmt: skip
-    return [*marks, *_built(rig, poses)]
+    return marks
 
 
 def drawn(seen: Class, pose: Float[np.ndarray, "23 3"]) -> Posed:
@@ -139,31 +137,3 @@ def _compared(
             f"Broyden: {told(broyden)}; points of occupied cells, no correction in any cell",
         ),
     ]  # fmt: skip
-
-
-def _built(rig: Rig, poses: dict[str, Float[np.ndarray, "23 3"]]) -> list[Mark]:
-    """CPU time of one frame's cells."""
-    asked = {BANDS_M[0]: ("≤ 30", "≤ 12")}
-    marks = []
-    for band_m in BANDS_M:
-        work = {
-            name: (lambda pose=pose, band_m=band_m: WarpCells.of(rig, pose, band_m=band_m))
-            for name, pose in poses.items()
-        }
-        ms = {
-            name: 1000.0 * t
-            for name, t in interleaved(work, torch.device("cpu"), rounds=15).items()
-        }
-        held = len(WarpCells.of(rig, poses["training"], band_m=band_m).roots)
-        least, moonshot = asked.get(band_m, ("printed", ""))
-        note = "" if band_m <= 0.14 else "; roots beyond 14 cm are not sought"
-        marks.append(
-            Mark(
-                name=f"build of a frame's cells, {100 * band_m:.0f}-cm band, core-ms",
-                value=ms["training"],
-                least=least,
-                moonshot=moonshot,
-                beside=f"training pose, {held:,} roots; novel pose {ms['novel']:.1f} ms{note}",
-            )
-        )
-    return marks
