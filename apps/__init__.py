@@ -6,5 +6,5 @@ import os
 # slower on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
-# numpy's own BLAS spins, too: a second thread doubled the cost of a frame's warp and gained nothing.
+# numpy's own BLAS spins, too: a second thread doubled the cost of a frame's warp, for nothing.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
