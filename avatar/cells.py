@@ -4,6 +4,9 @@ Fast-SNARF (Chen et al. 2022) finds for every sample the canonical point that li
 carries to it. The warp is smooth, so one solution per 3-cm cell, with its inverse Jacobian, serves
 every sample in it: `x(p) = x* + J⁻¹ (p - center)`. J⁻¹ is also the implicit gradient of the root
 with respect to the pose.
+
+Cells are solved on the CPU, compiled, whatever backend the training step runs on; what a root is
+says `avatar.kernels.skin.find_roots`, and a test holds the two together.
 """
 
 from dataclasses import dataclass

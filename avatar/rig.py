@@ -5,7 +5,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
-from scipy.ndimage import map_coordinates
 
 from avatar.skinning import distance_volume, skinning_volume
 from preprocess.body import ShapedBody
@@ -115,13 +114,16 @@ class Rig:
 
     def weights_at(self, points: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
         """Trilinear skinning weights at canonical points; the border's value outside the box."""
-        nodes = np.array(self.weights.shape[:3]) - 1
-        coordinates = ((points - self.box_low) / (self.box_high - self.box_low) * nodes).T
-        read = [
-            map_coordinates(self.weights[..., joint], coordinates, order=1, mode="nearest")
-            for joint in range(24)
-        ]
-        return np.stack(read, axis=-1).astype(np.float32)
+        last = np.array(self.weights.shape[:3]) - 1
+        place = (points - self.box_low) / (self.box_high - self.box_low) * last
+        place = np.clip(place, 0.0, last)
+        base = np.minimum(place.astype(np.int64), last - 1)
+        part = (place - base).astype(np.float32)
+        weights = np.zeros((len(points), 24), dtype=np.float32)
+        for corner in np.ndindex(2, 2, 2):  # all 24 weights of a node lie side by side
+            share = np.where(corner, part, 1.0 - part).prod(axis=1, keepdims=True)
+            weights += self.weights[tuple((base + corner).T)] * share
+        return weights
 
 
 def _seeds(

@@ -14,7 +14,7 @@ class Frame:
         index: Position in the source, counted from 0 (frames that were skipped keep their number).
         time_s: Container timestamp in seconds; never computed from an assumed rate.
         rgb: Picture, 8-bit RGB, upright.
-        flags: What is wrong with it: any of "corrupt", "repeated", "blurred".
+        flags: What is wrong with it: "corrupt", "repeated", or both.
         alpha: The source's own alpha channel (RGBA pictures), else None.
     """
 

@@ -53,10 +53,10 @@ class Inbox(Generic[Item]):
         """Tells the producer to stop and waits until it has."""
         self._stop.set()
         while self._thread.is_alive():
-            self.take_quietly()
+            self._drain()
             self._thread.join(timeout=0.02)
 
-    def take_quietly(self) -> None:
+    def _drain(self) -> None:
         """Empties the inbox, so that a waiting producer can see that it should stop."""
         while not self._queue.empty():
             try:

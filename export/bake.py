@@ -128,7 +128,7 @@ def _surfels(hull: Hull, rig: Rig) -> Surfels:
         position_codes=codes,
         normal_codes=np.round(hull.normals[order] * 127.0).astype(np.int8),
         thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
-        weight_codes=np.ascontiguousarray(weight_codes(_weights(rig, points)).T),
+        weight_codes=np.ascontiguousarray(weight_codes(rig.weights_at(points)).T),
         gradient_codes=_gradient_codes(rig, points),
     )
 
@@ -152,26 +152,12 @@ def weight_codes(weights: Float[np.ndarray, "points 24"]) -> UInt8[np.ndarray, "
     return (codes + (rank < missing)).astype(np.uint8)
 
 
-def _weights(rig: Rig, points: Float32[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
-    """`rig.weights_at`, reading all 24 weights of a node at once."""
-    last = np.array(rig.weights.shape[:3]) - 1
-    places = (points - rig.box_low) / (rig.box_high - rig.box_low) * last
-    places = np.clip(places, 0, last - 1e-4)
-    base = places.astype(np.int32)
-    part = (places - base).astype(np.float32)
-    weights = np.zeros((len(points), 24), dtype=np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        share = np.prod(np.where(corner, part, 1 - part), axis=1, keepdims=True)
-        weights += rig.weights[tuple((base + corner).T)] * share
-    return weights
-
-
 def _gradient_codes(
     rig: Rig, points: Float32[np.ndarray, "points 3"]
 ) -> Int8[np.ndarray, "points 3 24"]:
     codes = np.zeros((len(points), 3, 24), dtype=np.int8)
     for axis, step in enumerate(np.eye(3, dtype=np.float32) * np.float32(GRADIENT_STEP_M)):
-        difference = _weights(rig, points + step) - _weights(rig, points - step)
+        difference = rig.weights_at(points + step) - rig.weights_at(points - step)
         scaled = difference / (2 * GRADIENT_STEP_M) / GRADIENT_LIMIT * 127.0
         codes[:, axis] = np.clip(np.round(scaled), -127, 127).astype(np.int8)
     return codes
