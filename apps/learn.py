@@ -99,7 +99,7 @@ class Lesson:
         """
         self._trainer, self._recording, self._run = trainer, recording, run
         self._console, self._stop, self._notes = console, stop, notes
-        self._curve: list[CurvePoint] = [CurvePoint(**point) for point in notes.get("curve", [])]
+        self._curve: list[CurvePoint] = [CurvePoint.again(kept) for kept in notes.get("curve", [])]
         self._held: list[HeldOut] = []
         self._saved_at = time.perf_counter()
         self.meter = Meter(stop)
@@ -201,6 +201,7 @@ class Lesson:
             frames_seen=self._trainer.frames_seen,
             psnr=mean([s.psnr for s in scores]),
             psnr_mask=mean([s.psnr_mask for s in scores]),
+            frames=tuple((s.frame, s.psnr) for s in scores),
         )
         self._curve.append(point)
         return point

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from apps.curve_svg import curve_svg
-from apps.report import Report
+from apps.report import Report, largest_fall
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,10 +102,12 @@ def _curve(report: Report) -> str:
     svg = curve_svg(report.curve)
     if not svg:
         return ""
+    fall = largest_fall(report.curve)
+    told = "" if fall is None else f"No frame fell more than {fall:.1f} dB below its best."
     return (
         f'<div class="card">{svg}<p class="legend">PSNR of held-out frames'
         '<i style="background:var(--whole)"></i>whole picture'
-        '<i style="background:var(--masked)"></i>inside the mask</p></div>'
+        f'<i style="background:var(--masked)"></i>inside the mask. {told}</p></div>'
     )
 
 

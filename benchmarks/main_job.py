@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from apps.recording import Recording, RecordingPaths
+from apps.report import CurvePoint, largest_fall
 from apps.studio.writer import ShootConfig, shoot
 from avatar.hold import on_white, truth_on_white
 from avatar.metrics import psnr, ssim
@@ -158,19 +159,11 @@ def learning_rows(report: dict[str, Any]) -> list[Row]:
             ]
     curve = [point for point in report["curve"] if point["psnr"] is not None]
     told = ", ".join(f"{point['wall_seconds']:.0f} s {point['psnr']:.1f}" for point in curve)
-    fall = largest_fall([point["psnr"] for point in curve])
-    return [*rows, Row(name="largest fall of the curve, dB", value=fall, reference=told)]
-
-
-def largest_fall(scores: list[float]) -> float | None:
-    """How far a later score lies below the best before it.
-
-    A point of the curve is the mean over the held-out frames that had arrived: while they still
-    arrive, a hard one may lower it although no frame fell.
-    """
-    if not scores:
-        return None
-    return float((np.maximum.accumulate(scores) - scores).max())
+    fall = largest_fall([CurvePoint.again(point) for point in curve])
+    return [
+        *rows,
+        Row(name="largest fall of a frame from its best, dB", value=fall, reference=told),
+    ]
 
 
 def novel_rows(run: Path, unseen: list[Observation]) -> list[Row]:

@@ -1,6 +1,7 @@
 """The report: numbers that a machine can read and a page that needs nothing else."""
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -19,6 +20,7 @@ from apps.report import (
     Report,
     StreamNote,
     TrainingNote,
+    largest_fall,
     mean,
 )
 from apps.report_page import Pair, report_page
@@ -98,6 +100,23 @@ def test_the_file_holds_no_number_that_json_does_not_know():
     content = json.loads(text, parse_constant=lambda name: pytest.fail(name))
     assert content["curve"][0]["psnr"] is None
     assert content["curve"][0]["psnr_mask"] is None
+
+
+def test_a_fall_is_a_frames_own_and_not_that_of_a_mean():
+    def scored(*frames):
+        return replace(point(2.0, 24.0), frames=frames)
+
+    joined = (scored((9, 30.0)), scored((9, 31.0), (19, 20.0)), scored((9, 30.5), (19, 26.0)))
+    assert largest_fall(joined) == pytest.approx(0.5)
+    assert largest_fall(joined[:2]) == 0.0
+    assert largest_fall(joined[:1]) is None
+
+
+def test_a_point_of_the_curve_survives_a_checkpoint():
+    kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
+    assert CurvePoint.again(json.loads(json.dumps(vars(kept)))) == kept
+    older = {key: value for key, value in vars(kept).items() if key != "frames"}
+    assert CurvePoint.again(older).frames == ()
 
 
 class Tags(HTMLParser):
