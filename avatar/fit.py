@@ -12,6 +12,7 @@ from avatar.hold import HeldOut, score
 from avatar.prepare import prepare
 from avatar.refine import PoseTable
 from avatar.replay import Replay
+from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
 from avatar.trainer import Trainer, let_follow
 
@@ -39,13 +40,14 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
         prepared = prepare(frame.observation, avatar.rig)
         poses.put(replay.add(prepared), prepared.pose)
     config = dataclasses.replace(trainer.config, empty_weight=0.0, rays=2 * RAYS_A_CORRECTION)
+    sampler = CanonicalSampler(field.backend, avatar.occupancy, config)
     generator = torch.Generator(device=device).manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS * len(held) / 2)
     for step in range(steps):
         batch = replay.draw(config.rays, generator)
         gradients(
-            field, avatar.occupancy, replay.cells, batch, config,
-            hard_share=1.0, remember=False, poses=poses, generator=generator,
+            field, sampler, replay.cells, batch, config,
+            hard_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
         field.table_grad.zero_()
         for _ in range(2):

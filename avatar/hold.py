@@ -77,8 +77,13 @@ def truth_on_white(observation: Observation) -> Float32[np.ndarray, "height widt
 def score(avatar: Avatar, held: HeldOut) -> Score:
     """Renders a held-out frame and compares it with the truth."""
     observation = held.observation
-    truth = truth_on_white(observation)
     picture = render(avatar, observation.pose, observation.camera, cells=held.cells)
+    return compared(picture, observation)
+
+
+def compared(picture: Float32[np.ndarray, "height width 4"], observation: Observation) -> Score:
+    """How close a rendering of a frame's pose comes to the frame."""
+    truth = truth_on_white(observation)
     image = np.clip(on_white(picture), 0.0, 1.0)
     return Score(
         frame=observation.frame.index,

@@ -1,6 +1,8 @@
 """Pictures of an avatar by exact volume rendering: nothing is cut short, nothing cached counts."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,7 +29,12 @@ EMPTY_LOG_DENSITY = -30.0
 
 @torch.no_grad()
 def render(
-    avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: WarpCells | None = None
+    avatar: Avatar,
+    pose: BodyPose,
+    camera: Camera,
+    *,
+    cells: WarpCells | None = None,
+    samples_along: Callable[[Rays, CellTables], Samples] | None = None,
 ) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied RGBA in [0, 1] of the avatar in one pose, seen by one camera.
 
@@ -36,6 +43,8 @@ def render(
         pose: In the camera's world.
         camera: Also says how large the picture is.
         cells: The pose's warp, if it has been solved already.
+        samples_along: Where samples lie, if not in the avatar's own occupancy
+            (`avatar.paper.rendering`).
     """
     field = avatar.field
     device = field.table.device
@@ -45,8 +54,9 @@ def render(
         camera.pixel_centers().reshape(-1, 2), camera, avatar.rig.world_from_body(pose)
     )
     origin, directions = torch.from_numpy(rays.origin), torch.from_numpy(rays.directions)
-    grid = avatar.rendering_grid()
-    how = Marching(avatar.step_m, math.inf, MOST_SAMPLES)
+    if samples_along is None:
+        grid, how = avatar.rendering_grid(), Marching(avatar.step_m, math.inf, MOST_SAMPLES)
+        samples_along = partial(field.backend.march, grid=grid, how=how)
     picture = torch.zeros(height * width, 4)
     for start in range(0, height * width, RAYS_AT_ONCE):
         chunk = directions[start : start + RAYS_AT_ONCE].to(device)
@@ -56,7 +66,7 @@ def render(
             torch.zeros(len(chunk), dtype=torch.int32, device=device),
             torch.full((len(chunk),), 0.5, device=device),
         )
-        samples = field.backend.march(batch, tables, grid, how)
+        samples = samples_along(batch, tables)
         if len(samples.points):
             raw = _raw_as_far_as_seen(field, samples, avatar.step_m)
             colors = field.backend.composite(raw, samples, avatar.step_m)

@@ -8,12 +8,12 @@ from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.field import Activations, Field
-from avatar.kernels.backend import CellTables, Marching, Samples
+from avatar.field import Field
+from avatar.kernels.backend import CellTables, Grid, Samples
 from avatar.kernels.reference import MAX_LOG_DENSITY
-from avatar.occupancy import Occupancy
 from avatar.refine import PoseTable
 from avatar.replay import Batch
+from avatar.sampling import Sampler
 
 EMPTY_STEP_M = 0.01
 """The opacity of emptiness is that of one centimetre, as in the paper's code."""
@@ -34,13 +34,13 @@ class StepResult(NamedTuple):
 @torch.no_grad()
 def gradients(
     field: Field,
-    occupancy: Occupancy,
+    sampler: Sampler,
     cells: CellTables,
     batch: Batch,
     config: TrainConfig,
     *,
     hard_share: float,
-    remember: bool,
+    remember: Grid | None = None,
     poses: PoseTable | None = None,
     generator: torch.Generator,
 ) -> StepResult:
@@ -48,20 +48,19 @@ def gradients(
 
     Args:
         field: What is learnt.
-        occupancy: Where samples may be.
+        sampler: Where samples lie.
         cells: Warp cells of the frames that the batch's slots name.
         batch: Rays and what the video shows along them.
         config: The recipe.
         hard_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
             must be found before it can be hard.
-        remember: Whether the samples' densities raise the occupancy's.
+        remember: Whose cached densities the samples' raise, if any.
         poses: Whose wrenches take up what pulls the samples, if poses are refined.
         generator: Of backgrounds and empty points, on the field's device.
     """
-    how = Marching(config.step_m, config.grace_m, config.most_samples)
-    samples = field.backend.march(batch.rays, cells, occupancy.grid, how)
+    samples = sampler.samples(batch.rays, cells)
     empty = (
-        occupancy.empty_points(config.empty_points, generator).to(samples.points)
+        sampler.empty_points(config.empty_points, generator).to(samples.points)
         if config.empty_weight
         else samples.points[:0]
     )
@@ -76,8 +75,9 @@ def gradients(
     grad_features = field.backward(seen, torch.cat([grad, grad_empty]))
     if poses is not None and count:
         _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells)
-    if remember:
-        _remember(field, occupancy, seen, count)
+    if remember is not None:
+        log_density = seen.raw[:count, 3].contiguous()
+        field.backend.keep_highest(seen.points[:count], log_density, remember)
     return StepResult(loss, count)
 
 
@@ -106,11 +106,6 @@ def _pull(
         samples, grad_points, slots, cells, poses.skin, poses.bones, poses.wrenches
     )
     poses.count(slots.long())
-
-
-def _remember(field: Field, occupancy: Occupancy, seen: Activations, count: int) -> None:
-    log_density = seen.raw[:count, 3].contiguous()
-    field.backend.keep_highest(seen.points[:count], log_density, occupancy.grid)
 
 
 def cosine(progress: float) -> float:

@@ -18,6 +18,7 @@ from avatar.prepare import PreparedFrame
 from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.rig import Rig
+from avatar.sampling import CanonicalSampler, Sampler
 from avatar.step import StepResult, gradients
 
 NETWORK_RATE = 0.3
@@ -36,6 +37,7 @@ class Trainer:
     Attributes:
         avatar: As it stands.
         config: The recipe.
+        sampler: Where samples lie along rays.
         replay: The frames it learns from.
         poses: Their poses, corrected if the recipe says so.
         corrections: How each frame's pose was corrected, by the frame's number in its source; a
@@ -58,6 +60,7 @@ class Trainer:
         self.avatar = Avatar(
             rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
         )
+        self.sampler: Sampler = CanonicalSampler(self.backend, self.avatar.occupancy, config)
         self.replay = Replay(config.key_frames, device)
         self.poses = PoseTable(rig, config.key_frames, device)
         self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
@@ -88,6 +91,7 @@ class Trainer:
             joints = self.poses.pose(slot).joint_rotations
             self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
             self.replay.move_root(slot, self.poses.root(slot))
+        self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
 
     def step(self, *, rate: float, hard_share: float) -> StepResult:
@@ -99,11 +103,12 @@ class Trainer:
         """
         config, field = self.config, self.avatar.field
         batch = self.replay.draw(config.rays, self._generator)
+        remembers = self.steps % config.occupancy_every < 2
         refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
         result = gradients(
-            field, self.avatar.occupancy, self.replay.cells, batch, config,
+            field, self.sampler, self.replay.cells, batch, config,
             hard_share=hard_share,
-            remember=self.steps % config.occupancy_every < 2,
+            remember=self.avatar.occupancy.grid if remembers else None,
             poses=self.poses if refines else None,
             generator=self._generator,
         )  # fmt: skip
@@ -116,6 +121,7 @@ class Trainer:
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             self._update_occupancy()
+        self.sampler.update(self.steps, self.replay.cells, self._generator)
         self.steps += 1
         self.rays += config.rays
         self.samples += result.samples

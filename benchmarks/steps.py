@@ -39,8 +39,8 @@ def step_marks(seen: Class, device: torch.device) -> list[Mark]:
     def ours() -> None:
         field.table_grad.zero_()
         gradients(
-            field, avatar.occupancy, replay.cells, batch, config,
-            hard_share=1.0, remember=False, generator=_seeded(device),
+            field, seen.trainer.sampler, replay.cells, batch, config,
+            hard_share=1.0, generator=_seeded(device),
         )  # fmt: skip
 
     alternatives: dict[str, Callable[[], object]] = {

@@ -11,6 +11,7 @@ from avatar.kernels import reference
 from avatar.kernels.backend import Marching, Samples, TorchBackend
 from avatar.kernels.cpu import NumbaBackend
 from avatar.prepare import prepare
+from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
 from avatar.trainer import Trainer
 
@@ -56,8 +57,8 @@ def one_step(trainer, backend):
     generator = torch.Generator().manual_seed(4)
     field.table_grad.zero_()
     gradients(
-        field, occupancy, trainer.replay.cells, batch, CONFIG,
-        hard_share=1.0, remember=False, generator=generator,
+        field, CanonicalSampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
+        hard_share=1.0, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
     how = Marching(CONFIG.step_m, CONFIG.grace_m, CONFIG.most_samples)
