@@ -1,13 +1,9 @@
-"""What a trained avatar leaves on disk: the package, report.json and report.html."""
+"""What a run leaves on disk beside its package: report.json and report.html."""
 
 import resource
 import sys
-import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
-
-import numpy as np
 
 from apps.console import Console
 from apps.follow import FollowingCamera
@@ -27,17 +23,13 @@ from apps.report import (
 )
 from apps.report_page import Pair, report_page
 from apps.run_folder import RunFolder
+from apps.snapshot import Snapshot
 from apps.whole import write_text
 from avatar.hold import on_white, spread, truth_on_white
 from avatar.render import render
-from capture.camera import Camera
-from export.build import ExportReport, export_avatar
-from export.errors import ExportRefused
+from export.build import ExportReport
 from export.player import Player
-from preprocess.observe import shrunk
-from preprocess.pose import BodyPose
 
-CHECKED_VIEWS = 4
 SHOWN_PAIRS = 6
 NOVEL_PX = 320
 NOVEL_FPS = 16.0
@@ -72,29 +64,35 @@ class Delivered:
 
 
 def deliver(
-    learnt: Learnt, recording: Recording, run: RunFolder, note: RunNote, console: Console
+    learnt: Learnt,
+    taken: Snapshot,
+    recording: Recording,
+    run: RunFolder,
+    note: RunNote,
+    console: Console,
 ) -> Delivered:
-    """Writes the package, then the report, then the page; each whole or not at all.
+    """Writes the report, then the page; each whole or not at all.
+
+    Args:
+        learnt: With its scores.
+        taken: The package of the same avatar.
+        recording: What it was learnt from.
+        run: Where it goes.
+        note: What only the command knows.
+        console: Where warnings are collected and progress is shown.
 
     Raises:
         OSError: If the disk is full; what was written before stays.
     """
-    held = HeldOutNote.of(learnt.scores, learnt.meter.size_px if learnt.scores else None)
-    package, refused, ready_at = None, None, None
-    try:
-        with console.waiting("baking the avatar and checking its player"):
-            metrics = {"held_out": asdict(held), "recipe": asdict(learnt.trainer.config)}
-            exported = export_avatar(
-                learnt.trainer.avatar, run.package, views=views(learnt, recording), metrics=metrics
-            )
-        ready_at = time.perf_counter()
-        for warning in exported.warnings:
-            console.warn(warning)
-        package = _package_note(exported, run)
-    except ExportRefused as error:
+    refused, package = taken.refused, None
+    if taken.exported is None:
         run.package.unlink(missing_ok=True)  # a resumed run's older avatar would contradict
-        refused = str(error)
-    report = _report(learnt, recording, note, held, package, ready_at)
+    else:
+        for warning in taken.exported.warnings:
+            console.warn(warning)
+        package = _package_note(taken.exported, run)
+    ready_at = None if taken.exported is None else taken.ready_at
+    report = _report(learnt, recording, note, package, ready_at)
     write_text(run.report, report.to_json())
     with console.waiting("drawing the report"):
         page = report_page(
@@ -106,16 +104,6 @@ def deliver(
         )
     write_text(run.page, page)
     return Delivered(report=report, refused=refused)
-
-
-def views(learnt: Learnt, recording: Recording) -> Sequence[tuple[BodyPose, Camera]]:
-    """Poses and cameras to check the player with: held-out frames, else the first valid pose."""
-    seen = [frame.observation for frame in spread(learnt.held, CHECKED_VIEWS)]
-    if seen:
-        return [(observation.pose, observation.camera) for observation in seen]
-    row = int(np.flatnonzero(recording.motion.valid)[0])
-    size = shrunk(recording.source.size_px, recording.size_px)
-    return [(recording.motion[row], recording.cameras[0].resized(size))]
 
 
 def pairs(learnt: Learnt) -> list[Pair]:
@@ -168,11 +156,11 @@ def _report(
     learnt: Learnt,
     recording: Recording,
     note: RunNote,
-    held: HeldOutNote,
     package: PackageNote | None,
     ready_at: float | None,
 ) -> Report:
     trainer = learnt.trainer
+    held = HeldOutNote.of(learnt.scores, learnt.meter.size_px if learnt.scores else None)
     recipe = asdict(trainer.config) | {
         "camera": recording.cameras.source,
         "body": recording.shaped.body.family,

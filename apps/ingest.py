@@ -51,6 +51,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
     with console.waiting("loading torch"):
         from apps.deliver import RunNote, deliver
         from apps.learn import Lesson
+        from apps.snapshot import snapshot, views_of
         from apps.threads import use_threads
         from avatar.kernels.choice import backend_for
 
@@ -67,7 +68,11 @@ def ingest(given: IngestArguments, console: Console) -> int:
             _check_learnt(learnt, recording)
             startup = (learnt.meter.first_at or started) - started
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
-            delivered = deliver(learnt, recording, run, note, console)
+            with console.waiting("baking the avatar and checking its player"):
+                mark = learnt.curve[-1] if learnt.curve else None
+                views = views_of(learnt.held, recording)
+                taken = snapshot(trainer, run.package, views, mark=mark)
+            delivered = deliver(lesson.scored(learnt), taken, recording, run, note, console)
             if given.json is not None:
                 write_text(given.json, delivered.report.to_json())
             return _conclude(delivered, run, console, interrupted=stop.is_set())

@@ -37,22 +37,22 @@ class Learnt:
     Attributes:
         trainer: With the avatar as it is now.
         held: Held-out frames that have arrived.
-        scores: Of each of them, at the end, in the given poses.
-        fitted: The same in poses fitted to them, if poses are refined.
         curve: Scores on the way, and at the end.
         meter: What it saw of the stream.
         added: Frames that were put into the trainer's memory in this run.
         interrupted: Whether Ctrl-C ended it.
+        scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
+        fitted: The same in poses fitted to them, if poses are refined.
     """
 
     trainer: Trainer
     held: list[HeldOut]
-    scores: tuple[Score, ...]
-    fitted: tuple[Score, ...]
     curve: tuple[CurvePoint, ...]
     meter: Meter
     added: int
     interrupted: bool
+    scores: tuple[Score, ...] = ()
+    fitted: tuple[Score, ...] = ()
 
     @property
     def trained(self) -> bool:
@@ -105,7 +105,7 @@ class Lesson:
         self.meter = Meter(stop)
 
     def learn(self, *, recall: int = 0) -> Learnt:
-        """Trains until the time is up or somebody stops it; then scores every held-out frame.
+        """Trains until the time is up or somebody stops it. Scores come later (`scored`).
 
         Args:
             recall: Frames that the trainer has learnt from before: they are put back into its
@@ -129,22 +129,29 @@ class Lesson:
         for warning in self._recording.source.warnings:
             self._console.warn(warning)
         self._console.count_the_rest()
-        scores = fitted = ()
         if len(self._trainer.replay):
-            self._save()  # scoring takes a while
-            scores = self._final_scores()
             self._save()
-            if not interrupted:
-                fitted = self._fitted_scores()
         return Learnt(
             trainer=self._trainer,
             held=self._held,
-            scores=scores,
-            fitted=fitted,
             curve=tuple(self._curve),
             meter=self.meter,
             added=added + self._trainer.frames_seen,
             interrupted=interrupted,
+        )
+
+    def scored(self, learnt: Learnt) -> Learnt:
+        """The same with every held-out frame scored, in given poses and in fitted ones.
+
+        It takes a while, and the package need not wait for it.
+        """
+        scores = self._final_scores()
+        self._save()
+        return replace(
+            learnt,
+            scores=scores,
+            fitted=() if learnt.interrupted else self._fitted_scores(),
+            curve=tuple(self._curve),
         )
 
     def _frames(self) -> Iterator[Item]:

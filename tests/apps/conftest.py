@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps import deliver, ingest, learn, play
+from apps import deliver, ingest, learn, play, snapshot
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
@@ -117,7 +117,7 @@ def without_baking(monkeypatch) -> None:
             largest_difference=0.0, warnings=(),
         )  # fmt: skip
 
-    monkeypatch.setattr(deliver, "export_avatar", export_nothing)
+    monkeypatch.setattr(snapshot, "export_avatar", export_nothing)
     monkeypatch.setattr(deliver, "novel", lambda player: "data:,")
     monkeypatch.setattr(deliver.Player, "load", lambda path: None)
 
