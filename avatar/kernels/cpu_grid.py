@@ -1,6 +1,8 @@
 """Hash-grid encoding and its gradients, compiled for the CPU.
 
-Threads own chunks of points or, where the table's gradient is summed, whole levels, so that no two
+Points are worked on in blocks that stay in the nearest cache: first where all of a block's corners
+lie, in loops over points that LLVM vectorises, then the entries themselves, four features at once.
+Threads own blocks of points or, where the table's gradient is summed, whole levels, so that no two
 write to one place: no atomics, and the same sums for any number of threads.
 """
 
@@ -8,71 +10,91 @@ import numpy as np
 from numba import get_num_threads, prange
 
 from avatar.kernels.jit import FAST, compile_kernel
-from avatar.levels import FEATURES
+from avatar.kernels.vector4 import dot4, load4, plus4, store4, times4
+from avatar.levels import FEATURES, PRIMES
 
-CHUNK = 256
-F32, I32, I64, U32 = np.float32, np.int32, np.int64, np.uint32
+BLOCK = 256
+F32, I32, U32 = np.float32, np.int32, np.uint32
+PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
 
 
 @compile_kernel(inline="always")
-def _entry(ix, iy, iz, counts, level, dense, first, mask):
+def _placed(points, start, stop, low, places):
+    """Where the points of a block lie in the box, metres."""
+    for i in range(stop - start):
+        for axis in range(3):
+            places[axis, i] = points[start + i, axis] - low[axis]
+
+
+@compile_kernel(inline="always")
+def _found(places, number, scale, counts, cells, within):
+    """The cell of each place on one level, and where in it the place lies."""
+    for axis in range(3):
+        last = I32(counts[axis] - 2)
+        for i in range(number):
+            place = places[axis, i] * scale
+            cell = min(max(I32(place), I32(0)), last)
+            cells[axis, i] = cell
+            within[axis, i] = place - F32(cell)
+
+
+@compile_kernel(inline="always")
+def _numbered(cells, number, counts, dense, first, size, entries):
+    """Entries of the corners of each cell, x fastest."""
     if dense == 1:
-        return first + I64(ix + counts[level, 0] * (iy + counts[level, 1] * iz))
-    hashed = U32(ix) ^ (U32(iy) * U32(2654435761)) ^ (U32(iz) * U32(805459861))
-    return first + I64(hashed & mask)
+        along_y, along_z = counts[0], counts[0] * counts[1]
+        for i in range(number):
+            near = I32(first + cells[0, i] + along_y * cells[1, i] + along_z * cells[2, i])
+            far = I32(near + along_z)
+            entries[0, i], entries[1, i] = near, near + 1
+            entries[2, i], entries[3, i] = near + along_y, near + along_y + 1
+            entries[4, i], entries[5, i] = far, far + 1
+            entries[6, i], entries[7, i] = far + along_y, far + along_y + 1
+    else:
+        mask = U32(size - 1)
+        for i in range(number):
+            x0, x1 = U32(cells[0, i]), U32(cells[0, i] + 1)
+            y0, z0 = U32(U32(cells[1, i]) * PRIME_Y), U32(U32(cells[2, i]) * PRIME_Z)
+            y1, z1 = U32(y0 + PRIME_Y), U32(z0 + PRIME_Z)
+            a, b, c, d = U32(y0 ^ z0), U32(y1 ^ z0), U32(y0 ^ z1), U32(y1 ^ z1)
+            entries[0, i], entries[1, i] = first + ((x0 ^ a) & mask), first + ((x1 ^ a) & mask)
+            entries[2, i], entries[3, i] = first + ((x0 ^ b) & mask), first + ((x1 ^ b) & mask)
+            entries[4, i], entries[5, i] = first + ((x0 ^ c) & mask), first + ((x1 ^ c) & mask)
+            entries[6, i], entries[7, i] = first + ((x0 ^ d) & mask), first + ((x1 ^ d) & mask)
 
 
 @compile_kernel(inline="always")
-def _cell(points, i, low, scale, counts, level, dense, first, mask):
-    """Entries of the corners of a point's cell, x fastest, and where in the cell it lies."""
-    x = (points[i, 0] - low[0]) * scale
-    y = (points[i, 1] - low[1]) * scale
-    z = (points[i, 2] - low[2]) * scale
-    ix = min(max(I32(x), I32(0)), counts[level, 0] - I32(2))
-    iy = min(max(I32(y), I32(0)), counts[level, 1] - I32(2))
-    iz = min(max(I32(z), I32(0)), counts[level, 2] - I32(2))
-    jx, jy, jz = ix + I32(1), iy + I32(1), iz + I32(1)
-    e0 = _entry(ix, iy, iz, counts, level, dense, first, mask)
-    e1 = _entry(jx, iy, iz, counts, level, dense, first, mask)
-    e2 = _entry(ix, jy, iz, counts, level, dense, first, mask)
-    e3 = _entry(jx, jy, iz, counts, level, dense, first, mask)
-    e4 = _entry(ix, iy, jz, counts, level, dense, first, mask)
-    e5 = _entry(jx, iy, jz, counts, level, dense, first, mask)
-    e6 = _entry(ix, jy, jz, counts, level, dense, first, mask)
-    e7 = _entry(jx, jy, jz, counts, level, dense, first, mask)
-    return e0, e1, e2, e3, e4, e5, e6, e7, x - ix, y - iy, z - iz
+def _weighed(within, number, weights):
+    """Trilinear weights of the corners."""
+    for i in range(number):
+        x, y, z = within[0, i], within[1, i], within[2, i]
+        u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
+        a, b, c, d = u * v, x * v, u * y, x * y
+        weights[0, i], weights[1, i], weights[2, i], weights[3, i] = a * w, b * w, c * w, d * w
+        weights[4, i], weights[5, i], weights[6, i], weights[7, i] = a * z, b * z, c * z, d * z
 
 
 @compile_kernel(parallel=True, **FAST)
 def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
     """Trilinear features of all levels; points outside the box extrapolate from its border."""
-    chunks = (points.shape[0] + CHUNK - 1) // CHUNK
-    for chunk in prange(chunks):
-        start = chunk * CHUNK
-        stop = min(points.shape[0], start + CHUNK)
+    for block in prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        start = block * BLOCK
+        number = min(points.shape[0] - start, BLOCK)
+        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
+        cells = np.empty((3, BLOCK), I32)
+        entries, weights = np.empty((8, BLOCK), I32), np.empty((8, BLOCK), F32)
+        _placed(points, start, start + number, low, places)
         for level in range(cells_per_m.shape[0]):
-            first = offsets[level]
-            mask = U32(offsets[level + 1] - first - 1)
-            kind, scale, column = dense[level], cells_per_m[level], level * FEATURES
-            for i in range(start, stop):
-                e0, e1, e2, e3, e4, e5, e6, e7, x, y, z = _cell(
-                    points, i, low, scale, counts, level, kind, first, mask
-                )
-                u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
-                w0, w1, w2, w3 = u * v * w, x * v * w, u * y * w, x * y * w
-                w4, w5, w6, w7 = u * v * z, x * v * z, u * y * z, x * y * z
-                for f in range(FEATURES):
-                    features[i, column + f] = (
-                        w0 * table[e0, f] + w1 * table[e1, f] + w2 * table[e2, f]
-                        + w3 * table[e3, f] + w4 * table[e4, f] + w5 * table[e5, f]
-                        + w6 * table[e6, f] + w7 * table[e7, f]
-                    )  # fmt: skip
-
-
-@compile_kernel(inline="always")
-def _add(grad_table, entry, grad_features, i, column, weight):
-    for f in range(FEATURES):
-        grad_table[entry, f] += weight * grad_features[i, column + f]
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _found(places, number, cells_per_m[level], counts[level], cells, within)
+            _numbered(cells, number, counts[level], dense[level], first, size, entries)
+            _weighed(within, number, weights)
+            for i in range(number):
+                total = times4(weights[0, i], load4(table, entries[0, i], 0))
+                for corner in range(1, 8):
+                    entry = load4(table, entries[corner, i], 0)
+                    total = plus4(total, times4(weights[corner, i], entry))
+                store4(features, start + i, level * FEATURES, total)
 
 
 @compile_kernel(parallel=True, **FAST)
@@ -80,23 +102,23 @@ def _encode_backward(
     points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
 ):
     for thread in prange(threads):
-        for level in range(thread, cells_per_m.shape[0], threads):
-            first = offsets[level]
-            mask = U32(offsets[level + 1] - first - 1)
-            kind, scale, column = dense[level], cells_per_m[level], level * FEATURES
-            for i in range(points.shape[0]):
-                e0, e1, e2, e3, e4, e5, e6, e7, x, y, z = _cell(
-                    points, i, low, scale, counts, level, kind, first, mask
-                )
-                u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
-                _add(grad_table, e0, grad_features, i, column, u * v * w)
-                _add(grad_table, e1, grad_features, i, column, x * v * w)
-                _add(grad_table, e2, grad_features, i, column, u * y * w)
-                _add(grad_table, e3, grad_features, i, column, x * y * w)
-                _add(grad_table, e4, grad_features, i, column, u * v * z)
-                _add(grad_table, e5, grad_features, i, column, x * v * z)
-                _add(grad_table, e6, grad_features, i, column, u * y * z)
-                _add(grad_table, e7, grad_features, i, column, x * y * z)
+        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
+        cells = np.empty((3, BLOCK), I32)
+        entries, weights = np.empty((8, BLOCK), I32), np.empty((8, BLOCK), F32)
+        for start in range(0, points.shape[0], BLOCK):
+            number = min(points.shape[0] - start, BLOCK)
+            _placed(points, start, start + number, low, places)
+            for level in range(thread, cells_per_m.shape[0], threads):
+                first, size = offsets[level], offsets[level + 1] - offsets[level]
+                _found(places, number, cells_per_m[level], counts[level], cells, within)
+                _numbered(cells, number, counts[level], dense[level], first, size, entries)
+                _weighed(within, number, weights)
+                for i in range(number):
+                    grad = load4(grad_features, start + i, level * FEATURES)
+                    for corner in range(8):
+                        entry = entries[corner, i]
+                        added = times4(weights[corner, i], grad)
+                        store4(grad_table, entry, 0, plus4(load4(grad_table, entry, 0), added))
 
 
 def encode_backward(
@@ -110,11 +132,22 @@ def encode_backward(
 
 
 @compile_kernel(inline="always")
-def _pull(table, entry, grad_features, i, column):
-    pull = F32(0)
-    for f in range(FEATURES):
-        pull += table[entry, f] * grad_features[i, column + f]
-    return pull
+def _pulled(within, pulls, number, scale, total):
+    """Adds one level's gradient, from what pulls at the corners of each cell."""
+    for i in range(number):
+        x, y, z = within[0, i], within[1, i], within[2, i]
+        u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
+        p0, p1, p2, p3 = pulls[0, i], pulls[1, i], pulls[2, i], pulls[3, i]
+        p4, p5, p6, p7 = pulls[4, i], pulls[5, i], pulls[6, i], pulls[7, i]
+        total[0, i] += scale * (
+            v * w * (p1 - p0) + y * w * (p3 - p2) + v * z * (p5 - p4) + y * z * (p7 - p6)
+        )
+        total[1, i] += scale * (
+            u * w * (p2 - p0) + x * w * (p3 - p1) + u * z * (p6 - p4) + x * z * (p7 - p5)
+        )
+        total[2, i] += scale * (
+            u * v * (p4 - p0) + x * v * (p5 - p1) + u * y * (p6 - p2) + x * y * (p7 - p3)
+        )
 
 
 @compile_kernel(parallel=True, **FAST)
@@ -122,35 +155,22 @@ def encode_points_backward(
     points, low, cells_per_m, counts, dense, offsets, table, grad_features, grad_points
 ):
     """Gradient of `encode` with respect to its points, written to `grad_points`."""
-    chunks = (points.shape[0] + CHUNK - 1) // CHUNK
-    for chunk in prange(chunks):
-        start = chunk * CHUNK
-        stop = min(points.shape[0], start + CHUNK)
-        for i in range(start, stop):
-            grad_points[i, 0] = grad_points[i, 1] = grad_points[i, 2] = F32(0)
+    for block in prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        start = block * BLOCK
+        number = min(points.shape[0] - start, BLOCK)
+        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
+        cells, entries = np.empty((3, BLOCK), I32), np.empty((8, BLOCK), I32)
+        pulls, total = np.empty((8, BLOCK), F32), np.zeros((3, BLOCK), F32)
+        _placed(points, start, start + number, low, places)
         for level in range(cells_per_m.shape[0]):
-            first = offsets[level]
-            mask = U32(offsets[level + 1] - first - 1)
-            kind, scale, column = dense[level], cells_per_m[level], level * FEATURES
-            for i in range(start, stop):
-                e0, e1, e2, e3, e4, e5, e6, e7, x, y, z = _cell(
-                    points, i, low, scale, counts, level, kind, first, mask
-                )
-                p0 = _pull(table, e0, grad_features, i, column)
-                p1 = _pull(table, e1, grad_features, i, column)
-                p2 = _pull(table, e2, grad_features, i, column)
-                p3 = _pull(table, e3, grad_features, i, column)
-                p4 = _pull(table, e4, grad_features, i, column)
-                p5 = _pull(table, e5, grad_features, i, column)
-                p6 = _pull(table, e6, grad_features, i, column)
-                p7 = _pull(table, e7, grad_features, i, column)
-                u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
-                grad_points[i, 0] += scale * (
-                    v * w * (p1 - p0) + y * w * (p3 - p2) + v * z * (p5 - p4) + y * z * (p7 - p6)
-                )
-                grad_points[i, 1] += scale * (
-                    u * w * (p2 - p0) + x * w * (p3 - p1) + u * z * (p6 - p4) + x * z * (p7 - p5)
-                )
-                grad_points[i, 2] += scale * (
-                    u * v * (p4 - p0) + x * v * (p5 - p1) + u * y * (p6 - p2) + x * y * (p7 - p3)
-                )
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _found(places, number, cells_per_m[level], counts[level], cells, within)
+            _numbered(cells, number, counts[level], dense[level], first, size, entries)
+            for i in range(number):
+                grad = load4(grad_features, start + i, level * FEATURES)
+                for corner in range(8):
+                    pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
+            _pulled(within, pulls, number, cells_per_m[level], total)
+        for i in range(number):
+            for axis in range(3):
+                grad_points[start + i, axis] = total[axis, i]
