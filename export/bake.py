@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int32, UInt8, UInt16
-from scipy import ndimage
 
 from avatar.rig import Rig
+from export.compiled import grown, interpolated, mark_reached
 from export.errors import ExportRefused
 from export.hull import Hull, find_hull
 from export.lattice import FAINTEST, FieldAt, Lattice, read_field
@@ -29,6 +29,8 @@ FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.012
 """Bricks reach this far outside of the hull."""
+COARSE_M = 0.012
+"""Spacing at which a hull's surfels are counted before they are made."""
 VOXEL_SHARE = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 EMPTY = (
@@ -76,9 +78,29 @@ def bake(
         ExportRefused: If there is nothing to be seen in the field.
     """
     config = config or BakeConfig()
+    return tables_of(read(field_at, rig, occupied=occupied, config=config), rig, config)
+
+
+def read(
+    field_at: FieldAt, rig: Rig, *, occupied: UInt8[np.ndarray, "cx cy cz"], config: BakeConfig
+) -> Lattice:
+    """The first half of baking: all that the field is asked for. Arguments as of `bake`."""
     if not occupied.any():
         raise ExportRefused(EMPTY)
-    lattice = read_field(field_at, rig, occupied, config.voxel_m)
+    return read_field(field_at, rig, occupied, config.voxel_m)
+
+
+def tables_of(lattice: Lattice, rig: Rig, config: BakeConfig) -> Tables:
+    """The second half: numpy and serial kernels only, on whatever thread.
+
+    Args:
+        lattice: What the field said.
+        rig: What moves it.
+        config: How finely.
+
+    Raises:
+        ExportRefused: If there is nothing to be seen in the field.
+    """
     hull = _hull_that_fits(lattice, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
     pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
@@ -96,12 +118,18 @@ def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
     if visible.size == 0:
         raise ExportRefused(EMPTY)
     level = min(config.hull_density, FAINT_SHARE * float(np.percentile(visible, 99)))
-    spacing_m = config.surfel_spacing_m
+    spacing_m = max(config.surfel_spacing_m, _spacing_that_fits(lattice, level))
     while True:
         hull = find_hull(lattice, level=level, spacing_m=spacing_m)
         if 0 < len(hull.positions) < 1 << SURFEL_BITS:
             return hull
         spacing_m *= 1.02 * max(1.0, len(hull.positions) / (1 << SURFEL_BITS)) ** 0.5
+
+
+def _spacing_that_fits(lattice: Lattice, level: float) -> float:
+    """About the finest spacing whose surfels can be numbered, after a look at a coarse hull."""
+    coarse = find_hull(lattice, level=level, spacing_m=COARSE_M)
+    return 1.02 * COARSE_M * (len(coarse.positions) / (1 << SURFEL_BITS)) ** 0.5
 
 
 def _reach(rig: Rig) -> float:
@@ -128,7 +156,7 @@ def _surfels(hull: Hull, rig: Rig) -> Surfels:
         position_codes=codes,
         normal_codes=np.round(hull.normals[order] * 127.0).astype(np.int8),
         thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
-        weight_codes=np.ascontiguousarray(weight_codes(rig.weights_at(points)).T),
+        weight_codes=np.ascontiguousarray(weight_codes(_weights(rig, points)).T),
         gradient_codes=_gradient_codes(rig, points),
     )
 
@@ -152,12 +180,18 @@ def weight_codes(weights: Float[np.ndarray, "points 24"]) -> UInt8[np.ndarray, "
     return (codes + (rank < missing)).astype(np.uint8)
 
 
+def _weights(rig: Rig, points: Float32[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
+    """`rig.weights_at`, quickly."""
+    nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
+    return interpolated(rig.weights, rig.box_low, nodes / (rig.box_high - rig.box_low), points)
+
+
 def _gradient_codes(
     rig: Rig, points: Float32[np.ndarray, "points 3"]
 ) -> Int8[np.ndarray, "points 3 24"]:
     codes = np.zeros((len(points), 3, 24), dtype=np.int8)
     for axis, step in enumerate(np.eye(3, dtype=np.float32) * np.float32(GRADIENT_STEP_M)):
-        difference = rig.weights_at(points + step) - rig.weights_at(points - step)
+        difference = _weights(rig, points + step) - _weights(rig, points - step)
         scaled = difference / (2 * GRADIENT_STEP_M) / GRADIENT_LIMIT * 127.0
         codes[:, axis] = np.clip(np.round(scaled), -127, 127).astype(np.int8)
     return codes
@@ -168,29 +202,28 @@ def _bricks(lattice: Lattice, hull: Hull) -> Bricks:
     counts = np.array(lattice.density.shape) // BRICK
     codes = density_codes(lattice.density)
     codes[~_within_reach(lattice, hull)] = 0
-    visible = ndimage.maximum_filter(codes, size=3) > 0
+    visible = grown(codes > 0)
     blocks = np.lib.stride_tricks.sliding_window_view(visible, (NODES,) * 3)
     used = blocks[::BRICK, ::BRICK, ::BRICK].any(axis=(3, 4, 5))
     index = np.zeros(counts, dtype=np.int32)
     index[used] = np.arange(1, used.sum() + 1)
     voxels = np.zeros((used.sum() + 1, NODES, NODES, NODES, 4), dtype=np.uint8)
-    for number, corner in enumerate(np.argwhere(used) * BRICK, start=1):
-        cut = tuple(slice(c, c + NODES) for c in corner)
-        voxels[number, ..., :3] = lattice.rgb[cut]
-        voxels[number, ..., 3] = codes[cut]
-        voxels[number][~visible[cut]] = 0
+    seen = blocks[::BRICK, ::BRICK, ::BRICK][used]
+    for channel in range(4):
+        values = codes if channel == 3 else lattice.rgb[..., channel]
+        cut = np.lib.stride_tricks.sliding_window_view(values, (NODES,) * 3)
+        voxels[1:, ..., channel] = cut[::BRICK, ::BRICK, ::BRICK][used] * seen
     return Bricks(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
 
 
 def _within_reach(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:
     """Nodes that rays see: from a little outside of the hull as deep as its thickness."""
     reached = np.zeros(lattice.density.shape, dtype=bool)
-    last = np.array(reached.shape) - 1
-    depths = np.arange(-MARGIN_M, hull.thickness.max(), lattice.voxel_m, dtype=np.float32)
-    for depth in depths:
-        there = depth <= hull.thickness
-        points = hull.positions[there] - hull.normals[there] * depth
-        nodes = np.round((points - lattice.low) / lattice.voxel_m).astype(int)
-        reached[tuple(np.clip(nodes, 0, last).T)] = True
+    mark_reached(
+        reached, lattice.low, np.float32(lattice.voxel_m), hull.positions, hull.normals,
+        hull.thickness, np.float32(MARGIN_M),
+    )  # fmt: skip
     gap = 1 + 2 * int(np.ceil(hull.spacing_m / lattice.voxel_m))  # between neighbouring surfels
-    return ndimage.maximum_filter(reached, size=gap)
+    for _ in range(gap // 2):
+        reached = grown(reached)
+    return reached

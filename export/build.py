@@ -3,6 +3,7 @@
 import io
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,13 @@ from avatar.render import render
 from avatar.rig import Rig
 from capture.camera import Camera
 from capture.errors import BadInput
-from export.bake import BakeConfig, bake
+from export.bake import BakeConfig, read, tables_of
 from export.codec import Layout
 from export.errors import ExportRefused
 from export.graph import build_graph
-from export.lattice import FieldAt
+from export.lattice import FieldAt, Lattice
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
-from export.package import AvatarPackage, write_package
+from export.package import AvatarPackage, PackageDraft
 from export.player import ALIKE, Likeness, Player, premultiplied
 from export.rules import DrawingRules
 from export.tables import Tables
@@ -127,23 +128,29 @@ def export_field(
     """As `export_avatar`, of any canonical field."""
     if not views:
         raise BadInput("An avatar cannot be checked without a pose and a camera; give one view.")
-    started = time.perf_counter()
-    rules = DrawingRules()
+    started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
-    tables = bake(field_at, rig, occupied=occupied, config=config)
-    package = _package(tables, rules, rig, views, metrics)
-    player = Player(package)
-    worst = _check_graph(player, tables, rules, package.manifest.golden)
-    score, warnings = _check_pictures(player, views, renderer)
-    golden = tuple(player.render(frame.pose, frame.camera) for frame in package.manifest.golden)
-    note = replace(package.manifest.tiers["hq"], psnr_to_renderer=score, largest_difference=worst)
-    package = replace(
-        package,
-        manifest=replace(package.manifest, tiers={"hq": note}),
-        golden=golden,
-        preview=_png(player.render(*views[0])),
-    )
-    size = write_package(package, path)
+    # the field, and the renderer with it, is asked on this thread alone
+    lattice = read(field_at, rig, occupied=occupied, config=config)
+    with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
+        drawing = beside.submit(_drawing, lattice, rig, config, views, metrics)
+        exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
+        package, player = drawing.result()
+        compressed = beside.submit(draft.add_drawing, package)
+        worst = _check_graph(player, package)
+        score, warnings = _check_pictures(player, views, exact)
+        golden = tuple(player.render(frame.pose, frame.camera) for frame in package.manifest.golden)
+        note = replace(
+            package.manifest.tiers["hq"], psnr_to_renderer=score, largest_difference=worst
+        )
+        package = replace(
+            package,
+            manifest=replace(package.manifest, tiers={"hq": note}),
+            golden=golden,
+            preview=_png(player.render(*views[0])),
+        )
+        compressed.result()
+        size = draft.finish(package)
     return ExportReport(
         path=path,
         bytes=size,
@@ -152,6 +159,18 @@ def export_field(
         largest_difference=worst,
         warnings=tuple(warnings),
     )
+
+
+def _drawing(
+    lattice: Lattice,
+    rig: Rig,
+    config: BakeConfig,
+    views: Sequence[View],
+    metrics: Mapping[str, Any],
+) -> tuple[AvatarPackage, Player]:
+    """The package before its checks, and a player of it."""
+    package = _package(tables_of(lattice, rig, config), DrawingRules(), rig, views, metrics)
+    return package, Player(package)
 
 
 def _package(
@@ -193,12 +212,11 @@ def _fitted(camera: Camera, longest_px: int) -> Camera:
     return camera.resized((width, height))
 
 
-def _check_graph(
-    player: Player, tables: Tables, rules: DrawingRules, golden: Sequence[GoldenFrame]
-) -> float:
+def _check_graph(player: Player, package: AvatarPackage) -> float:
     """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
+    tables, rules = package.tables["hq"], package.manifest.tiers["hq"].rules
     worst = 0.0
-    for number, frame in enumerate(golden):
+    for number, frame in enumerate(package.manifest.golden):
         camera = frame.camera
         shot = Shot(
             bones=player.bones(frame.pose, camera),
@@ -221,14 +239,13 @@ def _check_graph(
 
 
 def _check_pictures(
-    player: Player, views: Sequence[View], renderer: Renderer
+    player: Player, views: Sequence[View], exact: Sequence[Float32[np.ndarray, "_ _ 3"]]
 ) -> tuple[float, list[str]]:
-    """Compares the player with the exact renderer on white."""
+    """Compares the player with the exact renderer's pictures on white."""
     scores = []
-    for pose, camera in views:
-        camera = _fitted(camera, CHECKED_PX)
-        drawn = _on_white(premultiplied(player.render(pose, camera)))
-        scores.append(min(psnr(drawn, _on_white(renderer(pose, camera))), 99.0))
+    for (pose, camera), truth in zip(views, exact, strict=True):
+        drawn = _on_white(premultiplied(player.render(pose, _fitted(camera, CHECKED_PX))))
+        scores.append(min(psnr(drawn, truth), 99.0))
     score = float(np.mean(scores))
     if score < LOWEST_PSNR:
         raise ExportRefused(

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 from scipy import ndimage
 
+from export.compiled import optical_depth_ends
 from export.lattice import Lattice
 
 CONTRAST = 16.0
@@ -141,15 +142,8 @@ def _thickness(
     `DEEPEST_M`; and `MARGIN_M`.
     """
     step = np.float32(0.5 * lattice.voxel_m)
-    depths = np.arange(0.5, DEEPEST_M / step, dtype=np.float32) * step
-    optical = np.zeros((len(depths), len(positions)), dtype=np.float32)
-    total = np.zeros(len(positions), dtype=np.float32)
-    for row, depth in enumerate(depths):
-        nodes = (positions - normals * depth - lattice.low) / lattice.voxel_m
-        nearest = np.round(nodes).astype(np.int32)
-        nearest = np.clip(nearest, 0, np.array(lattice.density.shape) - 1)
-        total = total + lattice.density[tuple(nearest.T)] * step
-        optical[row] = total
-    enough = np.minimum(OPAQUE, 0.999 * total)
-    seen = (optical < enough).sum(axis=0)
-    return ((seen + 1) * step + MARGIN_M).astype(np.float32)
+    ends = optical_depth_ends(
+        lattice.density, lattice.low, np.float32(lattice.voxel_m), positions, normals, step,
+        int(DEEPEST_M / step), OPAQUE, 0.999,
+    )  # fmt: skip
+    return ((ends + 1) * step + MARGIN_M).astype(np.float32)

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, UInt8
-from scipy import ndimage
+from jaxtyping import Float, Float32, Int, UInt8
 
 from avatar.rig import Rig
+from export.compiled import spread_colors
 from export.tables import BRICK, LOG_DENSITY
 
 FieldAt = Callable[
@@ -63,7 +63,7 @@ def read_field(
         i, j, k = nodes.T
         density[i, j, k] = densities.numpy()
         rgb[i, j, k] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
-    _spread_colors(density > FAINTEST, rgb)
+    spread_colors(density > FAINTEST, rgb)
     return Lattice(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
 
 
@@ -94,23 +94,3 @@ def _occupied_nodes(
             nodes = np.concatenate(waiting)
             yield from (nodes[start : start + CHUNK] for start in range(0, len(nodes), CHUNK))
             waiting = []
-
-
-def _spread_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
-    """Gives each empty node beside visible ones their mean colour, in place.
-
-    Between a visible and an empty node colour is interpolated too: black would darken the rim.
-    """
-    visible[[0, -1]] = visible[:, [0, -1]] = visible[:, :, [0, -1]] = False
-    near = ndimage.binary_dilation(visible, np.ones((3, 3, 3))) & ~visible
-    near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
-    flat, colors, places = visible.ravel(), rgb.reshape(-1, 3), np.flatnonzero(near)
-    strides = np.array([visible.shape[1] * visible.shape[2], visible.shape[2], 1])
-    total = np.zeros((len(places), 3), dtype=np.float32)
-    count = np.zeros((len(places), 1), dtype=np.float32)
-    for offset in np.ndindex(3, 3, 3):
-        beside = places + (np.array(offset) - 1) @ strides
-        weight = flat[beside].astype(np.float32)[:, None]
-        total += colors[beside] * weight
-        count += weight
-    colors[places] = np.round(total / np.maximum(count, 1.0)).astype(np.uint8)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import final
 
 import numpy as np
 from jaxtyping import UInt8
@@ -69,36 +70,88 @@ def write_package(package: AvatarPackage, path: Path) -> int:
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
-    entries = {PREVIEW: package.preview}
-    for tier, graph in package.graphs.items():
-        entries[graph_entry(tier)] = graph
-        for name, stream in encode(package.tables[tier]).items():
-            entries[stream_entry(tier, name)] = stream
-    for number, frame in enumerate(package.golden):
-        entries[golden_entry(number)] = frame.tobytes()
-    sums = {name: hashlib.sha256(content).hexdigest() for name, content in entries.items()}
-    manifest = replace(package.manifest, sha256=sums).to_json().encode()
-    return _write_whole(path, {MANIFEST: manifest, **entries})
+    with PackageDraft(path) as draft:
+        draft.add_drawing(package)
+        return draft.finish(package)
 
 
-def _write_whole(path: Path, entries: Mapping[str, bytes]) -> int:
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for name, content in entries.items():
-                    info = zipfile.ZipInfo(name, EPOCH)
-                    archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
-            file.flush()
-            os.fsync(file.fileno())
-            size = file.tell()
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
+@final
+class PackageDraft:
+    """A package under a temporary name, which it loses unless it is finished.
+
+    What is drawn can go in, and be compressed, while it is still being checked.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            path: Where the package will stand; replaced at once if it exists.
+        """
+        self._path = path
+        self._sums: dict[str, str] = {}
+
+    def __enter__(self) -> "PackageDraft":
+        """Opens the temporary file.
+
+        Raises:
+            OSError: If the folder cannot be written.
+        """
+        descriptor, temporary = tempfile.mkstemp(
+            dir=self._path.parent, prefix=f".{self._path.name}."
+        )
+        self._temporary: Path | None = Path(temporary)
+        self._file = os.fdopen(descriptor, "wb")
+        self._archive = zipfile.ZipFile(self._file, "w")
+        return self
+
+    def add_drawing(self, package: AvatarPackage) -> None:
+        """Adds graphs and tables."""
+        for tier, graph in package.graphs.items():
+            self._add(graph_entry(tier), graph)
+            for name, stream in encode(package.tables[tier]).items():
+                self._add(stream_entry(tier, name), stream)
+
+    def finish(self, package: AvatarPackage) -> int:
+        """Adds golden frames, preview and manifest, and gives the package its name.
+
+        Args:
+            package: Its graphs and tables are in already.
+
+        Returns:
+            Its size in bytes.
+        """
+        assert self._temporary is not None
+        self._add(PREVIEW, package.preview)
+        for number, frame in enumerate(package.golden):
+            self._add(golden_entry(number), frame.tobytes())
+        manifest = replace(package.manifest, sha256=dict(self._sums))
+        self._add(MANIFEST, manifest.to_json().encode())
+        self._archive.close()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        size = self._file.tell()
+        self._file.close()
+        self._temporary.chmod(0o644)
+        self._temporary.replace(self._path)
+        self._temporary = None
+        return size
+
+    def __exit__(self, *_: object) -> None:
+        """Removes what was not finished."""
+        if self._temporary is None:
+            return
+        with suppress(OSError, ValueError):  # a full disk fails again when the rest is flushed
+            self._archive.close()
+        with suppress(OSError):
+            self._file.close()
         with suppress(FileNotFoundError):
-            os.unlink(temporary)
-        raise
-    return size
+            self._temporary.unlink()
+
+    def _add(self, name: str, content: bytes) -> None:
+        self._sums[name] = hashlib.sha256(content).hexdigest()
+        info = zipfile.ZipInfo(name, EPOCH)
+        self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
 
 
 def read_package(path: Path, *, tier: str = "hq") -> AvatarPackage:

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from export.compiled import spread_colors
 from export.hull import MARGIN_M, OPAQUE, find_hull
-from export.lattice import Lattice, _spread_colors
+from export.lattice import Lattice
 
 VOXEL_M = 0.004
 RADIUS_M = 0.08
@@ -65,6 +66,6 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept():
 def test_empty_nodes_beside_visible_ones_take_their_color(color):
     visible, rgb = np.zeros((7, 7, 7), bool), np.zeros((7, 7, 7, 3), np.uint8)
     visible[3, 3, 2:5], rgb[3, 3, 2:5] = True, color
-    _spread_colors(visible, rgb)
+    spread_colors(visible, rgb)
     assert (rgb[2:5, 2:5, 1:6] == color).all()
     assert not rgb[0].any()

@@ -1,0 +1,120 @@
+"""The loops of baking, compiled: walks along normals, neighbours' colours, weights and slopes."""
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from avatar.kernels.cpu_skin import interpolate
+from avatar.kernels.jit import compile_kernel
+
+F32, I32 = np.float32, np.int32
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def optical_depth_ends(density, low, voxel_m, positions, normals, step, deepest, opaque, share):
+    """Number of steps along each inward normal until all that can be seen has been seen.
+
+    Args:
+        density: On nodes, 1/m.
+        low, voxel_m: Their place and distance, metres.
+        positions, normals: Where to start, and which way is out.
+        step: Distance between steps, metres.
+        deepest: Steps that are made.
+        opaque: Optical depth behind which nothing is seen.
+        share: So much of all there is along the normal is enough, too.
+    """
+    ends = np.empty(len(positions), dtype=np.int32)
+    along = np.empty(deepest, dtype=np.float32)
+    last_i, last_j, last_k = density.shape[0] - 1, density.shape[1] - 1, density.shape[2] - 1
+    for p in range(len(positions)):
+        total = F32(0)
+        for n in range(deepest):
+            depth = (F32(n) + F32(0.5)) * step
+            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
+            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
+            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
+            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            total += density[i, j, k] * step
+            along[n] = total
+        enough = min(F32(opaque), F32(share) * total)
+        seen = 0
+        while seen < deepest and along[seen] < enough:
+            seen += 1
+        ends[p] = seen
+    return ends
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def mark_reached(reached, low, voxel_m, positions, normals, thickness, margin_m):
+    """Marks the nodes from a margin outside of each position as deep as its thickness."""
+    last_i, last_j, last_k = reached.shape[0] - 1, reached.shape[1] - 1, reached.shape[2] - 1
+    for p in range(len(positions)):
+        depth = -margin_m
+        while depth <= thickness[p]:
+            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
+            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
+            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
+            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            reached[i, j, k] = True
+            depth += voxel_m
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def _mean_colors(visible, rgb, nodes):
+    _, ny, nz = visible.shape
+    for node in nodes:
+        i, j, k = node // (ny * nz), node // nz % ny, node % nz
+        red, green, blue, count = 0, 0, 0, 0
+        for a in range(i - 1, i + 2):
+            for b in range(j - 1, j + 2):
+                for c in range(k - 1, k + 2):
+                    if visible[a, b, c]:
+                        red += rgb[a, b, c, 0]
+                        green += rgb[a, b, c, 1]
+                        blue += rgb[a, b, c, 2]
+                        count += 1
+        rgb[i, j, k, 0] = np.uint8(np.rint(red / count))
+        rgb[i, j, k, 1] = np.uint8(np.rint(green / count))
+        rgb[i, j, k, 2] = np.uint8(np.rint(blue / count))
+
+
+def spread_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
+    """Gives each empty node beside visible ones their mean colour, in place.
+
+    Between a visible and an empty node colour is interpolated too: black would darken the rim.
+    The border is left alone, and counts as empty.
+    """
+    inner = np.zeros_like(visible)
+    inner[1:-1, 1:-1, 1:-1] = visible[1:-1, 1:-1, 1:-1]
+    beside = grown(inner) & ~inner
+    beside[[0, -1]] = beside[:, [0, -1]] = beside[:, :, [0, -1]] = False
+    _mean_colors(inner, rgb, np.flatnonzero(beside))
+
+
+def grown(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """The nodes and all 26 neighbours of each."""
+    for axis in range(3):
+        out = solid.copy()
+        here, beyond = [slice(None)] * 3, [slice(None)] * 3
+        here[axis], beyond[axis] = slice(None, -1), slice(1, None)
+        out[tuple(here)] |= solid[tuple(beyond)]
+        out[tuple(beyond)] |= solid[tuple(here)]
+        solid = out
+    return solid
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def _interpolated(volume, low, nodes_per_m, points, out):
+    for p in range(len(points)):
+        interpolate(volume, low, nodes_per_m, points[p, 0], points[p, 1], points[p, 2], 24, out[p])
+
+
+def interpolated(
+    volume: Float32[np.ndarray, "x y z 24"],
+    low: Float32[np.ndarray, "3"],
+    nodes_per_m: Float32[np.ndarray, "3"],
+    points: Float32[np.ndarray, "points 3"],
+) -> Float32[np.ndarray, "points 24"]:
+    """Trilinear skinning weights; the border's value outside the volume."""
+    out = np.empty((len(points), 24), dtype=np.float32)
+    _interpolated(volume, low, nodes_per_m, points, out)
+    return out
