@@ -2,11 +2,19 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 COARSEST_M = 0.13
 """Cells of the coarsest hash level: 16 along a two-metre box."""
 ENOUGH_FRAMES = 24
 """So many frames, all round, determine the detail that their pixels show."""
+Skipping = Literal["canonical", "union", "frame", "none"]
+"""What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
+for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
+Roots = Literal["cells", "broyden"]
+"""How samples are warped: by our warp cells, or each by Broyden's method (Fast-SNARF)."""
+EmptyTerm = Literal["occupancy", "global"]
+"""Where density is penalised: in empty cells (InstantAvatar, §3.4), or in the whole box."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +42,11 @@ class TrainConfig:
     learning_rate: float = 2.5e-2
     """Of the table; the network's is 0.3 of it."""
     alpha_weight: float = 0.1
-    """Of the L1 loss on alpha."""
+    """Of the L1 loss on alpha; 0 turns it off."""
     hard_weight: float = 0.02
-    """Of the hard-surface loss."""
+    """Of the hard-surface loss; 0 turns it off."""
     empty_weight: float = 1.0
-    """Of the opacity in cells that should be empty."""
+    """Of the opacity in cells that should be empty; 0 turns the term off."""
     empty_points: int = 256
     """Points at which that opacity is measured in each step."""
     occupancy_every: int = 16
@@ -51,6 +59,29 @@ class TrainConfig:
     """Every so manieth frame is held out; 0 for none."""
     seed: int = 0
     """Of everything random."""
+    skipping: Skipping = "canonical"
+    """How empty space is skipped. All but "canonical" are there to repeat the paper's tables."""
+    roots: Roots = "cells"
+    """How samples find their canonical points; "broyden" is the paper's way."""
+    empty_term: EmptyTerm = "occupancy"
+    """Where emptiness is asked for; "global" is the prior that the paper argues against."""
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot be combined.
+
+        Raises:
+            ValueError: If two of the choices contradict each other.
+        """
+        if self.roots == "broyden" and self.refine_poses:
+            raise ValueError(
+                "roots='broyden' warps samples without cells, and it is the cells that carry a "
+                "pose's gradient: set refine_poses=False."
+            )
+        if self.skipping == "none" and self.empty_term == "occupancy" and self.empty_weight:
+            raise ValueError(
+                "skipping='none' knows no empty cells that could be kept empty: set "
+                "empty_weight=0 or empty_term='global'."
+            )
 
     @classmethod
     def within(

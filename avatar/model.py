@@ -9,7 +9,7 @@ from torch import Tensor
 from avatar.field import Field
 from avatar.kernels.backend import Grid
 from avatar.kernels.reference import activate
-from avatar.occupancy import Occupancy, grown
+from avatar.occupancy import Occupancy, grown, inside
 from avatar.rig import Rig
 
 
@@ -38,12 +38,7 @@ class Avatar:
         self, points: Float32[Tensor, "points 3"]
     ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
         """Colour in [0, 1] and density in 1/m at canonical points; no density in empty cells."""
-        grid = self.rendering_grid()
-        shape = torch.tensor(grid.occupied.shape, device=points.device)
-        cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
-        inside = ((cell >= 0) & (cell < shape)).all(dim=1)
-        x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)
-        held = (inside & (grid.occupied[x, y, z] != 0)).nonzero()[:, 0]
+        held = inside(self.rendering_grid(), points).nonzero()[:, 0]
         color, density = activate(self.field.raw_at(points[held].contiguous()))
         all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])
         all_colors[held], all_densities[held] = color, density

@@ -114,6 +114,14 @@ class Occupancy:
         return (corner + within.to(cells.device)) / self.grid.cells_per_m + self.grid.low
 
 
+def inside(grid: Grid, points: Float32[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
+    """Which points lie in occupied cells."""
+    shape = torch.tensor(grid.occupied.shape, device=points.device)
+    cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
+    x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)
+    return ((cell >= 0) & (cell < shape)).all(dim=1) & (grid.occupied[x, y, z] != 0)
+
+
 def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
     """The cells and their six neighbours."""
     out = occupied.clone()

@@ -14,11 +14,11 @@ from avatar.kernels.choice import backend_for
 from avatar.levels import HashLevels
 from avatar.model import Avatar
 from avatar.occupancy import DECAY, FIRST_DECAY, Occupancy
+from avatar.paper.variants import sampler_for
 from avatar.prepare import PreparedFrame
 from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.rig import Rig
-from avatar.sampling import CanonicalSampler, Sampler
 from avatar.step import StepResult, gradients
 
 NETWORK_RATE = 0.3
@@ -60,7 +60,7 @@ class Trainer:
         self.avatar = Avatar(
             rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
         )
-        self.sampler: Sampler = CanonicalSampler(self.backend, self.avatar.occupancy, config)
+        self.sampler = sampler_for(config, self.avatar)
         self.replay = Replay(config.key_frames, device)
         self.poses = PoseTable(rig, config.key_frames, device)
         self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}

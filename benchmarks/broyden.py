@@ -11,8 +11,8 @@ from avatar.kernels.backend import Grid
 from avatar.kernels.cpu_cells import _solve
 from avatar.kernels.cpu_skin import moved
 from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.roots import START_BONES
 from avatar.rig import Rig
-from benchmarks.paper_step import START_BONES
 
 F32, I32 = np.float32, np.int32
 

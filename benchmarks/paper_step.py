@@ -23,6 +23,7 @@ from torch import Tensor
 from avatar.config import TrainConfig
 from avatar.kernels import reference
 from avatar.kernels.backend import Grid
+from avatar.kernels.roots import START_BONES
 from avatar.prepare import PreparedFrame
 from avatar.replay import Batch
 from avatar.rig import Rig
@@ -30,7 +31,6 @@ from benchmarks.torch_step import TorchField, opacity_of
 
 SAMPLES = 128
 UNION_CELLS = 64
-START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
 ITERATIONS = 10
 AT_REST_M = 1e-3
 SAME_ROOT_M = 1e-3

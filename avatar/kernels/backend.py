@@ -3,10 +3,10 @@
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, Integer, UInt8
 from torch import Tensor
 
-from avatar.kernels import pose, reference
+from avatar.kernels import lattice, pose, reference, roots
 from avatar.levels import HashLevels
 
 Points = Float32[Tensor, "points 3"]
@@ -101,6 +101,38 @@ class Skin(NamedTuple):
     nodes_per_m: Float32[Tensor, "3"]
 
 
+class PosedGrid(NamedTuple):
+    """Which cells of each slot's body frame may hold anything (`avatar.paper`).
+
+    Attributes:
+        occupied: Not 0 where something may be.
+        low: Corner of each slot's grid, metres.
+        cells_per_m: Along each axis.
+        shape: Cells along each axis.
+    """
+
+    occupied: Integer[Tensor, "slots cells"]
+    low: Float32[Tensor, "slots 3"]
+    cells_per_m: Float32[Tensor, "slots 3"]
+    shape: Int32[Tensor, "slots 3"]
+
+
+class Articulations(NamedTuple):
+    """Poses as Fast-SNARF keeps them: blended transforms of each, and where searches start.
+
+    Attributes:
+        blended: Σ w_j B_j on the nodes of the canonical box.
+        low: Its corner, metres.
+        nodes_per_m: Nodes per metre along each axis.
+        inverses: From body to canonical frame, of the bones that searches start with.
+    """
+
+    blended: Float32[Tensor, "slots x y z 12"]
+    low: Float32[Tensor, "3"]
+    nodes_per_m: Float32[Tensor, "3"]
+    inverses: Float32[Tensor, "slots starts 12"]
+
+
 class Marching(NamedTuple):
     """How a ray is sampled.
 
@@ -190,6 +222,21 @@ class Backend(Protocol):
         """Moves a slot's roots, in place, after its pose."""
         ...
 
+    def place(
+        self, rays: Rays, grid: PosedGrid, step_m: float
+    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+        """Samples of the body frame in a grid's occupied cells, and how many each ray has."""
+        ...
+
+    def find_roots(
+        self,
+        points: Float32[Tensor, "points 3"],
+        slots: Int32[Tensor, "points"],
+        poses: Articulations,
+    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+        """Where each of Fast-SNARF's searches ends, and which found a root of its own."""
+        ...
+
 
 @final
 class TorchBackend:
@@ -272,3 +319,16 @@ class TorchBackend:
         nx, ny, nz = cells.shape[slot].tolist()
         index = cells.index[slot, : nx * ny * nz].view(nx, ny, nz)
         pose.follow(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
+
+    def place(
+        self, rays: Rays, grid: PosedGrid, step_m: float
+    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+        return lattice.place(*rays, step_m, *grid)
+
+    def find_roots(
+        self,
+        points: Float32[Tensor, "points 3"],
+        slots: Int32[Tensor, "points"],
+        poses: Articulations,
+    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+        return roots.find_all(points, slots, *poses)

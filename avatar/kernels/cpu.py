@@ -4,17 +4,26 @@ from typing import final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
-from avatar.kernels import cpu_composite, cpu_grid, cpu_march, cpu_pose
+from avatar.kernels import (
+    cpu_composite,
+    cpu_grid,
+    cpu_lattice,
+    cpu_march,
+    cpu_pose,
+    cpu_roots,
+)
 from avatar.kernels.backend import (
+    Articulations,
     CellTables,
     Features,
     Grid,
     Marching,
     Pixels,
     Points,
+    PosedGrid,
     Raw,
     Rays,
     Samples,
@@ -140,3 +149,31 @@ class NumbaBackend:
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
             *(part.numpy() for part in skin), bones.numpy(),
         )  # fmt: skip
+
+    def place(
+        self, rays: Rays, grid: PosedGrid, step_m: float
+    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+        count = torch.empty(len(rays.slots), dtype=torch.int32)
+        given = (
+            *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
+        )  # fmt: skip
+        cpu_lattice.count(*given, np.empty((0, 3), np.float32), count.numpy())
+        points = torch.empty(int(count.sum()), 3)
+        first = torch.cumsum(count, 0) - count
+        cpu_lattice.place(*given, points.numpy(), first.numpy())
+        return points, count
+
+    def find_roots(
+        self,
+        points: Float32[Tensor, "points 3"],
+        slots: Int32[Tensor, "points"],
+        poses: Articulations,
+    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+        starts = poses.inverses.shape[1]
+        found = torch.empty(len(points), starts, 3)
+        valid = torch.empty(len(points), starts, dtype=torch.bool)
+        cpu_roots.find_all(
+            points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
+            found.numpy(), valid.numpy(),
+        )  # fmt: skip
+        return found, valid

@@ -7,10 +7,10 @@ from torch import Tensor
 
 def weights_at(
     points: Float[Tensor, "points 3"],
-    weights: Float[Tensor, "x y z 24"],
+    weights: Float[Tensor, "x y z channels"],
     low: Float[Tensor, "3"],
     nodes_per_m: Float[Tensor, "3"],
-) -> Float[Tensor, "points 24"]:
+) -> Float[Tensor, "points channels"]:
     """Trilinear skinning weights at canonical points; the border's outside."""
     last = torch.tensor(weights.shape[:3], device=points.device) - 1
     place = ((points - low) * nodes_per_m / last * 2.0 - 1.0).flip(-1)[None, :, None, None]
@@ -23,10 +23,10 @@ def weights_at(
 
 def skinned(
     points: Float[Tensor, "points 3"],
-    weights: Float[Tensor, "x y z 24"],
+    weights: Float[Tensor, "x y z channels"],
     low: Float[Tensor, "3"],
     nodes_per_m: Float[Tensor, "3"],
-    bones: Float[Tensor, "24 12"],
+    bones: Float[Tensor, "channels 12"],
 ) -> Float[Tensor, "points 3"]:
     """Linear blend skinning: x ↦ Σ w_j(x) B_j x (Fast-SNARF, eq. 3)."""
     blend = (weights_at(points, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
@@ -36,10 +36,10 @@ def skinned(
 def find_roots(
     targets: Float[Tensor, "points 3"],
     starts: Float[Tensor, "points 3"],
-    weights: Float[Tensor, "x y z 24"],
+    weights: Float[Tensor, "x y z channels"],
     low: Float[Tensor, "3"],
     nodes_per_m: Float[Tensor, "3"],
-    bones: Float[Tensor, "24 12"],
+    bones: Float[Tensor, "channels 12"],
     *,
     iterations: int = 12,
     tolerance_m: float = 1e-4,

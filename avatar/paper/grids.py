@@ -1,0 +1,213 @@
+"""The paper's occupancy grids (§3.3): one for the whole sequence, and one for each pose.
+
+Both are 64³, in the body frame (the paper's root-normalised space), filled by one jittered probe
+per cell of the posed field, thresholded at an opacity of 0.01 per centimetre, and dilated by one
+cell. Decay, threshold and passes are those of the released code.
+"""
+
+from typing import final
+
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+
+from avatar.kernels.backend import CellTables, PosedGrid
+from avatar.paper.posed_field import PosedField
+from avatar.rig import Rig
+
+SIDE = 64
+DECAY = 0.8
+"""What a cell keeps of its density from one update to the next."""
+OPACITY = 0.01
+"""Of one centimetre; a cell below it, or below the mean if that is lower, is empty."""
+BEYOND_M = 0.25
+"""How far beyond the longest chain of bones the sequence's grid reaches."""
+FRAME_EVERY = 4
+"""Steps between renewals of a frame's grid: with 100 frames each one's turn comes in 400 steps."""
+
+
+def occupied_by(density: Float32[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+    """Cells that hold something, and all their neighbours."""
+    opacity = 1.0 - torch.exp(-0.01 * density)
+    full = (opacity > opacity.mean().clamp(max=OPACITY)).float()
+    return torch.nn.functional.max_pool3d(full[None], 3, stride=1, padding=1)[0].to(torch.uint8)
+
+
+def jittered(
+    low: Float32[Tensor, "3"], cell_m: Float32[Tensor, "3"], generator: torch.Generator
+) -> Float32[Tensor, "cells 3"]:
+    """A random point in each cell of a grid, metres."""
+    axis = torch.arange(SIDE, device=low.device)
+    corner = torch.cartesian_prod(axis, axis, axis)
+    within = torch.rand(len(corner), 3, generator=generator, device=generator.device)
+    return low + (corner + within.to(low.device)) * cell_m
+
+
+@final
+class EmptyPool:
+    """Canonical points that the latest probes found in empty cells."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Nothing yet."""
+        self._points = torch.zeros(0, 3, device=device)
+
+    def fill(self, points: Float32[Tensor, "points 3"]) -> None:
+        """Puts other points in the place of those that were there."""
+        self._points = points
+
+    def draw(self, count: int, generator: torch.Generator) -> Float32[Tensor, "drawn 3"]:
+        """At most `count` of them, at random."""
+        held = len(self._points)
+        drawn = torch.randint(
+            max(held, 1), (count if held else 0,), generator=generator, device=generator.device
+        )
+        return self._points[drawn.to(self._points.device)]
+
+
+@final
+class UnionGrid:
+    """Training, in the paper: the union over the sequence, as the moving maximum of one grid.
+
+    As in the paper it forgets: what no drawn frame has shown for a few hundred steps is dropped.
+
+    Attributes:
+        density: 1/m.
+        occupied: Everything, until the first update.
+    """
+
+    def __init__(self, rig: Rig, field: PosedField, *, every: int, device: torch.device) -> None:
+        """A grid that knows nothing.
+
+        Args:
+            rig: Whose body: the grid is a cube about its pelvis that no pose leaves.
+            field: What is probed.
+            every: Steps between updates.
+            device: Where it lives.
+        """
+        reach = _reach(rig) + BEYOND_M
+        pelvis = torch.from_numpy(rig.rest_joints[0]).float().to(device)
+        self._field, self._every = field, every
+        self._low, self._cell_m = pelvis - reach, 2.0 * reach / SIDE
+        self._slots: list[int] = []
+        self._pool = EmptyPool(device)
+        self.density: Float32[Tensor, "64 64 64"] = torch.zeros((SIDE,) * 3, device=device)
+        self.occupied: UInt8[Tensor, "64 64 64"] = torch.ones(
+            (SIDE,) * 3, dtype=torch.uint8, device=device
+        )
+
+    def grid(self, cells: CellTables) -> PosedGrid:
+        """The same for every slot."""
+        slots = len(cells.low)
+        return PosedGrid(
+            self.occupied.view(1, -1).expand(slots, -1),
+            self._low.repeat(slots, 1),
+            torch.full_like(cells.low, 1.0 / self._cell_m),
+            torch.full_like(cells.shape, SIDE),
+        )
+
+    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """From empty cells of the frame that was probed last."""
+        return self._pool.draw(count, generator)
+
+    def admit(self, slot: int, cells: CellTables) -> None:
+        """The frame will be drawn for updates."""
+        if slot not in self._slots:
+            self._slots.append(slot)
+
+    def update(self, steps: int, cells: CellTables, generator: torch.Generator) -> None:
+        """Probes a random frame, every so many steps."""
+        if steps % self._every == 0 and self._slots:
+            drawn = torch.randint(
+                len(self._slots), (1,), generator=generator, device=generator.device
+            )
+            self.probe(self._slots[int(drawn)], cells, generator)
+
+    def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
+        """Takes in what one frame holds. Outside the person's box it holds nothing."""
+        cell_m = torch.full_like(self._low, self._cell_m)
+        points = jittered(self._low, cell_m, generator)
+        high = cells.low[slot] + cells.shape[slot] * cells.cell_m
+        near = ((points >= cells.low[slot]) & (points < high)).all(dim=1).nonzero()[:, 0]
+        probed = self._field.probe(points[near], slot, cells)
+        flat = self.density.view(-1)
+        flat *= DECAY
+        flat[near] = torch.maximum(flat[near], probed.density)
+        self.occupied = occupied_by(self.density)
+        empty = self.occupied.view(-1)[near[probed.found]] == 0
+        self._pool.fill(probed.canonical[empty])
+
+
+@final
+class FrameGrids:
+    """Rendering, in the paper: a grid for each pose, over the person's own box.
+
+    In training the grids are renewed in turn, each as a moving maximum.
+
+    Attributes:
+        density: 1/m, of every slot.
+        occupied: Everything, until a slot's first probe.
+    """
+
+    def __init__(self, field: PosedField, slots: int, device: torch.device) -> None:
+        """Grids without frames."""
+        self._field = field
+        self._turn: list[int] = []
+        self._pool = EmptyPool(device)
+        cube = (slots, SIDE, SIDE, SIDE)
+        self.density: Float32[Tensor, "slots 64 64 64"] = torch.zeros(cube, device=device)
+        self.occupied: UInt8[Tensor, "slots 64 64 64"] = torch.zeros(
+            cube, dtype=torch.uint8, device=device
+        )
+        self._low = torch.zeros(slots, 3, device=device)
+        self._cell_m = torch.ones(slots, 3, device=device)
+
+    def grid(self, cells: CellTables) -> PosedGrid:
+        """Each slot's own, in the box that it had when it was probed."""
+        shape = torch.full_like(cells.shape, SIDE)
+        return PosedGrid(self.occupied.flatten(1), self._low, 1.0 / self._cell_m, shape)
+
+    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """From empty cells of the grid that was renewed last."""
+        return self._pool.draw(count, generator)
+
+    def admit(self, slot: int, cells: CellTables) -> None:
+        """The slot's box is full until it is probed, and its turn is next."""
+        if slot in self._turn:
+            self._turn.remove(slot)
+        self._turn.insert(0, slot)
+        self._measure(slot, cells)
+        self.density[slot] = 0.0
+        self.occupied[slot] = 1
+
+    def update(self, steps: int, cells: CellTables, generator: torch.Generator) -> None:
+        """Renews one slot's grid, every so many steps."""
+        if steps % FRAME_EVERY == 0 and self._turn:
+            slot = self._turn.pop(0)
+            self._turn.append(slot)
+            self.density[slot] *= DECAY
+            self._measure(slot, cells)
+            self.probe(slot, cells, generator)
+
+    def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
+        """Raises one slot's densities to what a random point of each cell holds."""
+        points = jittered(self._low[slot], self._cell_m[slot], generator)
+        probed = self._field.probe(points, slot, cells)
+        flat = self.density[slot].view(-1)
+        torch.maximum(flat, probed.density, out=flat)
+        self.occupied[slot] = occupied_by(self.density[slot])
+        empty = self.occupied[slot].view(-1)[probed.found] == 0
+        self._pool.fill(probed.canonical[empty])
+
+    def _measure(self, slot: int, cells: CellTables) -> None:
+        self._low[slot] = cells.low[slot]
+        self._cell_m[slot] = cells.shape[slot] * (cells.cell_m / SIDE)
+
+
+def _reach(rig: Rig) -> float:
+    """The longest chain of bones that hangs on the pelvis, metres."""
+    lengths = [0.0] * len(rig.parents)
+    for joint in range(1, len(rig.parents)):
+        parent = int(rig.parents[joint])
+        bone = rig.rest_joints[joint] - rig.rest_joints[parent]
+        lengths[joint] = lengths[parent] + float((bone**2).sum() ** 0.5)
+    return max(lengths)
