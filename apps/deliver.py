@@ -8,7 +8,6 @@ from typing import Any
 from apps.console import Console
 from apps.follow import FollowingCamera
 from apps.learn import Learnt
-from apps.meter import Meter
 from apps.novel import novel_motion
 from apps.pictures import data_uri, eight_bit, moving_data_uri
 from apps.recording import Recording
@@ -18,7 +17,6 @@ from apps.report import (
     MachineNote,
     PackageNote,
     Report,
-    StreamNote,
     TrainingNote,
 )
 from apps.report_page import Pair, report_page
@@ -179,31 +177,19 @@ def _report(
         held_out=held,
         held_out_refined=_fitted_note(learnt),
         curve=learnt.curve,
-        stream=_stream_note(learnt.meter, ready_at),
+        stream=learnt.meter.note(ready_at=ready_at),
         package=package,
     )
 
 
 def _frames_note(learnt: Learnt) -> FramesNote:
-    dropped = tuple(learnt.meter.dropped)
+    meter = learnt.meter
     return FramesNote(
-        read=learnt.added + len(learnt.held) + len(dropped),
+        read=learnt.added + len(learnt.held) + meter.dropped_count,
         used=learnt.added,
         held_out=len(learnt.held),
-        dropped=dropped,
+        dropped=tuple(meter.dropped),
         not_replayed=learnt.added - len(learnt.trainer.replay),
-    )
-
-
-def _stream_note(meter: Meter, ready_at: float | None) -> StreamNote:
-    ready = None
-    if ready_at is not None and meter.first_at is not None:
-        ready = ready_at - (meter.first_at + meter.last_time_s)
-    return StreamNote(
-        realtime=False,
-        ingest_ms=meter.ingest_ms(),
-        inbox_dropped=0,
-        ready_after_last_frame_seconds=ready,
     )
 
 

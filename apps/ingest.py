@@ -112,11 +112,12 @@ def _trainer(
     from avatar import checkpoint
 
     device, video = _device(given.device), str(recording.source.path.resolve())
+    seconds = given.training_seconds(recording)
     if given.resume and not run.has_checkpoint():
         console.say(f"There is no checkpoint in {run.path}: starting afresh.")
     if not (given.resume and run.has_checkpoint()):
         trainer = new_trainer(
-            recording, seconds=given.seconds, seed=given.seed, refine_poses=given.refine_poses,
+            recording, seconds=seconds, seed=given.seed, refine_poses=given.refine_poses,
             device=device,
         )  # fmt: skip
         return trainer, 0, {"video": video}
@@ -124,19 +125,15 @@ def _trainer(
     had = trainer.wall_seconds
     if notes.get("video") == video:
         console.say(f"Going on after {had:.0f} seconds of training.")
-        if had >= given.seconds:
+        if had >= seconds:
             console.warn(
-                f"The run has had {had:.0f} of {given.seconds:.0f} seconds; only its package and "
+                f"The run has had {had:.0f} of {seconds:.0f} seconds; only its package and "
                 "report are written again. Give more --seconds to go on learning."
             )
-        trainer.config = replace(
-            trainer.config, seconds=given.seconds, refine_poses=given.refine_poses
-        )
+        trainer.config = replace(trainer.config, seconds=seconds, refine_poses=given.refine_poses)
         return trainer, trainer.frames_seen, notes
     console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
-    trainer.config = replace(
-        trainer.config, seconds=had + given.seconds, refine_poses=given.refine_poses
-    )
+    trainer.config = replace(trainer.config, seconds=had + seconds, refine_poses=given.refine_poses)
     trainer.corrections.clear()  # they are of the other video's frames
     return trainer, 0, {**notes, "video": video}
 

@@ -1,7 +1,7 @@
 """What ia-ingest can be told; the text under each field is its --help."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,8 @@ from capture.errors import BadInput
 
 LEARNABLE_PX = 540
 """Longer side of the pictures that a minute is enough for."""
+
+A_MINUTE = 60.0
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -54,8 +56,12 @@ class IngestArguments:
     """Go on with the run in --out: with the same video after an interruption, or with another."""
     overwrite: Flag = False
     """Replace the run in --out."""
-    seconds: float = 60.0
-    """How long you will wait: seconds of training, after start-up."""
+    seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """How long you will wait: seconds of training, after start-up. Without it 60; with --realtime
+    as long as the clip lasts."""
+    realtime: Flag = False
+    """Play the video as if it were being filmed now: each frame comes at its own time, and the
+    avatar is ready when the video ends. More --seconds polish it after the last frame."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of the pictures in pixels; they are never enlarged. Without it, what can
     be learnt in --seconds: 540 in a minute, twice as many in four."""
@@ -78,7 +84,7 @@ class IngestArguments:
         Raises:
             BadInput: Naming the option.
         """
-        if not 0.0 < self.seconds < float("inf"):
+        if self.seconds is not None and not 0.0 < self.seconds < float("inf"):
             raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
         if self.size is not None and self.size < 16:
             raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
@@ -108,7 +114,17 @@ class IngestArguments:
             frames=parsed_frames(self.frames),
             mask_invert=invert,
         )
-        return Recording.open(wanted, size_px=self.size or learnable_px(self.seconds))
+        recording = Recording.open(wanted)
+        size_px = self.size or learnable_px(self.training_seconds(recording))
+        recording = replace(recording, size_px=size_px)
+        return recording.played() if self.realtime else recording
+
+    def training_seconds(self, recording: Recording) -> float:
+        """How long training goes on: as was said, else as the clip lasts, else a minute."""
+        if self.seconds is not None:
+            return self.seconds
+        duration_s = recording.source.duration_s
+        return duration_s if self.realtime and duration_s else A_MINUTE
 
     def as_json(self) -> dict[str, Any]:
         """The arguments as report.json keeps them."""

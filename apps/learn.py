@@ -15,7 +15,7 @@ from apps.report import CurvePoint, mean
 from apps.run_folder import RunFolder
 from avatar import checkpoint
 from avatar.config import TrainConfig
-from avatar.events import Evaluated, Score, Stepped, TrainEvent, Warned
+from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
 from avatar.prepare import PreparedFrame
@@ -26,6 +26,8 @@ from capture.inbox import Inbox
 from preprocess.observe import Dropped
 
 CHECKPOINT_EVERY_S = 10.0
+LATE_S = 0.5
+"""A playback that lags more than this is spoken of."""
 
 Item = PreparedFrame | HeldOut | Dropped
 
@@ -102,7 +104,7 @@ class Lesson:
         self._curve: list[CurvePoint] = [CurvePoint.again(kept) for kept in notes.get("curve", [])]
         self._held: list[HeldOut] = []
         self._saved_at = time.perf_counter()
-        self.meter = Meter(stop)
+        self.meter = Meter(stop, recording.source)
 
     def learn(self, *, recall: int = 0) -> Learnt:
         """Trains until the time is up or somebody stops it. Scores come later (`scored`).
@@ -114,7 +116,8 @@ class Lesson:
         Raises:
             OSError: If a checkpoint cannot be written; the one before stays.
         """
-        inbox = Inbox(self._frames())
+        source = self._recording.source
+        self._inbox = inbox = Inbox(self._frames(), paced=source.paced, live=source.live)
         try:
             added = self._recall(inbox, recall) - self._trainer.frames_seen
             self._saved_at = time.perf_counter()
@@ -124,9 +127,11 @@ class Lesson:
                     if self._stop.is_set():
                         break
         finally:
+            source.close()
             inbox.close()
+        self.meter.inbox_dropped = inbox.dropped
         interrupted = self._stop.is_set()
-        for warning in self._recording.source.warnings:
+        for warning in [*source.warnings, *self._how_late()]:
             self._console.warn(warning)
         self._console.count_the_rest()
         if len(self._trainer.replay):
@@ -156,7 +161,8 @@ class Lesson:
 
     def _frames(self) -> Iterator[Item]:
         """Frames as they become ready; runs on the inbox's thread."""
-        observations = self.meter.watched(self._recording.observations())
+        frames = self.meter.frames(self._recording.source.frames())
+        observations = self.meter.watched(map(self._recording.observer(), frames))
         rig, every = self._trainer.avatar.rig, self._trainer.config.hold_every
         total = self._recording.source.frame_count
         return self.meter.timed(prepared(observations, rig, every=every, total=total))
@@ -178,7 +184,10 @@ class Lesson:
 
     def _listen(self, event: TrainEvent, bar: Bar) -> None:
         match event:
+            case Arrived(index=index):
+                self.meter.arrived(index)
             case Stepped():
+                self.meter.depth.add(float(self._inbox.waiting))
                 bar.move(event.wall_seconds, self._progress(event))
                 if time.perf_counter() - self._saved_at > CHECKPOINT_EVERY_S:
                     self._save()
@@ -198,8 +207,28 @@ class Lesson:
             f"{event.frames_seen} frames",
             f"step {event.step}",
             f"{rays / 1000.0:.0f}k rays/s",
+            f"{event.samples_per_ray:.1f} samples/ray",
+            f"{self._inbox.waiting} waiting",
         ]
+        if self._recording.source.paced:
+            parts.append(f"{1000.0 * self.meter.behind_s:.0f} ms behind")
         return " · ".join(parts if psnr is None else [*parts, f"held out {psnr:.1f} dB"])
+
+    def _how_late(self) -> Iterator[str]:
+        """What a user should know about a stream that could not be kept up with."""
+        source, late = self._recording.source, self.meter.lateness_s
+        if source.dropped + self._inbox.dropped:
+            yield (
+                f"{source.dropped + self._inbox.dropped} frames gave way to later ones, because "
+                "preparing a frame takes longer than filming it. A smaller --size is faster."
+            )
+        if source.paced and not source.live and late.percentile(95.0) > LATE_S:
+            yield (
+                f"The playback fell behind by up to {late.largest:.1f} s (half of the frames by "
+                f"{late.percentile(50.0):.1f} s or more): frames are not prepared as fast as they "
+                "come. No frame was lost. A smaller --size, or every other frame (--frames ::2), "
+                "is faster."
+            )
 
     def _mark(self, scores: tuple[Score, ...], wall_s: float, cpu_s: float) -> CurvePoint:
         point = CurvePoint(

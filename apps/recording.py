@@ -1,19 +1,22 @@
 """All that is known about a video before its first frame is read, checked together."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from capture.errors import BadInput
+from capture.frame import Frame
+from capture.pace import Pace
+from capture.playback import Playback
 from capture.source import Source, open_source
 from preprocess.body import Body, ShapedBody
 from preprocess.camera_file import CameraTrack, default_cameras, read_cameras
 from preprocess.capture_folder import CapturePaths, find_capture
 from preprocess.masks import Masks, open_masks
 from preprocess.observation import Observation
-from preprocess.observe import Dropped, observe
+from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion
 from preprocess.shape import betas_for
@@ -93,13 +96,21 @@ class Recording:
             size_px=size_px,
             notes=tuple(_notes(body, motion, masks, cameras)),
         )
-        recording.observations()  # the parts are checked together, and no frame is read yet
+        recording.observer()  # the parts are checked together, and no frame is read yet
         recording.footprint_m()
         return recording
 
     def observations(self) -> Iterator[Observation | Dropped]:
         """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
-        return observe(self.source, self.motion, self.masks, self.cameras, size_px=self.size_px)
+        return map(self.observer(), self.source.frames())
+
+    def observer(self) -> Callable[[Frame], Observation | Dropped]:
+        """What joins a frame with its pose, mask and camera."""
+        return observer(self.source, self.motion, self.masks, self.cameras, size_px=self.size_px)
+
+    def played(self) -> "Recording":
+        """The same, its frames coming at their own times."""
+        return replace(self, source=Playback(self.source, Pace()))
 
     def footprint_m(self) -> float:
         """What one pixel covers on the body: the dial of the field's resolution.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from avatar.events import Score
+from capture.reservoir import Reservoir
 
 FORMAT = 1
 
@@ -135,11 +136,17 @@ class CurvePoint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Milliseconds:
-    """A spread of durations."""
+class Spread:
+    """A spread of numbers: half of them are below p50, and 95 % below p95."""
 
     p50: float
     p95: float
+
+    @classmethod
+    def of(cls, numbers: Reservoir, *, scale: float = 1.0) -> "Spread":
+        """Of what a reservoir has seen, times `scale`."""
+        p50, p95 = (scale * numbers.percentile(percent) for percent in (50.0, 95.0))
+        return cls(p50=p50, p95=p95)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,17 +154,24 @@ class StreamNote:
     """How the video kept pace.
 
     Attributes:
-        realtime: Whether it was played at its own speed.
+        realtime: Whether frames came at times of their own: played so, or live.
         ingest_ms: From decoding to ready for training, per frame.
-        inbox_dropped: Frames that gave way in the inbox.
+        inbox_dropped: Frames of a live source that gave way, because nobody took them in time.
         ready_after_last_frame_seconds: From the end of the video, had it been filmed from the
             first frame on, to the finished package; null without a package.
+        latency_ms: From the moment when a frame was there (due, filmed, or decoded) until the
+            trainer had it.
+        lateness_ms: How long after that moment its preparation began.
+        inbox_depth: Frames that waited in the inbox.
     """
 
     realtime: bool
-    ingest_ms: Milliseconds
+    ingest_ms: Spread
     inbox_dropped: int
     ready_after_last_frame_seconds: float | None
+    latency_ms: Spread
+    lateness_ms: Spread
+    inbox_depth: Spread
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,24 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
+class Arrived:
+    """The trainer has been given a frame.
+
+    Attributes:
+        index: The frame's number in its source.
+        held_out: Whether it will be scored instead of learnt from.
+    """
+
+    index: int
+    held_out: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Idle:
+    """There is nothing to learn from yet; it has been waited for a moment."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Stepped:
     """A step was made.
 
@@ -78,4 +96,4 @@ class Finished:
     samples: int
 
 
-TrainEvent = Stepped | Evaluated | Warned | Finished
+TrainEvent = Arrived | Idle | Stepped | Evaluated | Warned | Finished

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from typing import final
 
-from avatar.events import Evaluated, Finished, Score, Stepped, TrainEvent, Warned
+from avatar.events import Arrived, Evaluated, Finished, Idle, Score, Stepped, TrainEvent, Warned
 from avatar.hold import SCORED_AT_A_MARK, HeldOut, interleaved, score, spread
 from avatar.prepare import PreparedFrame
 from avatar.step import cosine
@@ -44,9 +44,10 @@ def train(
 ) -> Iterator[TrainEvent]:
     """Trains until the time is up, on whatever has arrived.
 
-    The learning rate is constant while frames arrive and falls as a cosine after the last. No
-    frame is lost: where the time is too short to read them all beside training, reading comes
-    first, and ends after the time if it must.
+    The learning rate is constant while frames arrive and falls as a cosine after the last. Of a
+    recording no frame is lost: where the time is too short to read them all beside training,
+    reading comes first, and ends after the time if it must. Frames that come at times of their own
+    are never waited for, except for the first. A live source is left when the time is up.
 
     Args:
         trainer: Goes on from where it stands.
@@ -57,13 +58,14 @@ def train(
         What happens, on the caller's thread: what the caller does with an event takes training
         time.
     """
-    config, stream, marks = trainer.config, _Stream(trainer, inbox, held), _Marks(trainer)
+    stream, marks = _Stream(trainer, inbox, held), _Marks(trainer)
     while True:
         now = stream.clock.read()
-        yield from stream.take_in(urgent=now > READING_SHARE * config.seconds)
+        yield from stream.take_in(now)
         if len(trainer.replay) == 0:
             if stream.ended:
                 return
+            yield Idle()
             continue
         now = stream.clock.read()
         if stream.is_done(now):
@@ -74,7 +76,7 @@ def train(
         if stream.is_behind(now):
             continue
         yield _stepped(trainer, stream, now)
-    yield from _farewell(trainer)
+    yield from _farewell(trainer, paced=inbox.paced)
 
 
 def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
@@ -90,9 +92,9 @@ def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
     )
 
 
-def _farewell(trainer: Trainer) -> Iterator[Warned | Finished]:
+def _farewell(trainer: Trainer, *, paced: bool) -> Iterator[Warned | Finished]:
     config = trainer.config
-    if trainer.wall_seconds > 1.1 * config.seconds and not config.steps:
+    if trainer.wall_seconds > 1.1 * config.seconds and not (config.steps or paced):
         yield Warned(
             message=f"Reading the video took longer than the {config.seconds:.0f} s that were "
             f"given: training ended after {trainer.wall_seconds:.0f} s, when every frame had been "
@@ -128,15 +130,12 @@ class _Stream:
         """Whether nothing more will arrive."""
         return self._ended_at is not None
 
-    def take_in(self, *, urgent: bool) -> Iterator[Warned]:
-        """Hands what has arrived to the trainer; the clock starts with the first frame.
-
-        Args:
-            urgent: Wait a little for something to arrive, so that the reader has the machine.
-        """
+    def take_in(self, now: float) -> Iterator[Arrived | Warned]:
+        """Hands what has arrived to the trainer; the clock starts with the first frame."""
         if self.ended:
             return
-        wait_s = 0.1 if urgent or len(self._trainer.replay) == 0 else 0.0
+        # without a frame, or where reading comes first, the reader has the machine for a moment
+        wait_s = 0.1 if self.is_behind(now) or len(self._trainer.replay) == 0 else 0.0
         for item in self._inbox.take(wait_s=wait_s):
             if isinstance(item, Dropped):
                 yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
@@ -145,15 +144,19 @@ class _Stream:
                 self.clock, self._started = Clock(self._trainer), True
             if isinstance(item, HeldOut):
                 self._held.append(item)
+                yield Arrived(index=item.observation.frame.index, held_out=True)
             else:
                 self._trainer.add(item)
-        if self._inbox.finished:
+                yield Arrived(index=item.index, held_out=False)
+        too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
+        if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
             self._last_steps = self._trainer.steps + FAREWELL_STEPS
 
     def is_behind(self, now: float) -> bool:
-        """Whether reading must come first for a while."""
-        return not self.ended and now > READING_SHARE * self._trainer.config.seconds
+        """Whether reading must come first for a while; a video's own pace cannot be hurried."""
+        late = now > READING_SHARE * self._trainer.config.seconds
+        return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:
         """Whether the time, or the number of steps asked for, is up and nothing is left over."""

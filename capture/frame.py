@@ -16,6 +16,8 @@ class Frame:
         rgb: Picture, 8-bit RGB, upright.
         flags: What is wrong with it: "corrupt", "repeated", or both.
         alpha: The source's own alpha channel (RGBA pictures), else None.
+        due_s: When it was there to be taken, on `time.perf_counter`'s clock: played or filmed at
+            that moment. None for a recording that is read as fast as it is taken.
     """
 
     index: int
@@ -23,6 +25,7 @@ class Frame:
     rgb: UInt8[np.ndarray, "height width 3"]
     flags: frozenset[str] = frozenset()
     alpha: UInt8[np.ndarray, "height width"] | None = None
+    due_s: float | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -82,6 +82,9 @@ class ImageFolder:
     """A folder of pictures; picture i was taken at i / 30 s."""
 
     live = False
+    paced = False
+    waited_s = 0.0
+    dropped = 0
 
     def __init__(self, path: Path, selection: Selection) -> None:
         """Lists the folder and reads the first picture that can be read.
@@ -94,12 +97,13 @@ class ImageFolder:
         self.warnings: list[str] = []
         self._images = list_images(path)
         self.frames_in_file = len(self._images)
-        self.frame_count = selection.count(self.frames_in_file)
+        self.frame_count: int | None = selection.count(self.frames_in_file)
         if not self.frame_count:
             raise BadInput(
                 f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
                 f"; at least one was expected from number {selection.start} on."
             )
+        self.duration_s: float | None = selection.span(self.frames_in_file) / RATE
         self.size_px, self.has_alpha = self._look()
 
     def frames(self) -> Iterator[Frame]:
@@ -127,6 +131,9 @@ class ImageFolder:
     def count_frames(self) -> int:
         """How many pictures the folder holds."""
         return len(self._images)
+
+    def close(self) -> None:
+        """Nothing is held open."""
 
     def _look(self) -> tuple[tuple[int, int], bool]:
         """Size of the first picture that can be read, and whether it has an alpha channel."""

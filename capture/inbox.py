@@ -12,17 +12,35 @@ Item = TypeVar("Item")
 class Inbox(Generic[Item]):
     """Runs an iterable on a thread of its own and hands its items over, in order.
 
-    Nothing is lost: when the inbox is full the producer waits. An error in the producer is raised
-    in the consumer, after the items that came before it.
+    Of a recording nothing is lost: when the inbox is full the producer waits. Of a live source the
+    latest is kept: when the inbox is full the oldest item that nobody has taken gives way. An error
+    in the producer is raised in the consumer, after the items that came before it.
+
+    Attributes:
+        paced: Whether items come at times of their own, so that hurrying would not help.
+        live: Whether the latest is kept.
+        dropped: How many items gave way.
     """
 
-    def __init__(self, items: Iterable[Item], *, capacity: int = 64) -> None:
+    def __init__(
+        self,
+        items: Iterable[Item],
+        *,
+        capacity: int = 64,
+        paced: bool = False,
+        live: bool = False,
+    ) -> None:
         """Starts the producer.
 
         Args:
             items: Iterated on the inbox's own thread.
             capacity: How many items wait at most.
+            paced: Whether items come at times of their own.
+            live: Whether the producer never waits.
         """
+        self.paced = paced
+        self.dropped = 0
+        self.live = live
         self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
         self._error: BaseException | None = None
         self._stop = threading.Event()
@@ -34,6 +52,11 @@ class Inbox(Generic[Item]):
     def finished(self) -> bool:
         """Whether everything has been taken and nothing more will come."""
         return self._ended.is_set() and self._queue.empty() and self._error is None
+
+    @property
+    def waiting(self) -> int:
+        """How many items have arrived and nobody has taken."""
+        return self._queue.qsize()
 
     def take(self, *, wait_s: float = 0.0) -> list[Item]:
         """Everything that has arrived; waits up to `wait_s` seconds for a first item."""
@@ -64,15 +87,25 @@ class Inbox(Generic[Item]):
             except queue.Empty:
                 return
 
+    def _let_one_give_way(self) -> None:
+        """Makes room for the latest, of a live source; else the producer goes on waiting."""
+        if not self.live:
+            return
+        try:
+            self._queue.get_nowait()
+            self.dropped += 1
+        except queue.Empty:  # somebody has just taken everything
+            return
+
     def _fill(self, items: Iterable[Item]) -> None:
         try:
             for item in items:
                 while not self._stop.is_set():
                     try:
-                        self._queue.put(item, timeout=0.1)
+                        self._queue.put(item, timeout=0.0 if self.live else 0.1)
                         break
                     except queue.Full:
-                        continue
+                        self._let_one_give_way()
                 if self._stop.is_set():
                     return
         except BaseException as error:

@@ -46,3 +46,8 @@ class Selection:
     def position(self, index: int) -> int:
         """The place of a wanted frame among the wanted ones, counted from 0."""
         return (index - self.start) // self.step
+
+    def span(self, total: int) -> int:
+        """How many of `total` frames lie from the first wanted one to the last, both counted."""
+        count = self.count(total)
+        return (count - 1) * self.step + 1 if count else 0

@@ -21,10 +21,16 @@ class Source(Protocol):
         path: The video file or the folder of pictures itself.
         size_px: Width and height of every frame.
         selection: The frames that are wanted.
-        frames_in_file: How many frames there are in all, wanted or not, as the container claims.
-        frame_count: How many of them are wanted; fewer may come, see `warnings`.
+        frames_in_file: How many frames there are in all, wanted or not, as the container claims;
+            of a live source 0.
+        frame_count: How many of them are wanted; fewer may come, see `warnings`. None if nobody
+            knows, of a live source.
+        duration_s: How long the wanted frames last, as the container claims; None if nobody knows.
         has_alpha: Whether the frames have an alpha channel of their own.
         live: Whether frames that are not taken in time are lost.
+        paced: Whether frames come at times of their own, however fast they are taken.
+        waited_s: How long `frames()` has waited for frames, in all.
+        dropped: How many frames were lost because nobody took them in time.
         warnings: What was wrong so far; grows while `frames()` is read.
     """
 
@@ -32,10 +38,22 @@ class Source(Protocol):
     size_px: tuple[int, int]
     selection: Selection
     frames_in_file: int
-    frame_count: int
+    frame_count: int | None
+    duration_s: float | None
     has_alpha: bool
     live: bool
+    paced: bool
     warnings: list[str]
+
+    @property
+    def waited_s(self) -> float:
+        """How long `frames()` has waited for frames, in all."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """How many frames were lost because nobody took them in time."""
+        ...
 
     def frames(self) -> Iterator[Frame]:
         """The frames, lazily and in order; every call starts anew."""
@@ -43,6 +61,10 @@ class Source(Protocol):
 
     def count_frames(self) -> int:
         """How many frames there really are in all, found by decoding; slow."""
+        ...
+
+    def close(self) -> None:
+        """Ends `frames()`, also one that waits on another thread, and lets a device go."""
         ...
 
 

@@ -28,6 +28,9 @@ class VideoFile:
 
     has_alpha = False
     live = False
+    paced = False
+    waited_s = 0.0
+    dropped = 0
 
     def __init__(self, path: Path, selection: Selection) -> None:
         """Opens the file and decodes one frame.
@@ -47,7 +50,9 @@ class VideoFile:
         claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
         self.frames_in_file = claimed if claimed > 0 else self.count_frames()
-        self.frame_count = selection.count(self.frames_in_file)
+        self.frame_count: int | None = selection.count(self.frames_in_file)
+        span = selection.span(self.frames_in_file)
+        self.duration_s: float | None = span / self._rate if self._rate > 0.0 else None
         if not self.frame_count:
             raise BadInput(
                 f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "
@@ -76,6 +81,9 @@ class VideoFile:
             count += not failures
         capture.release()
         return count
+
+    def close(self) -> None:
+        """Nothing is held open but by `frames()`, which lets it go itself."""
 
     def _pictures(self) -> Iterator[tuple[int, float, cv2.VideoCapture, bool]]:
         """Number and time of every picture while the decoder stands at it; if it follows a gap."""

@@ -38,10 +38,22 @@ def observe(
     *,
     size_px: int | None = None,
 ) -> Iterator[Observation | Dropped]:
-    """Observations of the wanted frames in order, lazily, after everything was checked.
+    """Observations of the wanted frames in order, lazily; `observer` says the rest."""
+    return map(observer(source, motion, masks, cameras, size_px=size_px), source.frames())
+
+
+def observer(
+    source: Source,
+    motion: Motion,
+    masks: Masks | None,
+    cameras: CameraTrack,
+    *,
+    size_px: int | None = None,
+) -> Callable[[Frame], Observation | Dropped]:
+    """What makes an observation of a frame, after everything was checked.
 
     Args:
-        source: The frames.
+        source: Where the frames come from.
         motion: Poses; matched by their frame numbers, by their times, or by order.
         masks: One mask a frame; None if the pictures have an alpha channel.
         cameras: Cameras of the frames' size.
@@ -76,7 +88,7 @@ def observe(
             camera=cameras[camera_row(frame.index)].resized(target_px),
         )
 
-    return map(observed, source.frames())
+    return observed
 
 
 def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None]:

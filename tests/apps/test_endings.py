@@ -2,8 +2,6 @@
 
 import errno
 import io
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from rich.console import Console as RichConsole
 from apps.background import background
 from apps.console import MOST_WARNINGS, Console
 from apps.exit_codes import Stop, exit_code
-from apps.meter import Meter
 from apps.run_folder import RunFolder
 from apps.whole import whole_file, whole_folder, write_text
 from capture.errors import BadInput
@@ -155,25 +152,6 @@ def test_a_log_gets_plain_lines_and_few(monkeypatch):
         monkeypatch.setattr("apps.console.LOG_EVERY_S", 0.0)
         bar.move(60.0, "the end")
     assert said.getvalue() == "learning: the end\n"
-
-
-def test_a_meter_times_what_passes_and_stops_when_asked():
-    stop = threading.Event()
-    meter = Meter(stop)
-
-    def slow():
-        for number in range(5):
-            time.sleep(0.02)
-            yield number
-
-    taken = []
-    for number in meter.timed(slow()):
-        taken.append(number)
-        if number == 2:
-            stop.set()
-    assert taken == [0, 1, 2]
-    assert 20.0 <= meter.ingest_ms().p50 <= meter.ingest_ms().p95
-    assert meter.first_at is not None
 
 
 def test_colours_and_pictures_stand_behind_an_avatar(tmp_path, rng):

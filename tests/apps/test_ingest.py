@@ -23,7 +23,8 @@ KEYS = {
     "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
     "samples_per_ray peak_memory_mb",
     "held_out": "frames size psnr psnr_mask ssim lpips background poses",
-    "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds",
+    "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
+    "lateness_ms inbox_depth",
     "package": "path bytes seconds psnr_to_renderer",
 }
 

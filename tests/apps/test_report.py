@@ -16,8 +16,8 @@ from apps.report import (
     FramesNote,
     HeldOutNote,
     MachineNote,
-    Milliseconds,
     Report,
+    Spread,
     StreamNote,
     TrainingNote,
     largest_fall,
@@ -59,9 +59,12 @@ def report(**changes):
         "curve": (point(2.0, 24.0, 18.0), point(5.0, 29.0, 23.0)),
         "stream": StreamNote(
             realtime=False,
-            ingest_ms=Milliseconds(p50=20.0, p95=30.0),
+            ingest_ms=Spread(p50=20.0, p95=30.0),
             inbox_dropped=0,
             ready_after_last_frame_seconds=None,
+            latency_ms=Spread(p50=25.0, p95=40.0),
+            lateness_ms=Spread(p50=0.0, p95=1.0),
+            inbox_depth=Spread(p50=0.0, p95=2.0),
         ),
         "package": None,
     }

@@ -118,3 +118,28 @@ def test_the_source_runs_on_a_thread_of_its_own():
     threads = taken(Inbox(threading.current_thread() for _ in range(1)))
     assert threads != [threading.current_thread()]
     assert threads[0].daemon  # it cannot keep the process alive
+
+
+def test_a_live_producer_never_waits_and_the_latest_is_kept():
+    inbox = Inbox(range(1000), capacity=4, live=True)
+    wait_until(lambda: inbox._ended.is_set())
+    assert inbox.waiting == 4
+    assert taken(inbox) == [996, 997, 998, 999]
+    assert inbox.dropped == 996
+
+
+def test_what_a_live_inbox_hands_over_and_what_gave_way_is_everything():
+    source = Counting()
+    inbox = Inbox(itertools.islice(iter(source), 3000), capacity=2, live=True)
+    items = taken(inbox)
+    assert items == sorted(set(items))
+    assert len(items) + inbox.dropped == 3000
+    assert items[-1] == 2999
+
+
+def test_a_recording_drops_nothing_and_tells_how_much_waits():
+    inbox = Inbox(range(10), capacity=64)
+    wait_until(lambda: inbox._ended.is_set())
+    assert inbox.waiting == 10
+    assert taken(inbox) == list(range(10))
+    assert inbox.waiting == inbox.dropped == 0

@@ -1,0 +1,55 @@
+"""Waiting that ends at once when somebody says so, and that is counted."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import final
+
+Clock = Callable[[], float]
+Wait = Callable[[float], object]
+
+
+@final
+class Pace:
+    """The clock of a source whose frames come at times of their own.
+
+    Attributes:
+        waited_s: How long it has been waited for frames, in all.
+    """
+
+    def __init__(self, *, clock: Clock = time.perf_counter, wait: Wait | None = None) -> None:
+        """A pace that nobody has ended.
+
+        Args:
+            clock: Seconds; another one in tests.
+            wait: Lets so many seconds go by, fewer once the pace is ended.
+        """
+        self._ended = threading.Event()
+        self._clock = clock
+        self._wait: Wait = self._ended.wait if wait is None else wait
+        self.waited_s = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether nobody waits any more."""
+        return self._ended.is_set()
+
+    def now(self) -> float:
+        """Seconds on the clock."""
+        return self._clock()
+
+    def end(self) -> None:
+        """Ends every wait, the present one too; from any thread."""
+        self._ended.set()
+
+    def until(self, moment: float) -> bool:
+        """Waits for a moment on the clock; does not if it has gone by.
+
+        Returns:
+            Whether to go on: False once somebody has ended it.
+        """
+        began = self._clock()
+        if moment > began and not self.ended:
+            self._wait(moment - began)
+            self.waited_s += self._clock() - began
+        return not self.ended

@@ -1,0 +1,70 @@
+"""A recording played as a live capture: each frame comes at its own time."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import final
+
+from capture.frame import Frame
+from capture.pace import Pace
+from capture.source import Source
+
+
+@final
+class Playback:
+    """A source whose frames are handed over no earlier than their timestamps say.
+
+    The first frame is at 0; what lies between two frames is what the container says, whatever its
+    rate. Nothing is lost: where frames are not taken in time, the playback falls behind and
+    catches up as soon as it can.
+    """
+
+    live = False
+    paced = True
+
+    def __init__(self, source: Source, pace: Pace) -> None:
+        """Nothing is read yet.
+
+        Args:
+            source: What is played.
+            pace: Its clock; ending it ends the playback, also in the middle of a wait.
+        """
+        self._source, self._pace = source, pace
+        self.path = source.path
+        self.size_px = source.size_px
+        self.selection = source.selection
+        self.frames_in_file = source.frames_in_file
+        self.frame_count = source.frame_count
+        self.duration_s = source.duration_s
+        self.has_alpha = source.has_alpha
+        self.warnings = source.warnings
+
+    @property
+    def waited_s(self) -> float:
+        """How long frames have been held back in all."""
+        return self._pace.waited_s
+
+    @property
+    def dropped(self) -> int:
+        """How many frames were lost: none."""
+        return self._source.dropped
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames when they are due, read one ahead; every call plays anew."""
+        began = first = due = None
+        for frame in self._source.frames():
+            if began is None or first is None or due is None:
+                began = due = self._pace.now()
+                first = frame.time_s
+            due = max(due, began + frame.time_s - first)
+            if not self._pace.until(due):
+                return
+            yield replace(frame, due_s=due)
+
+    def count_frames(self) -> int:
+        """As the recording's own."""
+        return self._source.count_frames()
+
+    def close(self) -> None:
+        """Ends the playback, also in the middle of a wait."""
+        self._pace.end()
+        self._source.close()

@@ -1,0 +1,42 @@
+"""What is kept of a stream of numbers that may never end: its percentiles, in bounded memory."""
+
+import random
+from typing import final
+
+import numpy as np
+
+KEPT = 4096
+"""Numbers that are kept; up to so many the percentiles are exact."""
+
+
+@final
+class Reservoir:
+    """A uniform sample of all numbers so far (Vitter 1985, algorithm R).
+
+    Attributes:
+        count: How many there were.
+        largest: The largest of them all; 0 of none.
+    """
+
+    def __init__(self, kept: int = KEPT) -> None:
+        """An empty one that keeps at most so many."""
+        self._most = kept
+        self._kept: list[float] = []
+        self._random = random.Random(0)
+        self.count = 0
+        self.largest = 0.0
+
+    def add(self, number: float) -> None:
+        """Takes a number in; to be called by one thread."""
+        self.count += 1
+        self.largest = number if self.count == 1 else max(self.largest, number)
+        if len(self._kept) < self._most:
+            self._kept.append(number)
+            return
+        place = self._random.randrange(self.count)
+        if place < self._most:
+            self._kept[place] = number
+
+    def percentile(self, percent: float) -> float:
+        """The number below which `percent` of them lie; 0 of none."""
+        return float(np.percentile(self._kept.copy() or [0.0], percent))
