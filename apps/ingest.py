@@ -140,9 +140,11 @@ def _trainer(
 
 def _warm_up(trainer: "Trainer", console: Console) -> None:
     from avatar.warm import warm_up
+    from export import compiled
 
     with console.waiting("warming up"):
         warm_up(trainer)
+        compiled.warm_up()
 
 
 def _check_learnt(learnt: "Learnt", recording: Recording) -> None:

@@ -118,3 +118,15 @@ def interpolated(
     out = np.empty((len(points), 24), dtype=np.float32)
     _interpolated(volume, low, nodes_per_m, points, out)
     return out
+
+
+def warm_up() -> None:
+    """Compiles these loops, or loads them from disk, before anybody waits for a package."""
+    nodes, point = np.zeros((3, 3, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
+    low, size = point[0], np.float32(1.0)
+    optical_depth_ends(nodes, low, size, point, point, size, 1, 7.0, 0.999)
+    mark_reached(nodes > 0, low, size, point, point, low[:1], size)
+    solid = np.zeros((3, 3, 3), dtype=bool)
+    solid[1, 1, 1] = True
+    spread_colors(solid, np.zeros((3, 3, 3, 3), dtype=np.uint8))
+    interpolated(np.zeros((3, 3, 3, 24), dtype=np.float32), low, low, point)

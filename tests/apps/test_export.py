@@ -1,0 +1,54 @@
+"""ia-export: a package at any second, from what is on the disk."""
+
+import numpy as np
+import pytest
+
+from apps import export
+from export.player import Player, verify
+
+
+@pytest.fixture
+def call_export(capsys):
+    """Runs ia-export."""
+
+    def call(*arguments):
+        code = export.main([str(argument) for argument in arguments])
+        return code, capsys.readouterr()
+
+    return call
+
+
+def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    code, said = call_export(run, "--out", tmp_path / "now.iavatar")
+    assert code == 0, said.err
+    assert all(likeness.alike for likeness in verify(tmp_path / "now.iavatar"))
+    golden = Player.load(tmp_path / "now.iavatar").manifest.golden[0]
+    shown = Player.load(tmp_path / "now.iavatar").render(golden.pose, golden.camera)
+    assert 0.03 < (shown[..., 3] > 127).mean() < 0.5
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_the_whole_person_is_in_the_views(rig):
+    for _, camera in export.views(rig):
+        seen = camera.project(rig.seeds.astype(float))
+        assert (seen > 0).all()
+        assert (seen < np.array(camera.size_px)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda run, out: (out.parent, out), "checkpoint"),
+        (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
+        (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "no folder"),
+    ],
+)
+def test_what_cannot_be_done_is_said_and_nothing_is_written(
+    run, call_export, tmp_path, change, told
+):
+    folder, out = change(run, tmp_path / "a.iavatar")
+    code, said = call_export(folder, "--out", out)
+    assert code == 2
+    assert told in said.err
+    assert list(tmp_path.iterdir()) == []
