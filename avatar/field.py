@@ -85,7 +85,9 @@ class Field:
         first, first_bias, second, second_bias = self.layers
         features = self.backend.encode(points, self.table, self.levels)
         hidden = torch.addmm(first_bias, features, first).relu_()
-        return Activations(points, features, hidden, torch.addmm(second_bias, hidden, second))
+        # BLAS takes a third of the time where the few outputs are rows, not columns
+        raw = torch.addmm(second_bias[:, None], second.T, hidden.T).T.contiguous()
+        return Activations(points, features, hidden, raw)
 
     @torch.no_grad()
     def backward(
@@ -97,15 +99,14 @@ class Field:
             The gradient of the grid's features.
         """
         first, _, second, _ = self.layers
-        for parameter, grad in zip(
-            self.layers[2:], (seen.hidden.T @ grad_raw, grad_raw.sum(dim=0)), strict=True
-        ):
-            parameter.grad = grad
-        grad_hidden = (grad_raw @ second.T).mul_(seen.hidden > 0)
-        for parameter, grad in zip(
-            self.layers[:2], (seen.features.T @ grad_hidden, grad_hidden.sum(dim=0)), strict=True
-        ):
-            parameter.grad = grad
+        grad_hidden = (grad_raw @ second.T).mul_(seen.hidden.sign())
+        grads = (
+            seen.features.T @ grad_hidden, grad_hidden.sum(dim=0),
+            (grad_raw.T @ seen.hidden).T, grad_raw.sum(dim=0),
+        )  # fmt: skip
+        for parameter, grad in zip(self.layers, grads, strict=True):
+            assert parameter.grad is not None, "a gradient is overwritten, never taken away"
+            parameter.grad.copy_(grad)
         grad_features = grad_hidden @ first.T
         self.backend.encode_backward(seen.points, grad_features, self.levels, self.table_grad)
         return grad_features

@@ -53,8 +53,10 @@ def composite_loss(
 ):  # fmt: skip
     """Composite, loss of every ray, and the gradient of the mean loss with respect to `raw`.
 
-    The sum over the samples behind one sample, which its density's gradient needs, follows from
-    the totals (sum of weights = alpha, of weighted colours = colour): two passes, no storage.
+    A density's gradient needs the sum over the samples behind it, so a second pass runs from back
+    to front. (Totals less the sum of what is in front would need no such order, but behind an
+    opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
+    Meanwhile `grad_raw` holds each sample's colour and the light that passes it.
     """
     share = F32(1) / F32(first.shape[0])
     for ray in prange(first.shape[0]):
@@ -62,15 +64,14 @@ def composite_loss(
         through = F32(1)
         red, green, blue = F32(0), F32(0), F32(0)
         for i in range(start, stop):
-            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m
-            kept = np.exp(-optical)
+            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m)
             weight = through * (F32(1) - kept)
             through *= kept
             q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
             grad_raw[i, 0] = q0
             grad_raw[i, 1] = q1
             grad_raw[i, 2] = q2
-            grad_raw[i, 3] = optical
+            grad_raw[i, 3] = through
             red += weight * q0
             green += weight * q1
             blue += weight * q2
@@ -98,20 +99,15 @@ def composite_loss(
             - hard_weight * np.log(solid + empty)
         )  # fmt: skip
 
-        behind = (
-            (red - alpha * b0) * g0 + (green - alpha * b1) * g1 + (blue - alpha * b2) * g2
-            + alpha * g_alpha
-        )  # fmt: skip
-        through = F32(1)
-        for i in range(start, stop):
-            q0, q1, q2, optical = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
-            kept = np.exp(-optical)
-            weight = through * (F32(1) - kept)
-            through *= kept
+        behind = F32(0)
+        for i in range(stop - 1, start - 1, -1):
+            q0, q1, q2, through = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
+            weight = (grad_raw[i - 1, 3] if i > start else F32(1)) - through
             value = (q0 - b0) * g0 + (q1 - b1) * g1 + (q2 - b2) * g2 + g_alpha
-            behind -= weight * value
             grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
             grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
             grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
+            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m
             inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
             grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
+            behind += weight * value
