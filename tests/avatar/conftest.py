@@ -1,5 +1,6 @@
 """Stand-ins for the avatar's tests: a rig, poses, and small hash levels."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from avatar.levels import HashLevels
 from avatar.rig import Rig
 from avatar.step import cosine
 from avatar.trainer import Trainer
+from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
@@ -52,6 +54,43 @@ def bent_pose() -> np.ndarray:
     rotations[0] = -0.6, 0.0, 0.1
     rotations[3] = 0.9, 0.0, 0.0
     return rotations
+
+
+def lowered_arms(angle: float) -> np.ndarray:
+    """Joint rotations with both arms lowered by so many radians from the T-pose."""
+    rotations = np.zeros((23, 3))
+    rotations[15, 2], rotations[16, 2] = -angle, angle
+    return rotations
+
+
+@pytest.fixture
+def observed(shaped) -> Callable[..., Observation]:
+    """The body before a level camera of 200 px; what the picture shows plays no part.
+
+    Turned by so many radians about its axis, at 0 it faces the camera, which stands `distance_m`
+    away and `up_m` above the pelvis. The mask is white unless it is given.
+    """
+
+    def observe(*, turned=0.0, lowered=0.8, alpha=None, up_m=0.0, distance_m=4.0) -> Observation:
+        camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
+        eye = shaped.joints[0] + [0.0, up_m, distance_m]
+        camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
+        camera = Camera(
+            focal_px=(350.0, 350.0), center_px=(100.0, 100.0), size_px=(200, 200),
+            camera_from_world=camera_from_world,
+        )  # fmt: skip
+        pose = BodyPose(
+            root_rotation=np.array([0.0, turned, 0.0]),
+            root_translation=np.zeros(3),
+            joint_rotations=lowered_arms(lowered),
+        )
+        rgb = np.zeros((200, 200, 3), dtype=np.uint8)
+        alpha = np.ones((200, 200), dtype=np.float32) if alpha is None else alpha
+        return Observation(
+            frame=Frame(index=0, time_s=0.0, rgb=rgb), alpha=alpha, pose=pose, camera=camera
+        )
+
+    return observe
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,155 @@
+"""Which of the skin the camera has seen, and how squarely: kept up to date frame by frame."""
+
+import base64
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from avatar.patches import PART_NAMES, SIDE_NAMES, SkinPatches, in_front
+from preprocess.body import ShapedBody
+from preprocess.observation import Observation
+
+SEEN_COSINE = 0.3
+"""A patch that is turned further from the camera than this (72°) shows nothing of itself."""
+CELL_M, SLACK_M = 0.03, 0.03
+"""Of the depth buffer in which the body hides itself."""
+PERSON = 0.5
+"""Alpha above which a pixel shows the person."""
+
+
+class Stage(IntEnum):
+    """How far towards being seen a patch has ever come."""
+
+    AWAY = 0
+    """It never faced the camera."""
+    OUTSIDE = 1
+    """It did, outside the picture."""
+    HIDDEN = 2
+    """It did, inside the picture, behind another part of the body."""
+    MASKED = 3
+    """Nothing of the body was before it, but the mask says that no person is there."""
+    SEEN = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PartSeen:
+    """How much of a body part's surface was seen, all around and side by side.
+
+    Attributes:
+        seen: Share of its surface, in [0, 1].
+        sides: The same by side, in the order of `SIDE_NAMES`; only sides that the part has.
+    """
+
+    seen: float
+    sides: dict[str, float]
+
+
+@final
+class Coverage:
+    """What has been seen of one person. Costs about a millisecond a frame.
+
+    Frames may be added on one thread while others read: nothing that was seen is ever unseen.
+
+    Attributes:
+        patches: The person's skin.
+        cosines: How squarely each patch was seen at best, in [0, 1]; 0 if it never was.
+        stages: How far each has come (`Stage`).
+    """
+
+    cosines: Float32[np.ndarray, "patches"]
+    stages: UInt8[np.ndarray, "patches"]
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Nothing of this person has been seen yet."""
+        self._shaped = shaped
+        self.patches = SkinPatches.of(shaped)
+        self.cosines = np.zeros(len(self.patches.points), dtype=np.float32)
+        self.stages = np.zeros(len(self.patches.points), dtype=np.uint8)
+
+    def add(self, observation: Observation) -> None:
+        """Takes in what one frame shows.
+
+        A patch is seen if it faces the camera (cosine above 0.3), lands inside the picture, has
+        no other patch before it, and the mask says that a person is there.
+        """
+        camera, body = observation.camera, self._shaped.with_pose(observation.pose)
+        points, normals = posed(self.patches, body.world_from_rest())
+        to_camera = camera.center_world - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        cosines = np.einsum("pa,pa->p", to_camera, normals)
+        in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        depths = in_camera[:, 2]
+        if depths.min() <= 0.0:  # somebody behind the camera is not in the picture either
+            return
+        plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+        free = in_front(plane, depths, cosines, cell_m=CELL_M, slack_m=SLACK_M)
+        column, row = np.floor(camera.project(points)).astype(np.int64).T
+        width, height = camera.size_px
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
+        passed = (cosines > SEEN_COSINE, inside, free, alpha > PERSON)
+        stages = np.cumprod(passed, axis=0, dtype=np.uint8).sum(axis=0, dtype=np.uint8)
+        np.maximum(self.stages, stages, out=self.stages)
+        shown = np.where(stages == Stage.SEEN, cosines, 0.0).astype(np.float32)
+        np.maximum(self.cosines, shown, out=self.cosines)
+
+    @property
+    def seen(self) -> float:
+        """Share of the whole surface, in [0, 1]."""
+        return _share(self.patches.areas, self.cosines > 0.0)
+
+    def parts(self) -> dict[str, PartSeen]:
+        """How much of each part was seen, by its name."""
+        patches, seen = self.patches, self.cosines > 0.0
+        found: dict[str, PartSeen] = {}
+        for part, name in enumerate(PART_NAMES):
+            here = patches.parts == part
+            sides = {
+                side: _share(patches.areas[among], seen[among])
+                for k, side in enumerate(SIDE_NAMES)
+                if (among := here & (patches.sides == k)).any()
+            }
+            found[name] = PartSeen(seen=_share(patches.areas[here], seen[here]), sides=sides)
+        return found
+
+    def as_notes(self) -> dict[str, Any]:
+        """All of it as text, for a checkpoint."""
+        steps = np.round(self.cosines * 255.0).astype(np.uint8)
+        return {
+            "cosines": base64.b64encode(steps.tobytes()).decode("ascii"),
+            "stages": base64.b64encode(self.stages.tobytes()).decode("ascii"),
+        }
+
+    def recall(self, notes: dict[str, Any]) -> None:
+        """Adds what `as_notes` of an earlier run has kept; notes of another body count nothing."""
+        cosines, stages = (
+            np.frombuffer(base64.b64decode(notes[key]), dtype=np.uint8)
+            for key in ("cosines", "stages")
+        )
+        if len(stages) == len(self.stages) == len(cosines):
+            np.maximum(self.cosines, cosines.astype(np.float32) / 255.0, out=self.cosines)
+            np.maximum(self.stages, stages, out=self.stages)
+
+
+def posed(
+    patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
+) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
+    """Centres and unit normals of the patches in the world, by linear blend skinning.
+
+    Args:
+        patches: At rest.
+        world_from_rest: The joints' transforms (`PosedBody.world_from_rest`).
+    """
+    joints = world_from_rest[:, :3].reshape(24, 12).astype(np.float32)
+    blended = (patches.weights @ joints).reshape(-1, 3, 4)
+    points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]
+    normals = np.einsum("pab,pb->pa", blended[:, :, :3], patches.normals)
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
+    total = float(areas.sum())
+    return float(areas[seen].sum()) / total if total else 0.0
