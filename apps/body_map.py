@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
-from avatar.coverage import Coverage, posed
+from avatar.coverage import WELL_COSINE, Coverage, posed
 from avatar.patches import in_front
 from avatar.rig import canonical_rotations
 from preprocess.body import ShapedBody
@@ -20,8 +20,6 @@ DOT_CM = 2.7
 BLENDED, REACH_CM = 3, 2.6
 """A dot stands for so many visible patches, the nearest of them no farther than that."""
 GAP_CM, LABEL_CM = 14.0, 12.0
-WELL = 0.6
-"""A patch counts as well seen from this cosine on (53°)."""
 LEVELS = ("never", "slant", "well")
 
 
@@ -66,7 +64,7 @@ class BodyMap:
 
     def svg(self) -> str:
         """The map as it is now; colours are those of the classes never, slant and well."""
-        level = np.digitize(self._coverage.cosines, [1e-6, WELL])
+        level = np.digitize(self._coverage.cosines, [1e-6, WELL_COSINE])
         width, height = self._size
         margin = DOT_CM
         parts = [
@@ -98,7 +96,7 @@ def _view(
     shown = np.flatnonzero(free & (facing > 0.0))
     places = np.column_stack([plane[shown, 0], points[:, 1].max() - plane[shown, 1]]) * 100.0
     dots = _hexagonal(places)
-    distance, nearest = KDTree(places).query(dots, k=BLENDED)
+    distance, nearest = map(np.asarray, KDTree(places).query(dots, k=BLENDED))
     on_the_body = distance[:, 0] < REACH_CM
     return _View(places=dots[on_the_body], patches=shown[nearest[on_the_body]])
 

@@ -5,6 +5,7 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from apps.body_map import BodyMap
 from apps.console import Console
 from apps.follow import FollowingCamera
 from apps.learn import Learnt
@@ -12,6 +13,7 @@ from apps.novel import novel_motion
 from apps.pictures import data_uri, eight_bit, moving_data_uri
 from apps.recording import Recording
 from apps.report import (
+    CoverageNote,
     FramesNote,
     HeldOutNote,
     MachineNote,
@@ -96,6 +98,7 @@ def deliver(
         page = report_page(
             report,
             name=recording.paths.video.name,
+            body_map=BodyMap(recording.shaped, learnt.coverage).svg(),
             pairs=pairs(learnt),
             novel=None if package is None else novel(Player.load(run.package)),
             warnings=console.warnings if refused is None else [*console.warnings, refused],
@@ -179,6 +182,7 @@ def _report(
         curve=learnt.curve,
         stream=learnt.meter.note(ready_at=ready_at),
         package=package,
+        coverage=CoverageNote.of(learnt.coverage),
     )
 
 

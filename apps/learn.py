@@ -11,18 +11,21 @@ import torch
 from apps.console import Bar, Console
 from apps.meter import Meter
 from apps.recording import Recording
-from apps.report import CurvePoint, mean
+from apps.report import CurvePoint, mean, percent
 from apps.run_folder import RunFolder
 from avatar import checkpoint
+from avatar.advice import advice
 from avatar.config import TrainConfig
+from avatar.coverage import Coverage
 from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
-from avatar.hold import HeldOut, prepared, score
+from avatar.hold import HeldOut, is_held_out, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
+from preprocess.observation import Observation
 from preprocess.observe import Dropped
 
 CHECKPOINT_EVERY_S = 10.0
@@ -41,6 +44,7 @@ class Learnt:
         held: Held-out frames that have arrived.
         curve: Scores on the way, and at the end.
         meter: What it saw of the stream.
+        coverage: What of the person the frames show that it was trained on.
         added: Frames that were put into the trainer's memory in this run.
         interrupted: Whether Ctrl-C ended it.
         scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
@@ -51,6 +55,7 @@ class Learnt:
     held: list[HeldOut]
     curve: tuple[CurvePoint, ...]
     meter: Meter
+    coverage: Coverage
     added: int
     interrupted: bool
     scores: tuple[Score, ...] = ()
@@ -105,6 +110,9 @@ class Lesson:
         self._held: list[HeldOut] = []
         self._saved_at = time.perf_counter()
         self.meter = Meter(stop, recording.source)
+        self.coverage = Coverage(recording.shaped)
+        if "coverage" in notes:
+            self.coverage.recall(notes["coverage"])
 
     def learn(self, *, recall: int = 0) -> Learnt:
         """Trains until the time is up or somebody stops it. Scores come later (`scored`).
@@ -136,11 +144,14 @@ class Lesson:
         self._console.count_the_rest()
         if len(self._trainer.replay):
             self._save()
+            seen = percent(self.coverage.seen)
+            self._console.say(f"{seen} of the person was seen. {advice(self.coverage)}")
         return Learnt(
             trainer=self._trainer,
             held=self._held,
             curve=tuple(self._curve),
             meter=self.meter,
+            coverage=self.coverage,
             added=added + self._trainer.frames_seen,
             interrupted=interrupted,
         )
@@ -162,10 +173,22 @@ class Lesson:
     def _frames(self) -> Iterator[Item]:
         """Frames as they become ready; runs on the inbox's thread."""
         frames = self.meter.frames(self._recording.source.frames())
-        observations = self.meter.watched(map(self._recording.observer(), frames))
+        found = self.meter.watched(map(self._recording.observer(), frames))
+        observations = self._looked_at(found)
         rig, every = self._trainer.avatar.rig, self._trainer.config.hold_every
         total = self._recording.source.frame_count
         return self.meter.timed(prepared(observations, rig, every=every, total=total))
+
+    def _looked_at(
+        self, observations: Iterator[Observation | Dropped]
+    ) -> Iterator[Observation | Dropped]:
+        """Passes observations on; what those show that will be trained on has been seen."""
+        every, total = self._trainer.config.hold_every, self._recording.source.frame_count
+        for position, item in enumerate(observations):
+            held_out = is_held_out(position, every=every, total=total)
+            if isinstance(item, Observation) and not held_out:
+                self.coverage.add(item)
+            yield item
 
     def _recall(self, inbox: Inbox[Item], count: int) -> int:
         """Puts frames back into the memory of a trainer that has learnt from them before."""
@@ -209,6 +232,7 @@ class Lesson:
             f"{rays / 1000.0:.0f}k rays/s",
             f"{event.samples_per_ray:.1f} samples/ray",
             f"{self._inbox.waiting} waiting",
+            f"{percent(self.coverage.seen)} seen",
         ]
         if self._recording.source.paced:
             parts.append(f"{1000.0 * self.meter.behind_s:.0f} ms behind")
@@ -259,6 +283,7 @@ class Lesson:
             return fitted_scores(self._trainer, self._held)
 
     def _save(self) -> None:
-        notes = {**self._notes, "curve": [vars(point) for point in self._curve]}
+        curve = [vars(point) for point in self._curve]
+        notes = {**self._notes, "curve": curve, "coverage": self.coverage.as_notes()}
         checkpoint.save(self._trainer, self._run.checkpoint, notes=notes)
         self._saved_at = time.perf_counter()

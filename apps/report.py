@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from avatar.advice import advice
+from avatar.coverage import Coverage
 from avatar.events import Score
 from capture.reservoir import Reservoir
 
@@ -185,6 +187,30 @@ class PackageNote:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CoverageNote:
+    """What of the person's skin the frames show that were trained on.
+
+    Attributes:
+        seen: Share of the skin, in [0, 1].
+        well: The same, counting only what was seen within 53° of squarely.
+        advice: What the person should do next, in a sentence.
+        parts: For each body part its share under "seen", then one for each side that it has. Left
+            and right are the person's.
+    """
+
+    seen: float
+    well: float
+    advice: str
+    parts: dict[str, dict[str, float]]
+
+    @classmethod
+    def of(cls, coverage: Coverage) -> "CoverageNote":
+        """As things stand."""
+        parts = {name: {"seen": part.seen, **part.sides} for name, part in coverage.parts().items()}
+        return cls(seen=coverage.seen, well=coverage.well, advice=advice(coverage), parts=parts)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """All of it. `package` is None if none was written."""
 
@@ -198,13 +224,14 @@ class Report:
     stream: StreamNote
     package: PackageNote | None
     held_out_refined: HeldOutNote | None = None
+    coverage: CoverageNote | None = None
     format: int = FORMAT
 
     def to_json(self) -> str:
         """The text of report.json; what is not a number is null."""
         content = _plain(dataclasses.asdict(self))
         order = ("format", "command", "recipe", "machine", "frames", "training", "held_out")
-        order += ("held_out_refined", "curve", "stream", "package")
+        order += ("held_out_refined", "curve", "stream", "package", "coverage")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 
@@ -220,6 +247,13 @@ def largest_fall(curve: Sequence[CurvePoint]) -> float | None:
             falls.append(best[frame] - value)
         best[frame] = max(best.get(frame, value), value)
     return max(0.0, *falls) if falls else None
+
+
+def percent(share: float) -> str:
+    """A share as people read it; only all of it is 100 %, and only nothing of it 0 %."""
+    if 0.0 < share < 1.0:
+        return f"{min(max(round(100.0 * share), 1), 99)} %"
+    return f"{100.0 * share:.0f} %"
 
 
 def mean(values: list[float]) -> float | None:

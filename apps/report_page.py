@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from apps.curve_svg import curve_svg
-from apps.report import Report, largest_fall
+from apps.report import Report, largest_fall, percent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,7 @@ def report_page(
     report: Report,
     *,
     name: str,
+    body_map: str = "",
     pairs: Sequence[Pair] = (),
     novel: str | None = None,
     warnings: Sequence[str] = (),
@@ -39,6 +40,7 @@ def report_page(
     Args:
         report: The figures.
         name: Of the video, for the heading.
+        body_map: An SVG of what was seen (`BodyMap.svg`).
         pairs: Held-out frames, to look at.
         novel: A moving picture of poses that the video does not show, as an address.
         warnings: What the user was told.
@@ -50,6 +52,7 @@ def report_page(
             f'<p class="lead">{escape(_lead(report))}</p>',
             _tiles(report),
             _section("How it learnt", _curve(report)),
+            _section("What the camera has seen", _coverage(report, body_map)),
             _section("Frames it was never trained on", _pairs(pairs)),
             _section("Poses that the video does not show", _novel(novel)),
             _section("Worth knowing", _warnings(report, warnings)),
@@ -109,6 +112,30 @@ def _curve(report: Report) -> str:
         '<i style="background:var(--whole)"></i>whole picture'
         f'<i style="background:var(--masked)"></i>inside the mask. {told}</p></div>'
     )
+
+
+def _coverage(report: Report, body_map: str) -> str:
+    """The sentence, the map, and every part and side in figures."""
+    note = report.coverage
+    if note is None:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(part)}</td><td>{percent(shares['seen'])}</td><td>{_by_side(shares)}</td></tr>"
+        for part, shares in note.parts.items()
+    )
+    return (
+        f'<div class="card"><p class="advice">{escape(note.advice)}</p>{body_map}'
+        f'<p class="legend">{percent(note.seen)} of the skin seen'
+        '<i style="background:var(--whole)"></i>well'
+        '<i style="background:var(--whole);opacity:0.4"></i>at a slant'
+        '<i style="background:var(--masked)"></i>never. Left and right are the person\'s.</p>'
+        f"<details><summary>Part by part</summary><table>{rows}</table></details></div>"
+    )
+
+
+def _by_side(shares: Mapping[str, float]) -> str:
+    sides = (f"{side} {percent(share)}" for side, share in shares.items() if side != "seen")
+    return ", ".join(sides)
 
 
 def _pairs(pairs: Sequence[Pair]) -> str:

@@ -142,7 +142,7 @@ def _side(looks: Float[np.ndarray, "3"], limb: str, whose: str) -> str:
 def _limb(patches: SkinPatches, piece: Int[np.ndarray, "piece"]) -> tuple[str, str]:
     """The smallest limb that holds most of a piece, and whose it is."""
     areas = np.bincount(patches.parts[piece], weights=patches.areas[piece], minlength=14)
-    held = dict(zip(PART_NAMES, areas.tolist(), strict=True))
+    held: dict[str, float] = dict(zip(PART_NAMES, areas.tolist(), strict=True))
     enough = MOST * float(areas.sum())
     for limb, parts in LEFT_AND_RIGHT.items():
         left, right = (sum(held[f"{whose} {p}"] for p in parts) for whose in ("left", "right"))

@@ -14,6 +14,8 @@ from preprocess.observation import Observation
 
 SEEN_COSINE = 0.3
 """A patch that is turned further from the camera than this (72°) shows nothing of itself."""
+WELL_COSINE = 0.6
+"""From this cosine on (53°) it was seen well."""
 CELL_M, SLACK_M = 0.03, 0.03
 """Of the depth buffer in which the body hides itself."""
 PERSON = 0.5
@@ -100,6 +102,11 @@ class Coverage:
     def seen(self) -> float:
         """Share of the whole surface, in [0, 1]."""
         return _share(self.patches.areas, self.cosines > 0.0)
+
+    @property
+    def well(self) -> float:
+        """The share that was seen within 53° of squarely."""
+        return _share(self.patches.areas, self.cosines >= WELL_COSINE)
 
     def parts(self) -> dict[str, PartSeen]:
         """How much of each part was seen, by its name."""

@@ -17,7 +17,7 @@ from export.player import Player
 
 KEYS = {
     "": "format command recipe machine frames training held_out held_out_refined curve stream "
-    "package",
+    "package coverage",
     "machine": "device backend threads",
     "frames": "read used held_out dropped not_replayed",
     "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
@@ -26,6 +26,7 @@ KEYS = {
     "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
     "lateness_ms inbox_depth",
     "package": "path bytes seconds psnr_to_renderer",
+    "coverage": "seen well advice parts",
 }
 
 FEW = ("--frames", "0:8")
@@ -92,6 +93,29 @@ def test_the_package_is_the_one_that_was_reported(run, report):
         marks[-1]["psnr"] if marks else None, abs=1e-4
     )
     assert kept["recipe"]["rays"] == report["recipe"]["rays"]
+
+
+def test_an_actor_who_turns_twice_is_seen_from_all_sides(report):
+    coverage = report["coverage"]
+    assert coverage["seen"] > 0.95
+    assert coverage["well"] < coverage["seen"]
+    assert coverage["advice"] == "Everything was seen from all sides."
+    assert len(coverage["parts"]) == 14
+    assert coverage["parts"]["torso"]["back"] > 0.95
+
+
+def test_a_clip_of_the_front_alone_asks_for_a_turn(capture, call_ingest, without_baking, tmp_path):
+    out = tmp_path / "run"
+    outcome = call_ingest(capture, "--out", out, "--frames", "0:3")
+    assert "Turn until your back has been seen." in outcome.err
+    first = json.loads((out / "report.json").read_text())["coverage"]
+    assert first["parts"]["torso"]["back"] < 0.2
+    assert "Turn until your back has been seen." in (out / "report.html").read_text()
+    # what another clip shows is added to what this one did
+    call_ingest(capture, "--out", out, "--frames", "8:14", "--resume", seconds=1.0)
+    second = json.loads((out / "report.json").read_text())["coverage"]
+    assert second["parts"]["torso"]["back"] > 0.5
+    assert second["parts"]["torso"]["front"] >= first["parts"]["torso"]["front"]
 
 
 def test_the_page_needs_nothing_else(run):
