@@ -13,7 +13,8 @@ from avatar.levels import FEATURES, HashLevels
 HIDDEN = 64
 FIRST_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
-CHUNK = 1 << 17
+CHUNK = 1 << 13
+"""Points whose features and hidden numbers a cache still holds when they are read."""
 
 
 class Activations(NamedTuple):

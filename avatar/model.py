@@ -9,7 +9,7 @@ from torch import Tensor
 from avatar.field import Field
 from avatar.kernels.backend import Grid
 from avatar.kernels.reference import activate
-from avatar.occupancy import Occupancy, grown, inside
+from avatar.occupancy import Occupancy, inside
 from avatar.rig import Rig
 
 
@@ -30,9 +30,8 @@ class Avatar:
     step_m: float
 
     def rendering_grid(self) -> Grid:
-        """The occupancy grown by one more cell, so that pruning leaves no hole in a picture."""
-        grid = self.occupancy.grid
-        return grid._replace(occupied=grown(grid.occupied))
+        """Where a picture may show anything."""
+        return self.occupancy.for_rendering(self.step_m)
 
     def field_at(
         self, points: Float32[Tensor, "points 3"]

@@ -85,11 +85,25 @@ class Occupancy:
         density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
         flat = self.grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
-        bar = min(OPACITY / step_m, float(flat[self.band].mean()))
-        occupied = grown((self.grid.density > bar).to(torch.uint8)) & self._in_band
+        dense = (self.grid.density > self._bar(step_m)).to(torch.uint8)
+        occupied = grown(dense) & self._in_band
         if drop_specks:
             occupied &= 1 - specks(self.grid.density > FIRM_DENSITY, self._near_skin)
         self.grid.occupied.copy_(occupied)
+
+    def for_rendering(self, step_m: float) -> Grid:
+        """The occupancy grown by one more cell, so that pruning leaves no hole in a picture.
+
+        Of what is grown those cells stay that are next to one half as dense as an occupied one, a
+        step of the paper's 1 % of opacity: a quarter fewer samples, and no farther from the sum
+        over all samples, occupied or not, than with every grown cell.
+        """
+        hazy = (self.grid.density > 0.5 * self._bar(step_m)).to(torch.uint8)
+        return self.grid._replace(occupied=grown(self.grid.occupied) & grown(hazy))
+
+    def _bar(self, step_m: float) -> float:
+        """Density from which a cell is occupied: while all is fog, that which is above the mean."""
+        return min(OPACITY / step_m, float(self.grid.density.view(-1)[self.band].mean()))
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""

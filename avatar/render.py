@@ -1,29 +1,35 @@
-"""Pictures of an avatar by exact volume rendering: nothing is cut short, nothing cached counts."""
+"""Pictures of an avatar by exact volume rendering: what is skipped is empty or not to be seen.
+
+Rays are followed front to back, a few samples at a time, and the field is asked at every lattice
+sample of an occupied cell until next to nothing of the light is left. What ends a ray is the
+field's own density, never a cached one: those lie before the surface and cut it off.
+"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from avatar.cells import WarpCells
 from avatar.field import Field
-from avatar.kernels.backend import CellTables, Marching, Rays, Samples
+from avatar.kernels.backend import CellTables, Grid, Marching, Rays, Samples
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
 from avatar.prepare import BodyRays
+from avatar.skip import pruned, window
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
-RAYS_AT_ONCE = 16384
-MOST_SAMPLES = 512
-AT_ONCE = 6
-"""Samples of a ray that are asked for together."""
-UNSEEN_DEPTH = 14.0
-"""Optical depth behind which less than a millionth of the light comes from."""
+RAYS_AT_ONCE = 1 << 15
+SAMPLES_AT_ONCE = 1 << 15
+FEWEST, MOST = 4, 8
+"""Samples of a ray that are asked for together: more of them, the fewer rays are left."""
+UNSEEN = 5e-6
+"""Share of the light that may be left where a ray ends: no colour is farther off than this."""
 EMPTY_LOG_DENSITY = -30.0
 
 
@@ -38,6 +44,9 @@ def render(
 ) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied RGBA in [0, 1] of the avatar in one pose, seen by one camera.
 
+    It is within `UNSEEN`, and what single precision rounds off, of the sum over all lattice samples
+    in `avatar.rendering_grid()`.
+
     Args:
         avatar: Who.
         pose: In the camera's world.
@@ -46,56 +55,105 @@ def render(
         samples_along: Where samples lie, if not in the avatar's own occupancy
             (`avatar.paper.rendering`).
     """
-    field = avatar.field
-    device = field.table.device
-    tables = cell_tables(cells or WarpCells.of(avatar.rig, pose.joint_rotations), device)
+    cells = cells or WarpCells.of(avatar.rig, pose.joint_rotations)
+    world_from_body = avatar.rig.world_from_body(pose)
     width, height = camera.size_px
-    rays = BodyRays.through(
-        camera.pixel_centers().reshape(-1, 2), camera, avatar.rig.world_from_body(pose)
-    )
-    origin, directions = torch.from_numpy(rays.origin), torch.from_numpy(rays.directions)
     if samples_along is None:
-        grid, how = avatar.rendering_grid(), Marching(avatar.step_m, math.inf, MOST_SAMPLES)
-        samples_along = partial(field.backend.march, grid=grid, how=how)
-    picture = torch.zeros(height * width, 4)
-    for start in range(0, height * width, RAYS_AT_ONCE):
-        chunk = directions[start : start + RAYS_AT_ONCE].to(device)
-        batch = Rays(
-            origin.to(device).expand(len(chunk), 3).contiguous(),
-            chunk,
-            torch.zeros(len(chunk), dtype=torch.int32, device=device),
-            torch.full((len(chunk),), 0.5, device=device),
-        )
-        samples = samples_along(batch, tables)
-        if len(samples.points):
-            raw = _raw_as_far_as_seen(field, samples, avatar.step_m)
-            colors = field.backend.composite(raw, samples, avatar.step_m)
-            picture[start : start + len(chunk)] = colors.cpu()
-    return picture.reshape(height, width, 4).numpy()
+        grid = avatar.rendering_grid()
+        cells = pruned(cells, grid)
+        rows, columns = window(cells, camera, world_from_body)
+        colors_of = partial(traced, avatar.field, grid=grid, step_m=avatar.step_m)
+    else:
+        rows, columns = slice(0, height), slice(0, width)
+        colors_of = partial(_seen, avatar.field, samples_along, step_m=avatar.step_m)
+    tables = cell_tables(cells, avatar.field.table.device)
+    picture = np.zeros((height, width, 4), dtype=np.float32)
+    for part, pixels in _in_parts(picture[rows, columns], rows.start, columns.start):
+        rays = BodyRays.through(pixels, camera, world_from_body)
+        colors = colors_of(_batch(rays, tables.low.device), tables)
+        part[:] = colors.cpu().numpy().reshape(part.shape)
+    return picture
 
 
-def _raw_as_far_as_seen(
-    field: Field, samples: Samples, step_m: float
-) -> Float32[Tensor, "samples 4"]:
-    """Raw outputs of all samples that a millionth of the light reaches; the others stay empty.
+def _in_parts(
+    inside: Float32[np.ndarray, "height width 4"], top: int, left: int
+) -> Iterator[tuple[Float32[np.ndarray, "rows width 4"], Float[np.ndarray, "pixels 2"]]]:
+    """Some rows of a part of the picture after the other, and the centres of their pixels."""
+    x = left + np.arange(inside.shape[1]) + 0.5
+    rows = max(1, RAYS_AT_ONCE // max(len(x), 1))
+    for first in range(0, len(inside), rows):
+        part = inside[first : first + rows]
+        y = top + first + np.arange(len(part)) + 0.5
+        yield part, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
-    The field is asked front to back, a few samples of every ray at a time.
+
+def traced(
+    field: Field, rays: Rays, cells: CellTables, *, grid: Grid, step_m: float
+) -> Float32[Tensor, "rays 4"]:
+    """Premultiplied colour and alpha along rays.
+
+    Args:
+        field: What is seen.
+        rays: Of one body frame or of many.
+        cells: Their warps.
+        grid: Where the field counts.
+        step_m: Distance between samples, metres.
     """
+    colors = torch.zeros(len(rays.slots), 4, device=rays.origins.device)
+    alive = torch.arange(len(colors), device=colors.device)
+    while len(alive):
+        most = min(max(SAMPLES_AT_ONCE // len(alive), FEWEST), MOST)
+        how = Marching(step_m, math.inf, most)
+        samples, jitter = field.backend.march_on(rays, cells, grid, how)
+        nearer = colors[alive]
+        part = field.backend.composite(field.raw_at(samples.points), samples, step_m)
+        nearer = nearer + (1.0 - nearer[:, 3:]) * part
+        colors[alive] = nearer
+        on = ((samples.count == most) & (nearer[:, 3] < 1.0 - UNSEEN)).nonzero()[:, 0]
+        rays = Rays(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
+        alive = alive[on]
+    return colors
+
+
+def _seen(
+    field: Field,
+    samples_along: Callable[[Rays, CellTables], Samples],
+    rays: Rays,
+    cells: CellTables,
+    *,
+    step_m: float,
+) -> Float32[Tensor, "rays 4"]:
+    """Premultiplied colour and alpha along rays whose samples another scheme chooses.
+
+    The field is asked front to back here, too: of what `UNSEEN` hides nothing is known.
+    """
+    samples = samples_along(rays, cells)
     points, first, count, _ = samples
     ray = torch.repeat_interleave(torch.arange(len(count), device=points.device), count)
     rank = torch.arange(len(points), device=points.device) - first[ray]
     raw = points.new_zeros(len(points), 4)
     raw[:, 3] = EMPTY_LOG_DENSITY
     optical = points.new_zeros(len(count))
-    for start in range(0, int(count.max()), AT_ONCE):
-        lit = (rank >= start) & (rank < start + AT_ONCE) & (optical[ray] < UNSEEN_DEPTH)
+    for start in range(0, int(count.max()) if len(count) else 0, MOST):
+        lit = (rank >= start) & (rank < start + MOST) & (optical[ray] < -math.log(UNSEEN))
         seen = lit.nonzero()[:, 0]
-        if len(seen):
-            values = field.raw_at(points[seen])
-            raw[seen] = values
-            density = torch.exp(values[:, 3].clamp(max=MAX_LOG_DENSITY))
-            optical.index_add_(0, ray[seen], density * step_m)
-    return raw
+        values = field.raw_at(points[seen])
+        raw[seen] = values
+        density = torch.exp(values[:, 3].clamp(max=MAX_LOG_DENSITY))
+        optical.index_add_(0, ray[seen], density * step_m)
+    return field.backend.composite(raw, samples, step_m)
+
+
+def _batch(rays: BodyRays, device: torch.device) -> Rays:
+    """Rays of one frame, whose samples lie in the middle of their steps."""
+    directions = torch.from_numpy(rays.directions).to(device)
+    count = len(directions)
+    return Rays(
+        torch.from_numpy(rays.origin).to(device).expand(count, 3).contiguous(),
+        directions,
+        torch.zeros(count, dtype=torch.int32, device=device),
+        torch.full((count,), 0.5, device=device),
+    )
 
 
 def cell_tables(cells: WarpCells, device: torch.device) -> CellTables:

@@ -18,12 +18,14 @@ from avatar.hold import HeldOut, on_white
 from avatar.kernels.backend import CellTables, Grid, Marching, Rays, Samples
 from avatar.metrics import psnr
 from avatar.prepare import BodyRays
-from avatar.render import EMPTY_LOG_DENSITY, MOST_SAMPLES, RAYS_AT_ONCE, cell_tables, render
+from avatar.render import EMPTY_LOG_DENSITY, cell_tables, render
 from avatar.step import cosine
 from benchmarks.marks import Mark
 from benchmarks.stage import Class
 from benchmarks.stopwatch import interleaved
 
+RAYS_AT_ONCE = 1 << 14
+MOST_SAMPLES = 512
 RATE = 1e-6
 """Learning rates' factor: the avatar hardly changes while it is timed."""
 

@@ -44,7 +44,8 @@ class Rays(NamedTuple):
         origins: Metres.
         directions: Unit vectors.
         slots: Which frame's warp cells each ray runs through.
-        jitter: Offset of each ray's sample lattice, in steps, in [0, 1).
+        jitter: Offset of each ray's sample lattice, in steps; 1 and more passes so many samples
+            over.
     """
 
     origins: Float32[Tensor, "rays 3"]
@@ -57,7 +58,8 @@ class CellTables(NamedTuple):
     """Warp cells of many frames, one slot each (`avatar.cells.WarpCells`, padded).
 
     Attributes:
-        index: `first_root * 4 + count` of each cell.
+        index: `first_root * 4 + count` of each cell. Where nothing is near it is 0, or -n to say
+            that all cells less than n away hold nothing either.
         roots: Root and inverse Jacobian.
         low: Corner of each slot's grid, body frame, metres.
         shape: Cells along each axis of each slot's grid.
@@ -180,6 +182,12 @@ class Backend(Protocol):
         """Canonical samples along rays."""
         ...
 
+    def march_on(
+        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
+    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
+        """The same, and the jitter with which each ray goes on that has all its `how.most`."""
+        ...
+
     def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         """Premultiplied colour and alpha of each ray."""
         ...
@@ -258,10 +266,16 @@ class TorchBackend:
         grad_table += grad
 
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
-        points, rows, count = reference.march(
+        return self.march_on(rays, cells, grid, how)[0]
+
+    def march_on(
+        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
+    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
+        points, rows, count, reached = reference.march(
             *rays, how.step_m, *cells, *grid, how.grace_steps, how.most
         )
-        return Samples(points, torch.cumsum(count, 0) - count, count, rows)
+        samples = Samples(points, torch.cumsum(count, 0) - count, count, rows)
+        return samples, rays.jitter + reached
 
     def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         with torch.no_grad():

@@ -64,13 +64,19 @@ class NumbaBackend:
         )
 
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
+        return self.march_on(rays, cells, grid, how)[0]
+
+    def march_on(
+        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
+    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
         padded = np.empty((len(rays.slots), how.most, 3), dtype=np.float32)
         padded_rows = np.empty((len(rays.slots), how.most), dtype=np.int32)
-        count = torch.empty(len(rays.slots), dtype=torch.int32)
+        count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
         cpu_march.march(
             *(part.numpy() for part in rays), np.float32(how.step_m),
             *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
             *(part.numpy() for part in grid), how.grace_steps, padded, padded_rows, count.numpy(),
+            reached.numpy(),
         )  # fmt: skip
         first = torch.cumsum(count, 0) - count
         total = int(count.sum())
@@ -78,7 +84,7 @@ class NumbaBackend:
         cpu_march.pack(
             padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
         )
-        return Samples(points, first, count, rows)
+        return Samples(points, first, count, rows), rays.jitter + reached
 
     def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
         rendered = torch.empty(len(samples.count), 4)

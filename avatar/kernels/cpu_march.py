@@ -15,9 +15,9 @@ def _safe(x):
 
 
 @compile_kernel(inline="always")
-def _exit(position, low, cell, index, direction):
-    """Distance along the ray to the far wall of the cell, on one axis."""
-    wall = low + (F32(index) + (F32(1) if direction > 0 else F32(0))) * cell
+def _exit(position, low, cell, index, direction, wide):
+    """Distance along the ray, on one axis, to the far wall of the cells less than `wide` away."""
+    wall = low + F32(index + (wide if direction > 0 else I32(1) - wide)) * cell
     return abs((wall - position) / _safe(direction))
 
 
@@ -25,14 +25,14 @@ def _exit(position, low, cell, index, direction):
 def march(
     origins, directions, slots, jitter, step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
-    occupied, density, low, cells_per_m, grace_steps, points, rows, counts,
+    occupied, density, low, cells_per_m, grace_steps, points, rows, counts, reached,
 ):  # fmt: skip
     """Canonical sample points along rays of the body frame, and the root each was warped with.
 
     Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
     has a root whose canonical cell is occupied; of several roots the one of highest cached density
     counts. A ray ends `grace_steps` samples after its cached optical depth has passed
-    `OPAQUE_DEPTH`, or when `points` holds no more.
+    `OPAQUE_DEPTH`, or when `points` holds no more; `reached` is where it would go on.
     """
     most = points.shape[1]
     for ray in prange(origins.shape[0]):
@@ -61,10 +61,11 @@ def march(
             j = min(max(I32((py - ly) / cell_m), I32(0)), ny - I32(1))
             k = min(max(I32((pz - lz) / cell_m), I32(0)), nz - I32(1))
             packed = cell_index[slot, (i * ny + j) * nz + k]
-            if packed == 0:
+            if packed <= 0:
+                wide = max(I32(1), -packed)
                 beyond = min(
-                    _exit(px, lx, cell_m, i, dx),
-                    min(_exit(py, ly, cell_m, j, dy), _exit(pz, lz, cell_m, k, dz)),
+                    _exit(px, lx, cell_m, i, dx, wide),
+                    min(_exit(py, ly, cell_m, j, dy, wide), _exit(pz, lz, cell_m, k, dz, wide)),
                 )
                 step += max(I32(1), I32(np.ceil(beyond / step_m)))
                 continue
@@ -103,6 +104,7 @@ def march(
                         break
             step += I32(1)
         counts[ray] = kept
+        reached[ray] = step
 
 
 @compile_kernel(parallel=True, nogil=True)

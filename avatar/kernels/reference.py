@@ -136,7 +136,12 @@ def march(
     cells_per_m: Float32[Tensor, "3"],
     grace_steps: int,
     most: int,
-) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "samples"], Int32[Tensor, "rays"]]:
+) -> tuple[
+    Float32[Tensor, "samples 3"],
+    Int32[Tensor, "samples"],
+    Int32[Tensor, "rays"],
+    Int32[Tensor, "rays"],
+]:
     """Canonical sample points along rays of the body frame, packed ray by ray.
 
     Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
@@ -145,7 +150,8 @@ def march(
     `OPAQUE_DEPTH`, or after `most` samples.
 
     Returns:
-        The points, the root of its frame's cells that each was warped with, samples per ray.
+        The points, the root of its frame's cells that each was warped with, samples per ray, and
+        the step after each ray's last sample.
     """
     slot = slots.long()
     shape = cell_shape[slot]
@@ -161,7 +167,7 @@ def march(
     local = position - cell_low[slot][:, None]
     cell = torch.minimum((local / cell_m).long().clamp(min=0), shape[:, None] - 1)
     flat = (cell[..., 0] * shape[:, None, 1] + cell[..., 1]) * shape[:, None, 2] + cell[..., 2]
-    packed = torch.where(inside, cell_index[slot[:, None], flat], 0)
+    packed = torch.where(inside, cell_index[slot[:, None], flat], 0).clamp(min=0)
     offset = local - (cell + 0.5) * cell_m
 
     best = torch.full_like(t, -1.0)
@@ -184,7 +190,8 @@ def march(
     counted = (opaque & kept).int()
     kept &= torch.cumsum(counted, dim=1) - counted <= grace_steps
     kept &= torch.cumsum(kept.int(), dim=1) <= most
-    return points[kept], rows[kept].int(), kept.sum(dim=1).int()
+    after = torch.arange(1, steps + 1, device=slot.device) * kept
+    return points[kept], rows[kept].int(), kept.sum(dim=1).int(), after.amax(dim=1).int()
 
 
 def _look_up(

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import distance_transform_cdt
 
 from avatar.cells import WarpCells
 from avatar.kernels import reference
@@ -187,6 +188,43 @@ def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
     a, b = (samples.points[agree.repeat_interleave(samples.count)] for samples in (ours, theirs))
     off = (a - b).norm(dim=1)
     assert float((off < 1e-3).float().mean()) > 0.995
+
+
+@BACKENDS
+def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
+    """Seven samples at a time are, one after the other, those of the whole ray."""
+    rays, cells, grid = scene
+    whole = backend.march(rays, cells, grid, Marching(0.01, math.inf, 512))
+    parts = [[] for _ in rays.slots]
+    alive = torch.arange(len(rays.slots))
+    while len(alive):
+        some, jitter = backend.march_on(rays, cells, grid, Marching(0.01, math.inf, 7))
+        for ray, points in zip(alive, some.points.split(some.count.tolist()), strict=True):
+            parts[ray].append(points)
+        on = some.count == 7
+        alive = alive[on]
+        rays = Rays(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
+    assert max(map(len, parts)) > 5
+    # the offset of the lattice is rounded once more with every part
+    torch.testing.assert_close(
+        torch.cat([torch.cat(part) for part in parts]), whole.points, atol=1e-5, rtol=0
+    )
+
+
+@BACKENDS
+def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, backend):
+    rays, cells, grid = scene
+    shape = tuple(cells.shape[0].tolist())
+    index = cells.index.numpy().reshape(shape)
+    away = distance_transform_cdt(index == 0, metric="chessboard")
+    told = cells._replace(
+        index=torch.from_numpy(np.where(index == 0, -away, index).astype(np.int32).reshape(1, -1))
+    )
+    assert int(told.index.min()) < -3
+    how = Marching(0.01, math.inf, 512)
+    ours, plain = backend.march(rays, told, grid, how), backend.march(rays, cells, grid, how)
+    assert torch.equal(ours.points, plain.points)
+    assert torch.equal(ours.count, plain.count)
 
 
 @BACKENDS

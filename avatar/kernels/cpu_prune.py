@@ -1,0 +1,54 @@
+"""Which of a frame's warp cells lead to anything occupied, compiled for the CPU."""
+
+import numpy as np
+
+from avatar.kernels.jit import FAST, compile_kernel
+
+F32, I32 = np.float32, np.int32
+MARGIN = 1.001
+"""A cell is taken to be this much larger than it is: a sample on its wall counts, too."""
+
+
+@compile_kernel(inline="always")
+def _span(root, across, low, per_m, cells):
+    """First and last canonical cell, on one axis, that a warp cell reaches."""
+    first = I32(np.floor((root - across - low) * per_m))
+    last = I32(np.floor((root + across - low) * per_m))
+    return max(first, I32(0)), min(last, I32(cells - 1))
+
+
+@compile_kernel(inline="always")
+def _any(occupied, a0, a1, b0, b1, c0, c1):
+    for a in range(a0, a1 + 1):
+        for b in range(b0, b1 + 1):
+            for c in range(c0, c1 + 1):
+                if occupied[a, b, c] != 0:
+                    return True
+    return False
+
+
+@compile_kernel(**FAST)
+def prune(index, roots, cell_m, occupied, low, cells_per_m, pruned):
+    """The index without those cells of which no sample can lie in an occupied canonical cell.
+
+    A cell's warp is affine, so the box about its image holds every sample in it: none is lost.
+    """
+    half = F32(0.5 * MARGIN) * cell_m
+    nx, ny, nz = occupied.shape
+    for cell in range(index.shape[0]):
+        packed = index[cell]
+        pruned[cell] = 0
+        for row in range(packed >> 2, (packed >> 2) + (packed & 3)):
+            r = roots[row]
+            a0, a1 = _span(
+                r[0], half * (abs(r[3]) + abs(r[4]) + abs(r[5])), low[0], cells_per_m[0], nx
+            )
+            b0, b1 = _span(
+                r[1], half * (abs(r[6]) + abs(r[7]) + abs(r[8])), low[1], cells_per_m[1], ny
+            )
+            c0, c1 = _span(
+                r[2], half * (abs(r[9]) + abs(r[10]) + abs(r[11])), low[2], cells_per_m[2], nz
+            )
+            if _any(occupied, a0, a1, b0, b1, c0, c1):
+                pruned[cell] = packed
+                break
