@@ -8,7 +8,7 @@ cell. Decay, threshold and passes are those of the released code.
 from typing import final
 
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
 from avatar.kernels.backend import CellTables, PosedGrid
@@ -34,13 +34,22 @@ def occupied_by(density: Float32[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
 
 
 def jittered(
-    low: Float32[Tensor, "3"], cell_m: Float32[Tensor, "3"], generator: torch.Generator
+    cells: Int64[Tensor, "cells 3"],
+    low: Float32[Tensor, "3"],
+    cell_m: Float32[Tensor, "3"],
+    generator: torch.Generator,
 ) -> Float32[Tensor, "cells 3"]:
-    """A random point in each cell of a grid, metres."""
-    axis = torch.arange(SIDE, device=low.device)
-    corner = torch.cartesian_prod(axis, axis, axis)
-    within = torch.rand(len(corner), 3, generator=generator, device=generator.device)
-    return low + (corner + within.to(low.device)) * cell_m
+    """A random point in each of some cells of a grid, metres."""
+    within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
+    return low + (cells + within.to(low.device)) * cell_m
+
+
+def cells_between(
+    first: tuple[int, int, int], last: tuple[int, int, int], device: torch.device
+) -> Int64[Tensor, "cells 3"]:
+    """The cells of a block, its last ones not included."""
+    axes = [torch.arange(*ends, device=device) for ends in zip(first, last, strict=True)]
+    return torch.cartesian_prod(*axes)
 
 
 @final
@@ -124,11 +133,14 @@ class UnionGrid:
 
     def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
         """Takes in what one frame holds. Outside the person's box it holds nothing."""
-        cell_m = torch.full_like(self._low, self._cell_m)
-        points = jittered(self._low, cell_m, generator)
-        high = cells.low[slot] + cells.shape[slot] * cells.cell_m
-        near = ((points >= cells.low[slot]) & (points < high)).all(dim=1).nonzero()[:, 0]
-        probed = self._field.probe(points[near], slot, cells)
+        low = cells.low[slot] - self._low
+        high = low + cells.shape[slot] * cells.cell_m
+        first = (low / self._cell_m).floor().long().clamp(0, SIDE).tolist()
+        last = (high / self._cell_m).ceil().long().clamp(0, SIDE).tolist()
+        block = cells_between(tuple(first), tuple(last), low.device)
+        cell_m = torch.full_like(low, self._cell_m)
+        probed = self._field.probe(jittered(block, self._low, cell_m, generator), slot, cells)
+        near = (block[:, 0] * SIDE + block[:, 1]) * SIDE + block[:, 2]
         flat = self.density.view(-1)
         flat *= DECAY
         flat[near] = torch.maximum(flat[near], probed.density)
@@ -190,7 +202,8 @@ class FrameGrids:
 
     def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
         """Raises one slot's densities to what a random point of each cell holds."""
-        points = jittered(self._low[slot], self._cell_m[slot], generator)
+        block = cells_between((0, 0, 0), (SIDE, SIDE, SIDE), self._low.device)
+        points = jittered(block, self._low[slot], self._cell_m[slot], generator)
         probed = self._field.probe(points, slot, cells)
         flat = self.density[slot].view(-1)
         torch.maximum(flat, probed.density, out=flat)

@@ -60,7 +60,7 @@ class PosedSampler:
 class GloballySparse:
     """Another sampler, but emptiness is asked for everywhere: the paper's Global Sparsity.
 
-    The prior that the paper's Fig. 6 compares with: it biases the density of every point towards
+    The prior that the paper's Fig. 5 compares with: it biases the density of every point towards
     zero, the person's own included.
     """
 

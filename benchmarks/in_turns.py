@@ -1,0 +1,146 @@
+"""Variants of the recipe, trained in turns in one process, so that all meet the same machine."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from avatar.events import Score
+from avatar.hold import HeldOut, score
+from avatar.prepare import PreparedFrame
+from avatar.rig import Rig
+from avatar.step import cosine
+from avatar.trainer import Trainer
+from avatar.warm import warm_up
+from benchmarks.stage import recipe
+from benchmarks.stopwatch import use_threads
+
+LATE = 0.8
+"""Share of the budget after which steps count as late ones."""
+SLICE_S = 0.5
+"""Core time after which it is the next one's turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """A row: what it is called, and what of the recipe it changes."""
+
+    name: str
+    changes: Mapping[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How long each trains: so many seconds of one core, or so many steps."""
+
+    seconds: float = 0.0
+    steps: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """Means over pictures: dB on white, dB in the mask, SSIM."""
+
+    psnr: float
+    psnr_mask: float
+    ssim: float
+
+    @classmethod
+    def of(cls, scores: Sequence[Score]) -> "Quality":
+        return cls(
+            psnr=float(np.mean([s.psnr for s in scores])),
+            psnr_mask=float(np.mean([s.psnr_mask for s in scores])),
+            ssim=float(np.mean([s.ssim for s in scores])),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a variant.
+
+    Attributes:
+        name: Of the variant.
+        steps: Done.
+        step_ms: Core milliseconds each, all that a step brings with it included.
+        late_ms: The same over the last fifth.
+        samples: Of a ray, mean over all steps.
+        held: Frames of the video that were not learnt.
+        novel: Poses that were never filmed.
+    """
+
+    name: str
+    steps: int
+    step_ms: float
+    late_ms: float
+    samples: float
+    held: Quality
+    novel: Quality
+
+
+@dataclass(kw_only=True)
+class Run:
+    """A variant under way."""
+
+    variant: Variant
+    trainer: Trainer
+    spent_s: float = 0.0
+    late_s: float = 0.0
+    late_steps: int = 0
+
+    def progress(self, budget: Budget) -> float:
+        """Share of the budget that is used up."""
+        if budget.steps:
+            return self.trainer.steps / budget.steps
+        return self.spent_s / budget.seconds
+
+    def go_on(self, budget: Budget) -> None:
+        """One turn."""
+        began = now = time.process_time()
+        while now - began < SLICE_S and (done := self.progress(budget)) < 1.0:
+            self.trainer.step(rate=cosine(done), hard_share=min(1.0, 4.0 * done))
+            before, now = now, time.process_time()
+            self.spent_s += now - before
+            if done >= LATE:
+                self.late_s += now - before
+                self.late_steps += 1
+
+
+def trained(
+    variants: Sequence[Variant],
+    budget: Budget,
+    recording: Any,
+    rig: Rig,
+    frames: Sequence[PreparedFrame],
+    device: torch.device,
+) -> list[Run]:
+    """Every variant after its budget, with one thread."""
+    use_threads(1)
+    runs = []
+    for variant in variants:
+        seconds = budget.seconds or 60.0
+        trainer = Trainer(rig, recipe(recording, seconds, **variant.changes), device)
+        for frame in frames:
+            trainer.add(frame)
+        warm_up(trainer)
+        runs.append(Run(variant=variant, trainer=trainer))
+    while under_way := [run for run in runs if run.progress(budget) < 1.0]:
+        for run in under_way:
+            run.go_on(budget)
+    return runs
+
+
+def outcome(run: Run, held: Sequence[HeldOut], novel: Sequence[HeldOut]) -> Outcome:
+    """Scores of the exact renderer, the same for every row."""
+    trainer = run.trainer
+    return Outcome(
+        name=run.variant.name,
+        steps=trainer.steps,
+        step_ms=1000.0 * run.spent_s / trainer.steps,
+        late_ms=1000.0 * run.late_s / max(run.late_steps, 1),
+        samples=trainer.samples / trainer.rays,
+        held=Quality.of([score(trainer.avatar, frame) for frame in held]),
+        novel=Quality.of([score(trainer.avatar, frame) for frame in novel]),
+    )
