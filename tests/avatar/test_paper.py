@@ -349,6 +349,19 @@ def test_every_variant_learns(rig, clip, choices):
     assert np.mean(color[-5:]) < 0.5 * np.mean(color[:5])
 
 
+@pytest.mark.parametrize("choices", VARIANTS.values(), ids=VARIANTS.keys())
+def test_every_variant_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
+    """The reference path, on any device that torch knows."""
+    samples, losses = [], []
+    for backend in ("numba", "torch"):
+        monkeypatch.setenv("IA_BACKEND", backend)
+        result = trainer_of(rig, clip, rays=60, **choices).step(rate=1.0, hard_share=0.0)
+        samples.append(result.samples)
+        losses.append(result.loss)
+    assert samples[0] == pytest.approx(samples[1], rel=0.03)
+    assert float((losses[0] - losses[1]).abs().median()) < 1e-4
+
+
 @pytest.mark.parametrize("skipping", ["union", "frame", "none"])
 def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping):
     """The wrenches of a learnt avatar's samples; those that ours leaves out carry no light."""
