@@ -70,7 +70,7 @@ def export(given: ExportArguments, console: Console) -> int:
     if not run.has_checkpoint():
         raise BadInput(
             f"There is no checkpoint in {run.checkpoint}; a folder that ia-ingest wrote was "
-            "expected. It writes the first one about ten seconds after the first frame."
+            "expected. It writes the first one five seconds after the first frame."
         )
     if given.out.suffix != ".iavatar":
         raise BadInput(f"--out is {given.out}; a name that ends in .iavatar was expected.")

@@ -28,7 +28,7 @@ from capture.inbox import Inbox
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
 
-CHECKPOINT_EVERY_S = 10.0
+CHECKPOINT_EVERY_S = 5.0
 LATE_S = 0.5
 """A playback that lags more than this is spoken of."""
 

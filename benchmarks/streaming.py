@@ -1,0 +1,73 @@
+"""A video played at its own speed: what is learnt when it ends, and how soon it is ready.
+
+    python -m benchmarks.streaming [--quick] [--kills 20] [--json FILE] [--keep DIR]
+
+Films the sample turning twice in 20 s, plays it into ia-ingest as a user would, and looks at it
+from outside; then again from inside, for what no report says. There are no thresholds here.
+"""
+
+import itertools
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from benchmarks.hardware import Hardware
+from benchmarks.kills import kill_marks
+from benchmarks.looped import growth_marks
+from benchmarks.marks import Mark, table
+from benchmarks.onlooker import onlooker_marks
+from benchmarks.played import played_marks
+from benchmarks.stage import filmed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Streaming:
+    """Measures streaming and prints one table."""
+
+    size: int = 270
+    """Width and height of the pictures."""
+    frames: int = 600
+    """Frames of the video, at 30 a second."""
+    kills: int = 20
+    """How often a run is killed."""
+    quick: bool = False
+    """Neither kills nor memory."""
+    json: Path | None = None
+    """File for the figures."""
+    keep: Path | None = None
+    """Folder for what is filmed; what lies there is used again."""
+
+
+def main() -> None:
+    """The benchmark."""
+    job = tyro.cli(Streaming, prog="python -m benchmarks.streaming", description=__doc__)
+    hardware = Hardware.here()
+    with tempfile.TemporaryDirectory() as temporary:
+        marks = list(measured(job, job.keep or Path(temporary), Path(temporary)))
+    print("\n".join([*hardware.lines(), "", *table(marks)]))
+    if job.json is not None:
+        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
+        job.json.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def measured(job: Streaming, folder: Path, scratch: Path) -> Iterator[Mark]:
+    """All rows; each is also told on standard error as soon as it is known."""
+    capture = filmed(folder / f"turning{job.size}", job.size, frames=job.frames, turns=2.0)
+    groups = [played_marks(capture, scratch / "played"), onlooker_marks(capture)]
+    if not job.quick:
+        groups.append(growth_marks(capture, folder / f"looped{job.size}"))
+    if not job.quick and job.kills:
+        small = filmed(folder / "small", 96, frames=60, turns=1.0)
+        groups.append(kill_marks(small, scratch / "killed", kills=job.kills))
+    for mark in itertools.chain.from_iterable(groups):
+        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        yield mark
+
+
+if __name__ == "__main__":
+    main()
