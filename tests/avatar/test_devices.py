@@ -1,0 +1,97 @@
+"""The whole program asks nothing of its device but what torch offers on any."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avatar import checkpoint
+from avatar.config import TrainConfig
+from avatar.events import Evaluated, Finished
+from avatar.fit import fitted_scores
+from avatar.hold import HeldOut, prepared, score
+from avatar.train import train
+from avatar.trainer import REFINED_AFTER_STEPS, Trainer
+from capture.inbox import Inbox
+
+sys.path.insert(0, str(Path(__file__).parent))
+from elsewhere import ELSEWHERE, DeviceMixUp, Elsewhere, elsewhere
+
+CONFIG = TrainConfig(
+    rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_points=16,
+    key_frames=3, most_samples=64, occupancy_every=4,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def device():
+    with elsewhere() as place:
+        yield place
+
+
+def test_a_mix_up_of_devices_shows(device):
+    """Of the stand-in itself: it refuses what a GPU refuses."""
+    there = torch.rand(3, device=device, generator=torch.Generator(device=device))
+    with pytest.raises(DeviceMixUp):
+        there + torch.ones(3)
+    with pytest.raises(DeviceMixUp):
+        there.numpy()
+    with pytest.raises(DeviceMixUp):
+        torch.rand(3, device=device, generator=torch.Generator())
+    assert isinstance(there + 1.0, Elsewhere)
+    assert np.isfinite((there + 1.0).cpu().numpy()).all()
+
+
+@pytest.fixture(scope="module")
+def trainer(device, rig, clip):
+    """Trained until poses are refined and the occupancy has been updated."""
+    trainer = Trainer(rig, CONFIG, device)
+    for item in prepared(iter(clip.observations[:4]), rig, every=0, total=None):
+        trainer.add(item)
+    trainer.steps = REFINED_AFTER_STEPS - 3
+    for _ in range(12):
+        trainer.step(rate=1.0, hard_share=1.0)
+    return trainer
+
+
+def held_out(clip, rig) -> list[HeldOut]:
+    return [next(prepared(iter([clip.novel]), rig, every=1, total=None))]
+
+
+def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig):
+    assert trainer.backend.name == "torch"
+    assert all(parameter.device == ELSEWHERE for parameter in trainer.avatar.field.parameters())
+    assert trainer.corrections  # poses were refined, too
+    held = held_out(clip, rig)
+    assert np.isfinite(score(trainer.avatar, held[0]).psnr)
+    trainer.config = replace(trainer.config, rays=32)
+    assert np.isfinite(fitted_scores(trainer, held)[0].psnr)
+
+
+def test_a_checkpoint_goes_from_one_device_to_another(trainer, tmp_path):
+    checkpoint.save(trainer, tmp_path)
+    for device in (ELSEWHERE, torch.device("cpu")):
+        loaded, _ = checkpoint.load(tmp_path, device)
+        tables = [one.avatar.field.table.detach().cpu() for one in (trainer, loaded)]
+        assert torch.equal(*tables)
+        assert loaded.avatar.field.table.device == device
+        moments = [state["exp_avg"] for state in loaded.optimizer.state.values()]
+        assert {moment.device for moment in moments} == {device}
+
+
+def test_the_stream_of_training_runs_on_a_device(device, clip, rig):
+    trainer = Trainer(rig, replace(CONFIG, seconds=2.1, refine_poses=False), device)
+    held: list[HeldOut] = []
+    frames = prepared(iter(clip.observations[:6]), rig, every=3, total=None)
+    events = list(train(trainer, Inbox(frames), held))
+    assert isinstance(events[-1], Finished)
+    assert any(isinstance(event, Evaluated) for event in events)
+
+
+def test_a_field_is_read_out_on_its_device(trainer):
+    points = torch.from_numpy(trainer.avatar.rig.seeds[:50]).to(ELSEWHERE)
+    color, density = trainer.avatar.field_at(points)
+    assert color.device == density.device == ELSEWHERE
