@@ -1,4 +1,10 @@
-"""Which backend a device gets: the fastest that it has and that is right on this machine."""
+"""Which backend a device gets: the fastest that it has and that is right on this machine.
+
+The CPU has compiled twins of every operation (`avatar.kernels.cpu`). A GPU has none yet: the
+reference runs there, in plain torch. Kernels of our own for it would be a class beside
+`NumbaBackend` that keeps to the same protocol; `backend_for` is where it would be chosen, after
+the same self-test.
+"""
 
 import functools
 import os
@@ -8,22 +14,29 @@ import torch
 
 from avatar.kernels.backend import Backend, TorchBackend
 from avatar.kernels.selftest import strays
+from capture.errors import BadInput
 
 
 def backend_for(device: torch.device) -> Backend:
     """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
 
     Raises:
-        ValueError: If the forced backend is unknown or cannot run on the device.
+        BadInput: If the forced backend is unknown or cannot run on the device.
     """
     forced = os.environ.get("IA_BACKEND", "")
     if forced not in ("", "torch", "numba"):
-        raise ValueError(f"IA_BACKEND is '{forced}'; it may be 'torch' or 'numba'.")
+        raise BadInput(
+            f"The variable IA_BACKEND is {forced!r}; expected 'torch' or 'numba', or leave it out."
+        )
     if forced == "numba" and device.type != "cpu":
-        raise ValueError(f"IA_BACKEND=numba runs on the CPU only, not on {device}.")
-    if forced == "torch" or device.type != "cpu":
-        return TorchBackend()
-    return _numba() if _numba_is_sound() else TorchBackend()
+        raise BadInput(
+            f"IA_BACKEND=numba was asked for, but it runs on the CPU only, not on {device}. "
+            "Leave it out, or give --device cpu."
+        )
+    if device.type == "cpu" and forced != "torch" and _numba_is_sound():
+        return _numba()
+    # a CudaBackend's seat: device.type == "cuda", and `strays` finds nothing on it
+    return TorchBackend()
 
 
 def _numba() -> Backend:

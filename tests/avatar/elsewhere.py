@@ -22,7 +22,7 @@ COPIES = (torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default)
 LOOKUPS = ("aten::index", "aten::index_put_", "aten::_index_put_impl_", "aten::index_put")
 
 
-class DeviceMixUp(RuntimeError):
+class DeviceMixUpError(RuntimeError):
     """What would have raised on a GPU."""
 
 
@@ -79,15 +79,17 @@ def _refuse_mixtures(func, args, kwargs) -> None:
     """As torch does: numbers may come from the CPU, and so may indices; all else must not meet."""
     if func in COPIES:
         return
-    leaves = tree_leaves((args[:1] if func._schema.name in LOOKUPS else args, kwargs))
-    tensors = [leaf for leaf in leaves if isinstance(leaf, torch.Tensor)]
-    away = any(isinstance(tensor, Elsewhere) for tensor in tensors)
-    device = kwargs.get("device")
-    if device is not None:
-        away = away or torch.device(device) == ELSEWHERE
-    for leaf in leaves:
-        if isinstance(leaf, torch.Tensor) and away and not isinstance(leaf, Elsewhere) and leaf.dim():
-            raise DeviceMixUp(f"{func} meets a CPU tensor of shape {tuple(leaf.shape)} elsewhere")
+    tensors = [
+        leaf
+        for leaf in tree_leaves((args[:1] if func._schema.name in LOOKUPS else args, kwargs))
+        if isinstance(leaf, torch.Tensor)
+    ]
+    places = {tensor.device for tensor in tensors if tensor.dim()}
+    if kwargs.get("device") is not None:
+        places.add(torch.device(kwargs["device"]))
+    if len(places) > 1:
+        shapes = [tuple(tensor.shape) for tensor in tensors if tensor.device != ELSEWHERE]
+        raise DeviceMixUpError(f"{func} meets CPU tensors of shapes {shapes} elsewhere")
 
 
 class Generator(torch.Generator):
@@ -115,14 +117,20 @@ class _Functions(TorchFunctionMode):
         kwargs = kwargs or {}
         if func is torch.tensor and torch.device(kwargs.get("device") or "cpu") == ELSEWHERE:
             return func(*args, **{**kwargs, "device": "cpu"}).to(ELSEWHERE)
+        if func is torch.Tensor.new_tensor and isinstance(args[0], Elsewhere):
+            return torch.tensor(args[1], dtype=args[0].dtype).to(ELSEWHERE)
         generator = kwargs.get("generator")
         if generator is not None:
             tensors = [leaf for leaf in tree_leaves(args) if isinstance(leaf, torch.Tensor)]
             place = tensors[0].device if tensors else torch.device(kwargs.get("device") or "cpu")
             if place != generator.device:
-                raise DeviceMixUp(f"{func} draws on {place} from a generator of {generator.device}")
+                raise DeviceMixUpError(
+                    f"{func} draws on {place} from a generator of {generator.device}"
+                )
         if func is torch.Tensor.numpy and isinstance(args[0], Elsewhere):
-            raise DeviceMixUp("numpy looks into a tensor that lies elsewhere")
+            raise DeviceMixUpError("numpy looks into a tensor that lies elsewhere")
+        if func is torch.Tensor.__getitem__ and isinstance(args[1], list):
+            return func(args[0], torch.tensor(args[1]))
         if func is torch.Tensor.tolist and isinstance(args[0], Elsewhere):
             return args[0].here.tolist()
         return func(*args, **kwargs)

@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from avatar import checkpoint
+from avatar import checkpoint, fit
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished
-from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
 from avatar.train import train
 from avatar.trainer import REFINED_AFTER_STEPS, Trainer
 from capture.inbox import Inbox
 
 sys.path.insert(0, str(Path(__file__).parent))
-from elsewhere import ELSEWHERE, DeviceMixUp, Elsewhere, elsewhere
+from elsewhere import ELSEWHERE, DeviceMixUpError, Elsewhere, elsewhere
 
 CONFIG = TrainConfig(
     rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_points=16,
@@ -35,11 +34,11 @@ def device():
 def test_a_mix_up_of_devices_shows(device):
     """Of the stand-in itself: it refuses what a GPU refuses."""
     there = torch.rand(3, device=device, generator=torch.Generator(device=device))
-    with pytest.raises(DeviceMixUp):
+    with pytest.raises(DeviceMixUpError):
         there + torch.ones(3)
-    with pytest.raises(DeviceMixUp):
+    with pytest.raises(DeviceMixUpError):
         there.numpy()
-    with pytest.raises(DeviceMixUp):
+    with pytest.raises(DeviceMixUpError):
         torch.rand(3, device=device, generator=torch.Generator())
     assert isinstance(there + 1.0, Elsewhere)
     assert np.isfinite((there + 1.0).cpu().numpy()).all()
@@ -61,14 +60,32 @@ def held_out(clip, rig) -> list[HeldOut]:
     return [next(prepared(iter([clip.novel]), rig, every=1, total=None))]
 
 
-def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig):
+def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig, monkeypatch):
     assert trainer.backend.name == "torch"
     assert all(parameter.device == ELSEWHERE for parameter in trainer.avatar.field.parameters())
     assert trainer.corrections  # poses were refined, too
     held = held_out(clip, rig)
     assert np.isfinite(score(trainer.avatar, held[0]).psnr)
-    trainer.config = replace(trainer.config, rays=32)
-    assert np.isfinite(fitted_scores(trainer, held)[0].psnr)
+    monkeypatch.setattr(fit, "CORRECTIONS", 4)
+    assert np.isfinite(fit.fitted_scores(trainer, held)[0].psnr)
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        {"skipping": "union"}, {"skipping": "frame", "roots": "broyden"},
+        {"skipping": "none", "empty_term": "global"},
+    ],
+    ids=["union", "frame", "none"],
+)  # fmt: skip
+def test_the_papers_schemes_stay_on_their_device(device, scheme, rig, clip):
+    config = replace(CONFIG, rays=8, refine_poses=False, **scheme)
+    trainer = Trainer(rig, config, device)
+    trainer.add(next(prepared(iter(clip.observations[:1]), rig, every=0, total=None)))
+    for _ in range(2):
+        result = trainer.step(rate=1.0, hard_share=1.0)
+    assert result.loss.device == ELSEWHERE
+    assert torch.isfinite(trainer.avatar.field.table.cpu()).all()
 
 
 def test_a_checkpoint_goes_from_one_device_to_another(trainer, tmp_path):

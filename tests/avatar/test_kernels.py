@@ -15,6 +15,7 @@ from avatar.kernels.cpu import NumbaBackend
 from avatar.levels import FEATURES
 from avatar.occupancy import Occupancy
 from avatar.render import cell_tables
+from capture.errors import BadInput
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
 BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
@@ -272,5 +273,8 @@ def test_the_backend_can_be_forced(monkeypatch):
     monkeypatch.setenv("IA_BACKEND", "torch")
     assert backend_for(cpu).name == "torch"
     monkeypatch.setenv("IA_BACKEND", "abacus")
-    with pytest.raises(ValueError, match="abacus"):
+    with pytest.raises(BadInput, match="abacus"):
         backend_for(cpu)
+    monkeypatch.setenv("IA_BACKEND", "numba")
+    with pytest.raises(BadInput, match="on the CPU only"):
+        backend_for(torch.device("cuda"))
