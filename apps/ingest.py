@@ -16,11 +16,8 @@ from apps.interrupt import asked_to_stop
 from apps.recording import Recording
 from apps.run_folder import RunFolder
 from apps.whole import write_text
-from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    import torch
-
     from apps.deliver import Delivered
     from apps.learn import Learnt
     from avatar.trainer import Trainer
@@ -50,6 +47,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
         console.warn(note)
     with console.waiting("loading torch"):
         from apps.deliver import RunNote, deliver
+        from apps.device import device_for
         from apps.learn import Lesson
         from apps.snapshot import snapshot, views_of
         from apps.threads import use_threads
@@ -57,7 +55,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
 
         threads = use_threads(given.threads)
     with console.waiting("compiling kernels (slow on the first run only)"):
-        backend_for(_device(given.device))  # a bad --device is said here, too
+        backend_for(device_for(given.device))  # a bad --device is said here, too
     trainer, recall, notes = _trainer(given, recording, run, console)
     _warm_up(trainer, console)
     run.begin(resume=given.resume)
@@ -92,26 +90,15 @@ def _described(recording: Recording) -> str:
     )
 
 
-def _device(wish: str) -> "torch.device":
-    import torch
-
-    if wish == "cuda" and not torch.cuda.is_available():
-        raise BadInput(
-            "--device cuda was asked for, but torch sees no GPU here. Leave --device out, or "
-            "install torch with CUDA and check nvidia-smi."
-        )
-    wanted = wish != "cpu" and torch.cuda.is_available()
-    return torch.device("cuda" if wanted else "cpu")
-
-
 def _trainer(
     given: IngestArguments, recording: Recording, run: RunFolder, console: Console
 ) -> "tuple[Trainer, int, dict[str, Any]]":
     """The trainer, how many frames it has seen of this video, and what checkpoints keep."""
+    from apps.device import device_for
     from apps.learn import new_trainer
     from avatar import checkpoint
 
-    device, video = _device(given.device), str(recording.source.path.resolve())
+    device, video = device_for(given.device), str(recording.source.path.resolve())
     seconds = given.training_seconds(recording)
     if given.resume and not run.has_checkpoint():
         console.say(f"There is no checkpoint in {run.path}: starting afresh.")

@@ -13,10 +13,13 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
 
+from apps.device import device_for
+from apps.exit_codes import exit_code
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.hardware import Hardware
@@ -41,7 +44,7 @@ class Training:
 
     quick: bool = False
     """Only single operations: neither quality nor start-up nor memory."""
-    device: str = "cpu"
+    device: Literal["cpu", "cuda"] = "cpu"
     """Where to train."""
     json: Path | None = None
     """File for the figures."""
@@ -49,9 +52,14 @@ class Training:
     """Folder for what is filmed; what lies there is used again."""
 
 
-def main() -> None:
-    """The benchmark."""
+def main() -> int:
+    """The benchmark; returns its exit code."""
     job = tyro.cli(Training, prog="python -m benchmarks.training", description=__doc__)
+    return exit_code("benchmarks.training", lambda: measure(job))
+
+
+def measure(job: Training) -> int:
+    """Measures and prints."""
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
         marks = list(measured(job, job.keep or Path(temporary)))
@@ -59,11 +67,12 @@ def main() -> None:
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
         job.json.write_text(json.dumps(content, indent=1) + "\n")
+    return 0
 
 
 def measured(job: Training, folder: Path) -> Iterator[Mark]:
     """All rows; each is also told on standard error as soon as it is known."""
-    device = torch.device(job.device)
+    device = device_for(job.device)
     small = filmed(folder / f"sample{SIZE_PX}", SIZE_PX)
     groups = [operation_marks(small, device)]
     if not job.quick:
@@ -104,4 +113,4 @@ def large_marks(folder: Path, device: torch.device) -> Iterator[Mark]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
