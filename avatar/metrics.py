@@ -25,6 +25,14 @@ def psnr(
     return float("inf") if mean == 0.0 else -10.0 * float(np.log10(mean))
 
 
+def overlap(
+    shown: Bool[np.ndarray, "height width"], truth: Bool[np.ndarray, "height width"]
+) -> float:
+    """Intersection over union of two silhouettes, in [0, 1]; 1 if there is none in either."""
+    union = int((shown | truth).sum())
+    return int((shown & truth).sum()) / union if union else 1.0
+
+
 def ssim(
     image: Float[np.ndarray, "height width 3"], truth: Float[np.ndarray, "height width 3"]
 ) -> float:
