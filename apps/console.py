@@ -12,6 +12,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 MOST_WARNINGS = 5
 """Warnings that are printed; the rest are counted, and all stand in the report."""
+MOST_KEPT = 500
+"""Warnings that are kept, so that memory stays bounded however long a video lasts."""
 LOG_EVERY_S = 10.0
 
 
@@ -20,13 +22,14 @@ class Console:
     """Messages on stderr, so that stdout stays free for what was made.
 
     Attributes:
-        warnings: Every warning so far.
+        warnings: Every warning so far; of very many the first `MOST_KEPT`.
     """
 
     def __init__(self, console: RichConsole | None = None) -> None:
         """A console on stderr, unless another is given."""
         self._rich = console or RichConsole(stderr=True, soft_wrap=True)
         self.warnings: list[str] = []
+        self._beyond = 0
 
     @property
     def live(self) -> bool:
@@ -45,6 +48,9 @@ class Console:
         """Something the user should know; the same is never said twice."""
         if message in self.warnings:
             return
+        if len(self.warnings) == MOST_KEPT:
+            self._beyond += 1
+            return
         self.warnings.append(message)
         if len(self.warnings) <= MOST_WARNINGS:
             self._rich.print(f"[yellow]warning:[/] {escape(message)}", highlight=False)
@@ -53,7 +59,8 @@ class Console:
         """Says how many warnings were kept back."""
         rest = len(self.warnings) - MOST_WARNINGS
         if rest > 0:
-            self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report")
+            beyond = f", and {self._beyond} that are not" if self._beyond else ""
+            self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report{beyond}")
 
     @contextmanager
     def waiting(self, message: str) -> Iterator[None]:

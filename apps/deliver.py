@@ -189,9 +189,9 @@ def _report(
 def _frames_note(learnt: Learnt) -> FramesNote:
     meter = learnt.meter
     return FramesNote(
-        read=learnt.added + len(learnt.held) + meter.dropped_count,
+        read=learnt.added + meter.held_out + meter.dropped_count,
         used=learnt.added,
-        held_out=len(learnt.held),
+        held_out=meter.held_out,
         dropped=tuple(meter.dropped),
         not_replayed=learnt.added - len(learnt.trainer.replay),
     )

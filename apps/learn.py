@@ -19,7 +19,7 @@ from avatar.config import TrainConfig
 from avatar.coverage import Coverage
 from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
-from avatar.hold import HeldOut, is_held_out, prepared, score
+from avatar.hold import HeldOut, is_held_out, keep, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
 from avatar.train import train
@@ -199,7 +199,8 @@ class Lesson:
             while seen < count and not (inbox.finished or self._stop.is_set()):
                 for item in inbox.take(wait_s=0.1):
                     if isinstance(item, HeldOut):
-                        self._held.append(item)
+                        keep(self._held, item)
+                        self.meter.arrived(item.observation.frame.index, held_out=True)
                     elif isinstance(item, PreparedFrame):
                         self._trainer.add(item, again=True)
                         seen += 1
@@ -207,8 +208,8 @@ class Lesson:
 
     def _listen(self, event: TrainEvent, bar: Bar) -> None:
         match event:
-            case Arrived(index=index):
-                self.meter.arrived(index)
+            case Arrived(index=index, held_out=held_out):
+                self.meter.arrived(index, held_out=held_out)
             case Stepped():
                 self.meter.depth.add(float(self._inbox.waiting))
                 bar.move(event.wall_seconds, self._progress(event))

@@ -27,6 +27,7 @@ class Meter:
         read: Frames that came out of the source.
         dropped: Those that were left out, the first `MOST_NOTES` of them.
         dropped_count: How many were left out.
+        held_out: How many the trainer got that are not learnt from.
         first_at: When the first frame was there, on `time.perf_counter`'s clock.
         last_s: The newest frame's time, counted from the first frame's.
         size_px: Width and height that training sees.
@@ -41,7 +42,7 @@ class Meter:
     def __init__(self, stop: threading.Event, source: Source) -> None:
         """A meter whose streams end early once `stop` is set."""
         self._stop, self._source = stop, source
-        self.read = self.dropped_count = 0
+        self.read = self.dropped_count = self.held_out = 0
         self.dropped: list[DroppedNote] = []
         self.first_at: float | None = None
         self.last_s = 0.0
@@ -91,8 +92,9 @@ class Meter:
             self.prepared_s.add(time.perf_counter() - started - waited)
             yield item
 
-    def arrived(self, index: int) -> None:
+    def arrived(self, index: int, *, held_out: bool) -> None:
         """The trainer has a frame now; those before it that it never got are forgotten."""
+        self.held_out += held_out
         while self._there_at and self._there_at[0][0] <= index:
             number, there_at = self._there_at.popleft()
             if number == index:

@@ -1,7 +1,7 @@
 """Held-out frames: which they are, and how well they are rendered."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -19,16 +19,28 @@ from preprocess.observe import Dropped
 
 Item = TypeVar("Item")
 
+MOST_HELD = 100
+"""Held-out frames that are kept, so that memory stays bounded however long a video lasts."""
 SCORED_AT_A_MARK = 12
 """Held-out frames scored at each mark of the curve; all of them at the end."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeldOut:
-    """A frame that is never trained on, and its warp."""
+    """A frame that is never trained on.
+
+    Attributes:
+        observation: Picture, mask, pose and camera.
+        cells: Its warp; None to solve it when it is rendered. Most are rendered once, at the end,
+            and a warp is as large as its picture.
+    """
 
     observation: Observation
-    cells: WarpCells
+    cells: WarpCells | None = None
+
+    def solved(self, rig: Rig) -> "HeldOut":
+        """The same with its warp, for whoever renders it again and again."""
+        return replace(self, cells=WarpCells.of(rig, self.observation.pose.joint_rotations))
 
 
 def is_held_out(position: int, *, every: int, total: int | None) -> bool:
@@ -55,8 +67,7 @@ def prepared(
         if isinstance(observation, Dropped):
             yield observation
         elif is_held_out(position, every=every, total=total):
-            cells = WarpCells.of(rig, observation.pose.joint_rotations)
-            yield HeldOut(observation=observation, cells=cells)
+            yield HeldOut(observation=observation)
         else:
             yield prepare(observation, rig)
 
@@ -91,6 +102,18 @@ def compared(picture: Float32[np.ndarray, "height width 4"], observation: Observ
         psnr_mask=psnr(image, truth, observation.alpha > 0.5),
         ssim=ssim(image, truth),
     )
+
+
+def keep(held: list[HeldOut], frame: HeldOut, *, most: int = MOST_HELD) -> None:
+    """Takes a held-out frame in; of too many the one goes whose neighbours are closest together.
+
+    What stays is spread over the whole stream: no gap is more than about twice as wide as another.
+    """
+    held.append(frame)
+    if len(held) <= most:
+        return
+    places = np.array([frame.observation.frame.index for frame in held])
+    del held[1 + int((places[2:] - places[:-2]).argmin())]
 
 
 def spread(held: list[HeldOut], most: int) -> list[HeldOut]:

@@ -1,6 +1,7 @@
 """A frame made ready for training: its warp cells, and its pixels as rays of the body frame."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -72,22 +73,45 @@ def prepare(observation: Observation, rig: Rig) -> PreparedFrame:
     """Solves the frame's warp and picks the pixels worth training on."""
     near, far = _worthwhile(observation.alpha)
     chosen = np.concatenate([near, far])
-    width = observation.camera.size_px[0]
-    pixels = np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
-    world_from_body = rig.world_from_body(observation.pose)
-    rays = BodyRays.through(pixels, observation.camera, world_from_body)
-    alpha = observation.alpha.reshape(-1, 1)[chosen]
-    color = observation.frame.rgb.reshape(-1, 3)[chosen]
-    premultiplied = np.concatenate([color * alpha, alpha * 255.0], axis=1)
+    camera, world_from_body = observation.camera, rig.world_from_body(observation.pose)
+    camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
+    sights = _sights(camera.focal_px, camera.center_px, camera.size_px, camera.distortion)
+    origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
     return PreparedFrame(
         index=observation.frame.index,
         pose=observation.pose,
         cells=WarpCells.of(rig, observation.pose.joint_rotations),
-        origin=rays.origin,
-        directions=rays.directions,
-        colors=np.round(premultiplied).astype(np.uint8),
+        origin=origin.astype(np.float32),
+        directions=sights[chosen] @ camera_from_body.astype(np.float32),
+        colors=_premultiplied(observation, chosen),
         near=len(near),
     )
+
+
+@lru_cache(maxsize=2)
+def _sights(
+    focal_px: tuple[float, float],
+    center_px: tuple[float, float],
+    size_px: tuple[int, int],
+    distortion: tuple[float, ...],
+) -> Float32[np.ndarray, "pixels 3"]:
+    """Unit directions through all pixels in the camera's axes: the same in every frame."""
+    camera = Camera(
+        focal_px=focal_px, center_px=center_px, size_px=size_px, distortion=distortion,
+        camera_from_world=np.eye(4),
+    )  # fmt: skip
+    return camera.directions(camera.pixel_centers().reshape(-1, 2)).astype(np.float32)
+
+
+def _premultiplied(
+    observation: Observation, chosen: Int[np.ndarray, "pixels"]
+) -> UInt8[np.ndarray, "pixels 4"]:
+    """Colour times alpha, and alpha, of some pixels, in 8 bits."""
+    alpha = observation.alpha.reshape(-1, 1)[chosen]
+    premultiplied = np.empty((len(chosen), 4), dtype=np.float32)
+    np.multiply(observation.frame.rgb.reshape(-1, 3)[chosen], alpha, out=premultiplied[:, :3])
+    np.multiply(alpha, np.float32(255.0), out=premultiplied[:, 3:])
+    return np.rint(premultiplied, out=premultiplied).astype(np.uint8)
 
 
 def _worthwhile(

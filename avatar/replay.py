@@ -64,7 +64,8 @@ class Replay:
         self.capacity = capacity
         self.device = device
         self.indices: list[int] = []
-        self._likeness = np.empty((0, 3 + 69))
+        self._likeness = np.zeros((capacity, 3 + 69))
+        self._gap = np.full((capacity, capacity), np.inf)
         self._error = torch.zeros(capacity, device=device)
         self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -99,11 +100,10 @@ class Replay:
         if len(self) < self.capacity:
             slot = len(self)
             self.indices.append(frame.index)
-            self._likeness = np.concatenate([self._likeness, likeness[None]])
         else:
             slot = self._most_alike()
             self.indices[slot] = frame.index
-            self._likeness[slot] = likeness
+        self._compare(slot, likeness)
         self._fill(slot, frame)
         held = self._error[: len(self)]
         self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
@@ -186,12 +186,18 @@ class Replay:
         store[slot, :needed] = torch.from_numpy(values).to(self.device)
         return store
 
+    def _compare(self, slot: int, likeness: Float[np.ndarray, "numbers"]) -> None:
+        """Notes how far a slot's frame is from every other."""
+        held = len(self)
+        self._likeness[slot] = likeness
+        gap = np.linalg.norm(self._likeness[:held] - likeness, axis=1)
+        gap[slot] = np.inf
+        self._gap[slot, :held] = self._gap[:held, slot] = gap
+
     def _most_alike(self) -> int:
         """Of the two frames that differ least, the one nearer to a third."""
-        gap = np.linalg.norm(self._likeness[:, None] - self._likeness[None], axis=-1)
-        np.fill_diagonal(gap, np.inf)
-        first, second = np.unravel_index(gap.argmin(), gap.shape)
-        pair = gap[[first, second]]
+        first, second = np.unravel_index(self._gap.argmin(), self._gap.shape)
+        pair = self._gap[[first, second]]
         pair[:, [first, second]] = np.inf
         return int((first, second)[int(pair.min(axis=1).argmin())])
 

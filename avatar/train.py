@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import final
 
 from avatar.events import Arrived, Evaluated, Finished, Idle, Score, Stepped, TrainEvent, Warned
-from avatar.hold import SCORED_AT_A_MARK, HeldOut, interleaved, score, spread
+from avatar.hold import SCORED_AT_A_MARK, HeldOut, interleaved, keep, score, spread
 from avatar.prepare import PreparedFrame
 from avatar.step import cosine
 from avatar.trainer import Trainer
@@ -143,7 +143,7 @@ class _Stream:
             if not self._started:
                 self.clock, self._started = Clock(self._trainer), True
             if isinstance(item, HeldOut):
-                self._held.append(item)
+                keep(self._held, item)
                 yield Arrived(index=item.observation.frame.index, held_out=True)
             else:
                 self._trainer.add(item)

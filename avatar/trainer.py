@@ -41,7 +41,8 @@ class Trainer:
         replay: The frames it learns from.
         poses: Their poses, corrected if the recipe says so.
         corrections: How each frame's pose was corrected, by the frame's number in its source; a
-            frame that comes again starts from there. Clear it before another source is read.
+            frame that comes again starts from there. Clear it before another source is read. At
+            most twice as many are kept as frames in replay.
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
         frames_seen: Frames taken in so far, whether or not they are still kept.
@@ -93,6 +94,8 @@ class Trainer:
             self.replay.move_root(slot, self.poses.root(slot))
         self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
+        if not again:
+            self._forget_corrections()
 
     def step(self, *, rate: float, hard_share: float) -> StepResult:
         """Draws rays, follows their gradient once, and keeps the occupancy up to date.
@@ -126,6 +129,12 @@ class Trainer:
         self.rays += config.rays
         self.samples += result.samples
         return result
+
+    def _forget_corrections(self) -> None:
+        """Of frames that are long gone from replay, so that memory stays bounded."""
+        if len(self.corrections) > 2 * self.replay.capacity:
+            kept = set(self.replay.indices)
+            self.corrections = {i: c for i, c in self.corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
         for _ in range(CORRECTIONS_PER_STEP):

@@ -35,7 +35,8 @@ BOX = "off: between the walls of the person's box only"
 
 def skipping_marks(seen: Class, device: torch.device) -> list[Mark]:
     """All ratios."""
-    return [*_training(seen, device), *_rendering(seen, seen.held[len(seen.held) // 2], device)]
+    held = seen.held[len(seen.held) // 2].solved(seen.trainer.avatar.rig)
+    return [*_training(seen, device), *_rendering(seen, held, device)]
 
 
 def _training(seen: Class, device: torch.device) -> list[Mark]:

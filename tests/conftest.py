@@ -8,8 +8,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from preprocess.body import Body, ShapedBody
+
+settings.register_profile("busy", deadline=None)  # a machine may be busy with something else
+settings.load_profile("busy")
 
 
 @pytest.fixture

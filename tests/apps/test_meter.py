@@ -68,10 +68,11 @@ def test_latency_runs_from_the_moment_a_frame_was_due_until_the_trainer_has_it()
     due = [now - 3.0, now - 2.0, now - 1.0]
     assert len(list(meter.frames(frames([0.0, 1.0, 2.0], due)))) == 3
     for index in range(3):
-        meter.arrived(index)
+        meter.arrived(index, held_out=index == 1)
     assert [meter.latency_s.percentile(p) for p in (0.0, 50.0, 100.0)] == pytest.approx(
         [1.0, 2.0, 3.0], abs=0.5
     )
+    assert meter.held_out == 1
     assert meter.behind_s == pytest.approx(1.0, abs=0.5)
     assert meter.lateness_s.largest == pytest.approx(3.0, abs=0.5)
 
@@ -79,7 +80,7 @@ def test_latency_runs_from_the_moment_a_frame_was_due_until_the_trainer_has_it()
 def test_frames_that_never_arrive_are_forgotten():
     meter = Meter(threading.Event(), Recorded())
     list(meter.frames(frames(np.arange(100) / 30.0)))
-    meter.arrived(98)
+    meter.arrived(98, held_out=False)
     assert meter.latency_s.count == 1
     assert [index for index, _ in meter._there_at] == [99]
 

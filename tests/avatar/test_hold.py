@@ -1,11 +1,12 @@
 """Held-out frames: which they are, what they are compared with, and how they are scored."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avatar.cells import WarpCells
@@ -14,6 +15,7 @@ from avatar.hold import (
     HeldOut,
     interleaved,
     is_held_out,
+    keep,
     on_white,
     prepared,
     score,
@@ -133,3 +135,25 @@ def test_every_beginning_of_the_interleaved_order_is_spread_over_the_stream():
     assert sorted(order) == list(range(12))
     assert order[:2] == [0, 8]
     assert max(np.diff(sorted([*order[:3], 12]))) <= 4
+
+
+@given(count=st.integers(1, 700), most=st.integers(3, 40))
+@settings(max_examples=15, deadline=None)
+def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count, most):
+    kept, places = [], range(9, 10 * count, 10)
+    for place in places:
+        frame = replace(held.observation.frame, index=place)
+        keep(kept, HeldOut(observation=replace(held.observation, frame=frame)), most=most)
+    indices = [frame.observation.frame.index for frame in kept]
+    assert len(indices) == min(len(places), most)
+    assert indices == sorted(set(indices))
+    if len(places) > 1:
+        assert (indices[0], indices[-1]) == (places[0], places[-1])
+        gaps = np.diff(indices)
+        assert gaps.max() <= 4 * gaps.min()
+        assert gaps.max() <= 4 * (places[-1] - places[0]) / (len(indices) - 1)
+
+
+def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
+    lazy = HeldOut(observation=held.observation)
+    assert score(learnt.trainer.avatar, lazy) == score(learnt.trainer.avatar, lazy.solved(rig))

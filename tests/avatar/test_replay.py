@@ -176,3 +176,15 @@ def test_a_slot_that_is_taken_over_shows_the_new_frame(frames, generator):
     np.testing.assert_array_equal(
         batch.rays.origins, np.stack([held[s].origin for s in batch.rays.slots])
     )
+
+
+def test_distances_that_are_kept_are_those_that_would_be_found_anew(frames, rng):
+    """What goes is chosen from distances that are updated one row at a time."""
+    replay = Replay(6, CPU)
+    for index in range(40):
+        turned = dataclasses.replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
+        replay.add(dataclasses.replace(frames[index % 4], index=index, pose=turned))
+    likeness = replay._likeness
+    anew = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
+    np.fill_diagonal(anew, np.inf)
+    np.testing.assert_allclose(replay._gap, anew)

@@ -300,3 +300,14 @@ def test_while_nothing_has_come_the_listener_is_heard(rig):
     assert isinstance(next(train(Trainer(rig, QUICK, CPU), inbox, [])), Idle)
     closed.set()
     inbox.close()
+
+
+def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
+    config = dataclasses.replace(QUICK, key_frames=3)
+    trainer = Trainer(rig, config, CPU)
+    frame = prepare(clip.observations[0], rig)
+    for index in range(40):
+        trainer.add(dataclasses.replace(frame, index=index))
+        trainer.corrections[index] = np.full((25, 3), float(index))
+    assert len(trainer.corrections) <= 2 * config.key_frames + 1
+    assert set(trainer.replay.indices) <= set(trainer.corrections)
