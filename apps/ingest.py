@@ -16,6 +16,7 @@ from apps.interrupt import asked_to_stop
 from apps.recording import Recording
 from apps.run_folder import RunFolder
 from apps.whole import write_text
+from capture.camera_device import camera_address
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
@@ -98,7 +99,7 @@ def _trainer(
     from apps.learn import new_trainer
     from avatar import checkpoint
 
-    device, video = device_for(given.device), str(recording.source.path.resolve())
+    device, video = device_for(given.device), _name_of(recording)
     seconds = given.training_seconds(recording)
     if given.resume and not run.has_checkpoint():
         console.say(f"There is no checkpoint in {run.path}: starting afresh.")
@@ -123,6 +124,14 @@ def _trainer(
     trainer.config = replace(trainer.config, seconds=had + seconds, refine_poses=given.refine_poses)
     trainer.corrections.clear()  # they are of the other video's frames
     return trainer, 0, {**notes, "video": video}
+
+
+def _name_of(recording: Recording) -> str:
+    """By which a checkpoint knows the video again; what a camera sees is new every time."""
+    source = recording.source
+    if camera_address(source.path) is not None:
+        return f"{source.path} {source.started_at:.3f}"
+    return str(source.path.resolve())
 
 
 def _warm_up(trainer: "Trainer", console: Console) -> None:

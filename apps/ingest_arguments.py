@@ -9,7 +9,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.recording import Recording, RecordingPaths
 from apps.run_folder import RunFolder
+from capture.camera_device import camera_address
 from capture.errors import BadInput
+from capture.growing import IDLE_S
 
 LEARNABLE_PX = 540
 """Longer side of the pictures that a minute is enough for."""
@@ -36,7 +38,8 @@ class IngestArguments:
     """
 
     video: Positional[Path]
-    """Video file, folder of pictures, or capture folder."""
+    """Video file, folder of pictures, or capture folder; camera:0 for a camera, or the address of
+    a stream, as in camera:rtsp://…"""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """SMPL poses, one a frame: an .npz with global_orient, body_pose, transl (or poses, trans)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
@@ -62,6 +65,13 @@ class IngestArguments:
     realtime: Flag = False
     """Play the video as if it were being filmed now: each frame comes at its own time, and the
     avatar is ready when the video ends. More --seconds polish it after the last frame."""
+    live: Flag = False
+    """VIDEO is a folder that another program is still writing pictures to, while a tracker writes
+    the poses (the .npz again and again, or a .jsonl, a frame a line) and masks of the same names as
+    the pictures come into --masks. It ends with a file named DONE in the folder, when nothing new
+    has come for --idle-seconds, after --seconds, or by Ctrl-C. A camera is live without it."""
+    idle_seconds: float = IDLE_S
+    """How long a live source may bring nothing new, and its first picture and pose may take."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of the pictures in pixels; they are never enlarged. Without it, what can
     be learnt in --seconds: 540 in a minute, twice as many in four."""
@@ -90,6 +100,12 @@ class IngestArguments:
             raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
         if self.threads is not None and self.threads < 1:
             raise BadInput(f"--threads is {self.threads}; at least 1 was expected.")
+        if not 0.0 < self.idle_seconds < float("inf"):
+            raise BadInput(
+                f"--idle-seconds is {self.idle_seconds}; a positive number was expected."
+            )
+        if self.realtime and (self.live or camera_address(self.video) is not None):
+            raise BadInput("--realtime plays a recording; a live source has its own pace. Drop it.")
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.mask_invert and self.no_mask_invert:
@@ -98,9 +114,10 @@ class IngestArguments:
     def run_folder(self) -> RunFolder:
         """Where the run lies."""
         name = self.video.resolve()
-        return RunFolder(
-            path=self.out or Path("runs") / (name.name if name.is_dir() else name.stem)
-        )
+        own = name.name if name.is_dir() else name.stem
+        if camera_address(self.video) is not None:
+            own = re.sub(r"\W+", "-", str(self.video)).strip("-")
+        return RunFolder(path=self.out or Path("runs") / own)
 
     def recording(self) -> Recording:
         """Opens what the arguments name."""
@@ -113,6 +130,8 @@ class IngestArguments:
             body=self.body,
             frames=parsed_frames(self.frames),
             mask_invert=invert,
+            live=self.live,
+            idle_s=self.idle_seconds,
         )
         recording = Recording.open(wanted)
         size_px = self.size or learnable_px(self.training_seconds(recording))

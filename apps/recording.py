@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.frame import Frame
+from capture.growing import IDLE_S
 from capture.pace import Pace
 from capture.playback import Playback
-from capture.source import Source, open_source
+from capture.source import Source, open_live, open_source
 from preprocess.body import Body, ShapedBody
 from preprocess.camera_file import CameraTrack, default_cameras, read_cameras
-from preprocess.capture_folder import CapturePaths, find_capture
+from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
+from preprocess.live import LiveParts
 from preprocess.masks import Masks, open_masks
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, observer
@@ -33,6 +36,8 @@ class RecordingPaths:
         body: A body file; None for the embedded body.
         frames: Which frames are wanted.
         mask_invert: Whether the person is dark in the masks; None finds out.
+        live: Whether `video` is a folder that grows; a camera is live without it.
+        idle_s: Of a live source: how long nothing new may come.
     """
 
     video: Path
@@ -42,6 +47,8 @@ class RecordingPaths:
     body: Path | None = None
     frames: slice | None = None
     mask_invert: bool | None = None
+    live: bool = False
+    idle_s: float = IDLE_S
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,6 +64,8 @@ class Recording:
         shaped: The person's body.
         size_px: Longer side that training sees; None for the frames' own.
         notes: What a user should know about how the parts were read.
+        live: Poses and masks of a live source, which come while it runs; `motion` is what had come
+            when it was opened.
     """
 
     paths: CapturePaths
@@ -67,6 +76,7 @@ class Recording:
     shaped: ShapedBody
     size_px: int | None
     notes: tuple[str, ...]
+    live: LiveParts | None = None
 
     @classmethod
     def open(cls, wanted: RecordingPaths, *, size_px: int | None = None) -> "Recording":
@@ -75,6 +85,9 @@ class Recording:
         Raises:
             BadInput: If one is missing or unreadable, or they do not fit together.
         """
+        camera = camera_address(wanted.video)
+        if wanted.live or camera is not None:
+            return cls._open_live(wanted, camera, size_px)
         paths = find_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
         source = open_source(paths.video, frames=wanted.frames)
         body = Body.load(wanted.body)
@@ -100,12 +113,46 @@ class Recording:
         recording.footprint_m()
         return recording
 
+    @classmethod
+    def _open_live(
+        cls, wanted: RecordingPaths, camera: str | None, size_px: int | None
+    ) -> "Recording":
+        """The same of a live source, whose first picture and first pose are waited for."""
+        paths = find_live_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
+        body, pace = Body.load(wanted.body), Pace()
+        source = open_live(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
+        live = LiveParts.open(
+            paths, source, pace, family=body.family, invert=wanted.mask_invert,
+            first_within_s=wanted.idle_s,
+        )  # fmt: skip
+        motion = live.poses.motion
+        if paths.cameras is not None:
+            cameras = read_cameras(paths.cameras, source.size_px)
+        else:
+            cameras = default_cameras(motion, source.size_px)
+        recording = cls(
+            paths=paths,
+            source=source,
+            motion=motion,
+            masks=None,
+            cameras=cameras,
+            shaped=body.with_shape(betas_for(body, motion)),
+            size_px=size_px,
+            notes=tuple(_notes(body, motion, None, cameras)),
+            live=live,
+        )
+        recording.observer()
+        recording.footprint_m()
+        return recording
+
     def observations(self) -> Iterator[Observation | Dropped]:
         """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
         return map(self.observer(), self.source.frames())
 
     def observer(self) -> Callable[[Frame], Observation | Dropped]:
         """What joins a frame with its pose, mask and camera."""
+        if self.live is not None:
+            return self.live.observer(self.source, self.cameras, self.size_px)
         return observer(self.source, self.motion, self.masks, self.cameras, size_px=self.size_px)
 
     def played(self) -> "Recording":

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -105,15 +106,18 @@ def compared(picture: Float32[np.ndarray, "height width 4"], observation: Observ
 
 
 def keep(held: list[HeldOut], frame: HeldOut, *, most: int = MOST_HELD) -> None:
-    """Takes a held-out frame in; of too many the one goes whose neighbours are closest together.
+    """Takes a held-out frame in; whenever there are too many, every other one goes.
 
-    What stays is spread over the whole stream: no gap is more than about twice as wide as another.
+    What stays is spread evenly over the whole stream: from then on only frames are taken that are
+    as far from the last one as the others are from each other.
     """
-    held.append(frame)
-    if len(held) <= most:
+    places = [kept.observation.frame.index for kept in held]
+    closest = min((b - a for a, b in pairwise(places)), default=0)
+    if held and frame.observation.frame.index - places[-1] < closest:
         return
-    places = np.array([frame.observation.frame.index for frame in held])
-    del held[1 + int((places[2:] - places[:-2]).argmin())]
+    held.append(frame)
+    if len(held) > most:
+        del held[1::2]
 
 
 def spread(held: list[HeldOut], most: int) -> list[HeldOut]:

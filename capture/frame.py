@@ -18,6 +18,7 @@ class Frame:
         alpha: The source's own alpha channel (RGBA pictures), else None.
         due_s: When it was there to be taken, on `time.perf_counter`'s clock: played or filmed at
             that moment. None for a recording that is read as fast as it is taken.
+        name: Of the picture's file without its ending, where each picture has a file.
     """
 
     index: int
@@ -26,6 +27,7 @@ class Frame:
     flags: frozenset[str] = frozenset()
     alpha: UInt8[np.ndarray, "height width"] | None = None
     due_s: float | None = None
+    name: str | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:

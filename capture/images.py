@@ -83,6 +83,7 @@ class ImageFolder:
 
     live = False
     paced = False
+    started_at = 0.0
     waited_s = 0.0
     dropped = 0
 
@@ -114,7 +115,7 @@ class ImageFolder:
                 continue
             try:
                 rgb, alpha = read_image(path)
-            except BadInput as cause:
+            except (BadInput, OSError) as cause:  # damaged, or the disk was unplugged
                 self._warn(f"{cause} It was left out.")
                 continue
             if rgb.shape[1::-1] != self.size_px:

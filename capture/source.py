@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from capture.errors import BadInput
 from capture.frame import Frame
+from capture.pace import Pace
 from capture.selection import Selection
 
 VIDEO_SUFFIXES = frozenset(
@@ -31,6 +32,7 @@ class Source(Protocol):
         paced: Whether frames come at times of their own, however fast they are taken.
         waited_s: How long `frames()` has waited for frames, in all.
         dropped: How many frames were lost because nobody took them in time.
+        started_at: When the first frame of a live source was filmed, in seconds since 1970.
         warnings: What was wrong so far; grows while `frames()` is read.
     """
 
@@ -43,6 +45,7 @@ class Source(Protocol):
     has_alpha: bool
     live: bool
     paced: bool
+    started_at: float
     warnings: list[str]
 
     @property
@@ -98,3 +101,29 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
             f"{found}. Name the video itself."
         )
     return VideoFile(videos[0], selection)
+
+
+def open_live(
+    path: Path, camera: str | None, frames: slice | None, pace: Pace, *, idle_s: float
+) -> Source:
+    """Opens a camera, or a folder that another program writes pictures to.
+
+    Args:
+        path: The folder; a capture folder's pictures lie in its `images/`.
+        camera: Number or address of a camera instead.
+        frames: Which frames are wanted. All if None.
+        pace: The clock of a folder.
+        idle_s: No new picture for so long is a folder's end.
+
+    Raises:
+        BadInput: If there is no such camera, or no picture comes into the folder.
+        OSError: If the camera cannot be used now.
+    """
+    from capture.camera_device import CameraDevice
+    from capture.growing import GrowingFolder
+
+    selection = Selection.of(frames)
+    if camera is not None:
+        return CameraDevice(camera, selection, pace)
+    inside = path / "images"
+    return GrowingFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)

@@ -29,6 +29,7 @@ class VideoFile:
     has_alpha = False
     live = False
     paced = False
+    started_at = 0.0
     waited_s = 0.0
     dropped = 0
 

@@ -70,6 +70,46 @@ def find_capture(
     )
 
 
+def find_live_capture(
+    video: Path,
+    poses: Path | None = None,
+    masks: Path | None = None,
+    cameras: Path | str | None = None,
+) -> CapturePaths:
+    """Where the parts of a live source lie or will lie; poses and masks need not be there yet.
+
+    Args:
+        video: `camera:…`, or a folder that grows.
+        poses: Pose file; needed unless `video` is a folder, which will hold poses.npz.
+        masks: Folder of masks.
+        cameras: Camera file, or "static".
+
+    Raises:
+        BadInput: If nobody says where the poses will be, or a camera file is not there.
+    """
+    inside = video.parent if video.name == "images" else video
+    is_folder = video.is_dir()
+    if poses is None and is_folder:
+        poses = _first([inside], ["poses.npz", "poses.jsonl"]) or inside / "poses.npz"
+    if poses is None:
+        raise BadInput(
+            f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "
+            "written anew again and again, or a .jsonl, a frame a line)."
+        )
+    if masks is None:
+        masks = (inside if is_folder else poses.parent) / "masks"
+    if cameras is None:
+        cameras = _first([inside, poses.parent], ["cameras.npz"])
+    elif str(cameras) != "static" and not Path(cameras).exists():
+        raise BadInput(f"{cameras} does not exist; check the path.")
+    return CapturePaths(
+        video=video,
+        poses=poses,
+        masks=masks,
+        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
+    )
+
+
 def _first(places: list[Path], names: list[str]) -> Path | None:
     candidates = (place / name for place in places if place.is_dir() for name in names)
     return next((path for path in candidates if path.exists()), None)

@@ -106,7 +106,7 @@ def _folder_of_masks(path: Path) -> tuple[int, Reader]:
     files = sorted((file for file in files if not file.name.startswith(".")), key=natural_key)
     if not files:
         raise BadInput(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
-    return len(files), lambda row: _read_file(files[row])
+    return len(files), lambda row: read_mask(files[row])
 
 
 def _file_of_masks(path: Path) -> tuple[int, Reader]:
@@ -132,7 +132,12 @@ def _load(path: Path) -> Shaped[np.ndarray, "..."]:
         raise BadInput(f"{path} is no readable .npy of numbers ({cause}).") from cause
 
 
-def _read_file(path: Path) -> Float32[np.ndarray, "height width"]:
+def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
+    """One mask as it is stored, in [0, 1].
+
+    Raises:
+        BadInput: If it cannot be decoded, or is not complete.
+    """
     if path.suffix == ".npy":
         return _as_alpha(np.asarray(_load(path)), path)
     try:

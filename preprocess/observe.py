@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.source import Source
@@ -14,7 +15,7 @@ from preprocess.camera_file import CameraTrack
 from preprocess.masks import Masks, same_shape
 from preprocess.observation import Observation
 from preprocess.pairing import row_by_order
-from preprocess.pose import Motion
+from preprocess.pose import BodyPose, Motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,18 +66,45 @@ def observer(
     row_of = check_motion(motion, source)
     mask_row = check_masks(masks, source)
     camera_row = check_cameras(cameras, source)
-    target_px = shrunk(source.size_px, size_px)
 
-    def observed(frame: Frame) -> Observation | Dropped:
+    def pose_of(frame: Frame) -> BodyPose | str:
         row = row_of(frame)
+        if row is None:
+            return "no pose"
+        return motion[row] if motion.valid[row] else "pose invalid"
+
+    def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+        if masks is None:
+            return own_alpha(frame, size_px)
+        return masks.alpha(mask_row(frame.index), size_px)
+
+    target_px = shrunk(source.size_px, size_px)
+    return joiner(pose_of, alpha_of, lambda index: cameras[camera_row(index)], target_px)
+
+
+def joiner(
+    pose_of: Callable[[Frame], BodyPose | str],
+    alpha_of: Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "height width"]],
+    camera_of: Callable[[int], Camera],
+    target_px: tuple[int, int],
+) -> Callable[[Frame], Observation | Dropped]:
+    """What joins a frame with its pose, mask and camera, each found by a function of its own.
+
+    Args:
+        pose_of: The frame's pose, or why it has none.
+        alpha_of: Its mask at a size; raises BadInput if it has none.
+        camera_of: The camera of a frame's number, of the frames' size.
+        target_px: Width and height of the observations.
+    """
+
+    def joined(frame: Frame) -> Observation | Dropped:
         if "corrupt" in frame.flags:
             return Dropped(index=frame.index, reason="picture damaged")
-        if row is None:
-            return Dropped(index=frame.index, reason="no pose")
-        if not motion.valid[row]:
-            return Dropped(index=frame.index, reason="pose invalid")
+        pose = pose_of(frame)
+        if isinstance(pose, str):
+            return Dropped(index=frame.index, reason=pose)
         try:
-            alpha = _alpha(frame, masks, mask_row(frame.index), target_px)
+            alpha = alpha_of(frame, target_px)
         except BadInput as cause:
             return Dropped(index=frame.index, reason=f"mask unusable: {cause}")
         if not (alpha > 0.5).any():
@@ -84,11 +112,11 @@ def observer(
         return Observation(
             frame=_resized(frame, target_px),
             alpha=alpha,
-            pose=motion[row],
-            camera=cameras[camera_row(frame.index)].resized(target_px),
+            pose=pose,
+            camera=camera_of(frame.index).resized(target_px),
         )
 
-    return observed
+    return joined
 
 
 def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None]:
@@ -181,11 +209,12 @@ def _row_by_time(times_s: Float[np.ndarray, "poses"]) -> Callable[[Frame], int |
     return row
 
 
-def _alpha(
-    frame: Frame, masks: Masks | None, row: int, size_px: tuple[int, int]
-) -> Float32[np.ndarray, "height width"]:
-    if masks is not None:
-        return masks.alpha(row, size_px)
+def own_alpha(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    """The picture's own alpha channel, scaled.
+
+    Raises:
+        BadInput: If it has none.
+    """
     if frame.alpha is None:
         raise BadInput("the picture has no alpha channel")
     alpha = frame.alpha.astype(np.float32) / np.float32(255.0)

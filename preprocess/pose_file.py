@@ -1,5 +1,6 @@
 """Pose files: InstantAvatar's .npz, which its successors read too, with a few keys of ours."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +28,22 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
     (N, 3, 3), model. Rows with NaN are marked as not valid.
 
+    A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
+    a last line that is half written is left out.
+
     Args:
-        path: The .npz file.
+        path: The .npz or .jsonl file.
         default_model: Body family of files that do not say theirs.
 
     Raises:
         BadInput: If there is no such file, or it holds no such poses.
     """
-    if path.suffix != ".npz":
-        raise BadInput(f"{path}: poses are read from .npz files (InstantAvatar's keys).")
-    arrays = read_npz(path)
+    if path.suffix not in (".npz", ".jsonl"):
+        raise BadInput(
+            f"{path}: poses are read from .npz files (InstantAvatar's keys), or from .jsonl files "
+            "with the same keys, a frame a line."
+        )
+    arrays = read_npz(path) if path.suffix == ".npz" else _read_lines(path)
     layout = next((keys for keys in LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in LAYOUTS)
@@ -63,6 +70,23 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
         times_s=times,
         intrinsic=_intrinsic(arrays, path),
     )
+
+
+def _read_lines(path: Path) -> Arrays:
+    """One array for each key that every line has; of `model`, what the first line says.
+
+    Raises:
+        BadInput: If there is no such file, or a line before the last holds no JSON object.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        lines = [dict(json.loads(line)) for line in whole.splitlines() if line.strip()]
+        keys = set.intersection(*(set(line) for line in lines)) if lines else set()
+        arrays = {key: np.array([line[key] for line in lines]) for key in keys - {"model"}}
+    except (OSError, ValueError, TypeError) as cause:
+        raise BadInput(f"{path} is no file of one JSON object a line ({cause}).") from cause
+    return {**arrays, **({"model": np.array(lines[0]["model"])} if "model" in keys else {})}
 
 
 def write_motion(path: Path, motion: Motion) -> None:

@@ -145,13 +145,13 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
         frame = replace(held.observation.frame, index=place)
         keep(kept, HeldOut(observation=replace(held.observation, frame=frame)), most=most)
     indices = [frame.observation.frame.index for frame in kept]
-    assert len(indices) == min(len(places), most)
-    assert indices == sorted(set(indices))
+    assert min(len(places), most // 2) <= len(indices) <= most
+    assert indices[0] == places[0]
     if len(places) > 1:
-        assert (indices[0], indices[-1]) == (places[0], places[-1])
-        gaps = np.diff(indices)
-        assert gaps.max() <= 4 * gaps.min()
-        assert gaps.max() <= 4 * (places[-1] - places[0]) / (len(indices) - 1)
+        (gap,) = set(np.diff(indices))
+        assert places[-1] - indices[-1] < gap
+    if len(places) <= most:
+        assert indices == list(places)
 
 
 def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):

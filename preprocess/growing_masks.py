@@ -1,0 +1,83 @@
+"""Masks that a segmenter still writes: each is waited for, and belongs to a picture by its name."""
+
+import re
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from jaxtyping import Float32
+
+from capture.errors import BadInput
+from capture.frame import Frame
+from capture.images import list_images
+from capture.pace import Pace
+from preprocess.growing_poses import LOOK_EVERY_S, PATIENCE_S
+from preprocess.masks import Masks, read_mask
+
+
+@final
+class GrowingMasks:
+    """The masks of a live source: a folder of pictures, written one after the other.
+
+    A mask belongs to the picture of the same name; of a camera, whose pictures have none, to the
+    one whose number is the last in the mask's name.
+    """
+
+    def __init__(
+        self, path: Path, pace: Pace, *, invert: bool | None, patience_s: float = PATIENCE_S
+    ) -> None:
+        """Nothing is read yet.
+
+        Args:
+            path: The folder.
+            pace: Its clock; ending it ends every wait.
+            invert: Whether the person is dark; None finds out from the first mask.
+            patience_s: How long after it was filmed a frame waits for its mask.
+        """
+        self._path, self._pace, self._invert, self._patience_s = path, pace, invert, patience_s
+        self._by_name: dict[str, Path] = {}
+        self._by_number: dict[int, Path] = {}
+
+    def of(self, frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+        """The mask of a frame, scaled to a picture's size; waits for it.
+
+        Raises:
+            BadInput: If it did not come in time, cannot be read, or is of another shape.
+        """
+        deadline = (self._pace.now() if frame.due_s is None else frame.due_s) + self._patience_s
+        while True:
+            try:
+                path = self._find(frame)
+                if path is not None:
+                    return self._read(path, size_px)
+                trouble = BadInput(f"no mask within {self._patience_s:g} s")
+            except BadInput as cause:  # perhaps it is half written
+                trouble = cause
+            if self._pace.now() >= deadline or self._pace.ended:
+                raise trouble
+            self._pace.until(min(deadline, self._pace.now() + LOOK_EVERY_S))
+
+    def _read(self, path: Path, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+        stored = read_mask(path)
+        if not stored.any() and self._invert is None:  # it tells nothing of the others either
+            return np.zeros(size_px[::-1], dtype=np.float32)
+        masks = Masks(path, 1, lambda row: stored, invert=self._invert)
+        self._invert = masks.inverted
+        return masks.alpha(0, size_px)
+
+    def _find(self, frame: Frame) -> Path | None:
+        found = self._known(frame)
+        if found is None and self._path.is_dir():
+            self._by_name, self._by_number = {}, {}
+            for path in list_images(self._path):
+                self._by_name[path.stem] = path
+                numbers = re.findall(r"\d+", path.stem)
+                if numbers:
+                    self._by_number[int(numbers[-1])] = path
+            found = self._known(frame)
+        return found
+
+    def _known(self, frame: Frame) -> Path | None:
+        if frame.name is not None:
+            return self._by_name.get(frame.name)
+        return self._by_number.get(frame.index)

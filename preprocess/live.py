@@ -1,0 +1,85 @@
+"""A live source's poses and masks, which come while it runs, joined to its frames."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from capture.errors import BadInput
+from capture.frame import Frame
+from capture.pace import Pace
+from capture.source import Source
+from preprocess.camera_file import CameraTrack
+from preprocess.capture_folder import CapturePaths
+from preprocess.growing_masks import GrowingMasks
+from preprocess.growing_poses import GrowingPoses
+from preprocess.observation import Observation
+from preprocess.observe import Dropped, joiner, own_alpha, shrunk
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LiveParts:
+    """What is written beside a live source by other programs.
+
+    Attributes:
+        poses: The tracker's.
+        masks: The segmenter's; None if the pictures have an alpha channel.
+        pace: The clock by which both are waited for.
+    """
+
+    poses: GrowingPoses
+    masks: GrowingMasks | None
+    pace: Pace
+
+    @classmethod
+    def open(
+        cls,
+        paths: CapturePaths,
+        source: Source,
+        pace: Pace,
+        *,
+        family: str,
+        invert: bool | None,
+        first_within_s: float,
+    ) -> "LiveParts":
+        """Waits for the first pose.
+
+        Args:
+            paths: Where the parts lie or will lie.
+            source: The frames.
+            pace: The clock by which parts are waited for.
+            family: Body family of pose files that do not say theirs.
+            invert: Whether the person is dark in the masks; None finds out.
+            first_within_s: How long the first pose may take.
+
+        Raises:
+            BadInput: If no pose comes, or there is no folder of masks where one is needed.
+        """
+        masks = None
+        if not source.has_alpha:
+            if paths.masks is None or not paths.masks.is_dir():
+                raise BadInput(
+                    f"There is no folder of masks {paths.masks}, and making masks from the video "
+                    "is not built yet. Give --masks: the folder to which they will be written."
+                )
+            masks = GrowingMasks(paths.masks, pace, invert=invert)
+        poses = GrowingPoses(
+            paths.poses, pace, default_model=family, first_within_s=first_within_s,
+            started_at=source.started_at,
+        )  # fmt: skip
+        return cls(poses=poses, masks=masks, pace=pace)
+
+    def observer(
+        self, source: Source, cameras: CameraTrack, size_px: int | None
+    ) -> Callable[[Frame], Observation | Dropped]:
+        """What makes an observation of a frame, waiting for its pose and its mask.
+
+        Raises:
+            BadInput: If there are many cameras: nobody knows yet whose they are.
+        """
+        if cameras.moves:
+            raise BadInput(
+                f"{cameras.source} holds {len(cameras.cameras)} cameras; a live source has one "
+                "that stands still."
+            )
+        alpha_of = own_alpha if self.masks is None else self.masks.of
+        target_px = shrunk(source.size_px, size_px)
+        return joiner(self.poses.of, alpha_of, lambda index: cameras[0], target_px)
