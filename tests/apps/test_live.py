@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from apps import ingest, learn
+from avatar import warm
 from avatar.train import train
+from avatar.warm import warm_up
 from capture import camera_device
 from capture.source import open_source
 
@@ -23,6 +25,7 @@ def watch(call_ingest, without_baking, monkeypatch, tmp_path, capsys):
 
     def watch(*arguments):
         monkeypatch.setattr(learn, "train", train)  # frames come while it learns
+        monkeypatch.setattr(warm, "warm_up", warm_up)  # a live source waits for no compiler
         code = ingest.main([*map(str, arguments), "--out", str(tmp_path / "run")])
         path = tmp_path / "run" / "report.json"
         return code, json.loads(path.read_text()) if path.exists() else None
