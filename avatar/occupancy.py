@@ -56,6 +56,7 @@ class Occupancy:
         self.band: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
         self._near_skin = rig.distance <= SKIN_M
+        self._known_empty: tuple[int, Tensor] | None = None
 
     @torch.no_grad()
     def update(
@@ -107,8 +108,15 @@ class Occupancy:
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
-        empty = self.band[self.grid.occupied.view(-1)[self.band] == 0]
-        return self._somewhere_in(self._draw(empty, count, generator), generator)
+        return self._somewhere_in(self._draw(self._empty(), count, generator), generator)
+
+    def _empty(self) -> Int64[Tensor, "cells"]:
+        """Cells of the band that hold nothing: looked up when the occupancy has changed."""
+        version = self.grid.occupied._version
+        if self._known_empty is None or self._known_empty[0] != version:
+            cells = self.band[self.grid.occupied.view(-1)[self.band] == 0]
+            self._known_empty = version, cells
+        return self._known_empty[1]
 
     def _draw(
         self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator

@@ -67,6 +67,21 @@ def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
     assert (rig.distance[tuple(cell.T.numpy())] <= 0.08).all()
 
 
+def test_empty_points_follow_every_change_of_the_occupancy(occupancy, generator):
+    occupied = occupancy.grid.occupied
+    occupied.zero_()
+    assert len(occupancy.empty_points(100, generator)) == 100
+    occupied.fill_(1)
+    assert len(occupancy.empty_points(100, generator)) == 0
+    occupied.view(-1)[occupancy.band[7]] = 0
+    points = occupancy.empty_points(100, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 100
+    assert not occupied[tuple(cell.T)].any()
+    run(occupancy, lambda at: torch.full_like(at[:, 0], 5.0), generator, 60)
+    assert len(occupancy.empty_points(100, generator)) == 0
+
+
 def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, generator):
     assert len(occupancy.empty_points(100, generator)) == 0
 
