@@ -301,16 +301,16 @@ class TorchBackend:
         cell_m: float,
         device: torch.device,
     ) -> Cells:
+        def there(part: np.ndarray) -> Tensor:
+            return torch.from_numpy(part).to(device)
+
         extent = rig.box_high - rig.box_low
         nodes_per_m = (np.array(rig.weights.shape[:3], dtype=np.float32) - 1) / extent
         cells_per_m = np.array(rig.distance.shape, dtype=np.float32) / extent
-        given = rig.seeds, rig.seed_parts, rig.distance, cells_per_m
+        volume = there(rig.weights), there(rig.box_low), there(nodes_per_m), there(bones)
         built = build_cells(
-            tuple(
-                torch.from_numpy(part).to(device)
-                for part in (rig.weights, rig.box_low, nodes_per_m, bones)
-            ),
-            *(torch.from_numpy(part).to(device) for part in given), band_m, cell_m,
+            volume, there(rig.seeds), there(rig.seed_parts), there(rig.distance),
+            there(cells_per_m), band_m, cell_m,
         )  # fmt: skip
         return Cells(*(part.cpu().numpy() for part in built))
 

@@ -54,7 +54,7 @@ def build_cells(
     center = low + (torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1) + 0.5) * cell_m
     center = center.reshape(-1, 3)
     start, near = _starts(center, posed, parts, band_m + 0.012 + 0.6 * cell_m)
-    root = torch.zeros(len(center), STARTS, 3, device=seeds.device)
+    root = torch.zeros(*near.shape, 3, device=seeds.device)
     kept = torch.zeros_like(near)
     cell, rank = near.nonzero(as_tuple=True)
     seed = start[cell, rank]
@@ -109,7 +109,7 @@ def _distinct(
 ) -> Bool[Tensor, "cells starts"]:
     """Which roots are kept: of those within 2 cm the first, and of all the first three."""
     kept = found.clone()
-    for later in range(1, STARTS):
+    for later in range(1, kept.shape[1]):
         gap = (root[:, :later] - root[:, later : later + 1]).norm(dim=2)
         known = ((gap < SAME_ROOT_M) & kept[:, :later]).any(dim=1)
         kept[:, later] &= ~known & (kept[:, :later].sum(dim=1) < ROOTS)

@@ -11,9 +11,9 @@ ENDLESS = 10**9
 """A grace of so many samples never ends: `Marching.grace_steps` of exact rendering."""
 
 
-@compile_kernel(inline="always", **FAST)
-def _inverse(x):
-    return F32(1) / (x if abs(x) > F32(1e-7) else F32(1e-7))
+@compile_kernel(inline="always")
+def _safe(x):
+    return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 
 @compile_kernel(inline="always", **FAST)
@@ -95,7 +95,7 @@ def march(
         oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
         oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        ix, iy, iz = cell_m * _inverse(dx), cell_m * _inverse(dy), cell_m * _inverse(dz)
+        ix, iy, iz = cell_m / _safe(dx), cell_m / _safe(dy), cell_m / _safe(dz)
         dx, dy, dz = dx * cells_a_m, dy * cells_a_m, dz * cells_a_m
         ax, ay, az = -ox * ix, -oy * iy, -oz * iz
         bx, by, bz = (F32(nx) - ox) * ix, (F32(ny) - oy) * iy, (F32(nz) - oz) * iz
