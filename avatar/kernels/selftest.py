@@ -59,7 +59,9 @@ def strays(backend: Backend) -> str | None:
             "encode": of.encode(points, table, levels),
             "encode_backward": grad_table,
             "encode_points_backward": of.encode_points_backward(points, slope, table, levels),
-            "build_cells": _looked_up(TorchBackend(), _cells(of, rig, bones), rig, bones, canonical),
+            "build_cells": _looked_up(
+                TorchBackend(), _cells(of, rig, bones), rig, bones, canonical
+            ),
             "march": _looked_up(of, cells, rig, bones, canonical),
             "composite": of.composite(raw, samples, 0.01),
             "composite_loss": torch.cat([rendered.flatten(), loss, grad.flatten() * len(loss)]),
