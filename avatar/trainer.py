@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from avatar.adam import Adam
 from avatar.cells import WarpCells
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.field import Field
@@ -69,7 +70,7 @@ class Trainer:
         self.wall_seconds = self.cpu_seconds = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
         rate = config.learning_rate
-        self.optimizer = torch.optim.Adam(
+        self.optimizer = Adam(
             [
                 {"params": [field.table], "lr": rate, "eps": 1e-15},
                 {"params": field.layers, "lr": rate * NETWORK_RATE},
@@ -90,8 +91,7 @@ class Trainer:
         self.poses.put(slot, frame.pose, correction=known)
         if known is not None:
             joints = self.poses.pose(slot).joint_rotations
-            cells = WarpCells.of(self.avatar.rig, joints, device=self.replay.device)
-            self.replay.put_cells(slot, cells)
+            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
             self.replay.move_root(slot, self.poses.root(slot))
         self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
@@ -175,8 +175,7 @@ def let_follow(
     if slot is None:
         return None
     if poses.strayed(slot):
-        joints = poses.pose(slot).joint_rotations
-        replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
+        replay.put_cells(slot, WarpCells.of(rig, poses.pose(slot).joint_rotations))
     else:
         backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
     replay.move_root(slot, poses.root(slot))
