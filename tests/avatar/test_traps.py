@@ -174,7 +174,7 @@ def filmed(size: int) -> Filmed:
     return Filmed(
         rig=rig,
         frames=[item for item in items if isinstance(item, PreparedFrame)],
-        held=[item for item in items if isinstance(item, HeldOut)],
+        held=[item.solved(rig) for item in items if isinstance(item, HeldOut)],
         footprint_m=float((camera.camera_from_world @ pelvis)[2]) / camera.focal_px[0],
     )
 
