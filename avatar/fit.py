@@ -16,7 +16,7 @@ from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
 from avatar.trainer import Trainer, let_follow
 
-CORRECTIONS = 40
+CORRECTIONS = 16
 """Corrections that each frame's pose gets."""
 RAYS_A_CORRECTION = 512
 

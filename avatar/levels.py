@@ -1,6 +1,6 @@
 """The levels of the hash grid: how fine each is, and where its entries lie in the table."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
@@ -64,6 +64,17 @@ class HashLevels:
             counts=counts,
             dense=dense.astype(np.int32),
             offsets=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        )
+
+    def no_finer_than(self, cell_m: float) -> "HashLevels":
+        """The levels whose cells are at least so large, metres; the coarsest in any case."""
+        kept = max(int((1.0 / self.cells_per_m >= cell_m).sum()), 1)
+        return replace(
+            self,
+            cells_per_m=self.cells_per_m[:kept],
+            counts=self.counts[:kept],
+            dense=self.dense[:kept],
+            offsets=self.offsets[: kept + 1],
         )
 
     @property

@@ -2,8 +2,10 @@
 
 A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
 gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
-wrench per bone (`avatar.kernels.cpu_pose`). What all frames share is no error of a frame but a
-change of the canonical body, so the mean correction is taken out again and again.
+wrench per bone (`avatar.kernels.cpu_pose`). A few hundred rays of a frame make one Gauss-Newton
+step (`avatar.pose_step`); exact poses are left alone, and soon asked about only seldom. What all
+frames share is no error of a frame but a change of the canonical body, so the mean correction is
+taken out again and again.
 """
 
 from typing import final
@@ -15,24 +17,27 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend import Skin
+from avatar.pose_step import pose_step
 from avatar.replay import RootCorrection
 from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
 from preprocess.pose import BodyPose
 
-STEP_M = 1.2e-2
-"""How far a correction that is sure of itself moves what hangs on a joint, metres."""
-MOMENTS = 0.9, 0.95
-"""Memory of the gradient's mean and of its square, as Adam's. The mean starts at 0, uncorrected:
-the first gradients, of a field that knows little, move nothing much."""
+ROWS = 512
+"""Rays of a frame that are kept until its pose is corrected."""
 ENOUGH_RAYS = 256
-"""A frame's pose moves when this many of its rays have been seen since it last did."""
-STRAYED_M = 0.04
+"""A frame's pose is corrected when this many of its rays have been seen since it last was."""
+PULLING_M = 0.025
+"""Only levels of the grid with cells as large as this pull at poses: finer ones say where to go
+from a few millimetres away, and point anywhere from farther off."""
+MEMORY = 0.95
+"""Of the share of corrections that moved a pose."""
+SELDOM = 8
+"""Steps from one pull to the next where poses are exact."""
+STRAYED_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
-FORGOTTEN = 0.03
-"""Share of a correction that is given up at each step: what the pictures do not ask for goes."""
 FARTHEST = 0.35
 """A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
 
@@ -47,7 +52,6 @@ class PoseTable:
     Attributes:
         corrections: (slots, 25, 3): root rotation, joint rotations, root shift.
         bones: Body-from-canonical matrices of the corrected poses.
-        wrenches: What has been found out about each slot since its pose last moved.
     """
 
     def __init__(
@@ -72,30 +76,26 @@ class PoseTable:
             torch.from_numpy(rig.box_low).to(device),
             torch.from_numpy(nodes / (rig.box_high - rig.box_low)).to(device),
         )
-        self.wrenches: Float32[Tensor, "slots 24 6"] = torch.zeros(capacity, 24, 6, device=device)
+        self._pulls = torch.zeros(capacity, ROWS, 24, 6, device=device)
+        self._losses = torch.zeros(capacity, ROWS, device=device)
         self._rays = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._given: list[BodyPose | None] = [None] * capacity
-        self._first = np.zeros((capacity, 25, 3))
-        self._second = np.zeros((capacity, 25, 3))
-        self._times = np.zeros(capacity, dtype=int)
         self._posed = np.zeros((capacity, 24, 4, 4))
         self._solved_at = np.zeros((capacity, 24, 3))
         self._rest_from_canonical = np.linalg.inv(
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
         self._below = _subtrees(rig)
-        self._lever = np.append(_levers(rig, self._below), 1.0)
+        self._moving = 1.0
 
     def put(
         self, slot: int, pose: BodyPose, correction: Float[np.ndarray, "25 3"] | None = None
     ) -> None:
         """Takes in a frame's given pose, and its correction if one is known."""
         self._given[slot] = pose
-        for values in (self.corrections, self._first, self._second, self._times):
-            values[slot] = 0
+        self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
-        self.wrenches[slot] = 0.0
         self._rays[slot] = 0
         self._move(slot)
         self._solved_at[slot] = self._joint_places(slot)
@@ -117,9 +117,20 @@ class PoseTable:
             ).as_rotvec(),
         )
 
-    def count(self, slots: Int64[Tensor, "rays"]) -> None:
-        """Counts a step's rays, after their pull has been added to `wrenches`."""
-        self._rays += torch.bincount(slots, minlength=len(self._rays))
+    def feel(
+        self,
+        slots: Int64[Tensor, "rays"],
+        wrenches: Float32[Tensor, "rays 24 6"],
+        loss: Float32[Tensor, "rays"],
+    ) -> None:
+        """Keeps what a step's rays exert on their frames' bones; slots ascend."""
+        counts = torch.bincount(slots, minlength=len(self._rays))
+        rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
+        place = self._rays[slots] + rank
+        kept = place < ROWS
+        self._pulls[slots[kept], place[kept]] = wrenches[kept]
+        self._losses[slots[kept], place[kept]] = loss[kept]
+        self._rays = (self._rays + counts).clamp(max=ROWS)
 
     def correct_one(self, *, rate: float) -> int | None:
         """Corrects the pose about which most has been found out; cells and rays must follow.
@@ -128,17 +139,30 @@ class PoseTable:
             rate: Factor of the steps, in (0, 1].
 
         Returns:
-            The slot, or None if no frame has seen enough rays.
+            The slot, or None if no frame has seen enough rays or the pose stays as it is.
         """
         slot = int(self._rays.argmax())
-        if int(self._rays[slot]) < ENOUGH_RAYS:
+        rows = int(self._rays[slot])
+        if rows < ENOUGH_RAYS:
             return None
-        gradient = self.gradient(slot)
-        self.wrenches[slot] = 0.0
+        loss = self._losses[slot, :rows].cpu().numpy()
+        step = pose_step(self.gradients(slot), loss, self.corrections[slot])
         self._rays[slot] = 0
-        self._descend(slot, gradient, rate)
+        moves = bool(step.change.any())
+        self._moving += (1.0 - MEMORY) * (moves - self._moving)
+        if not moves:
+            return None
+        held = [i for i, pose in enumerate(self._given) if pose is not None]
+        mean = self.corrections[held].mean(axis=0)
+        moved = self.corrections[slot] + rate * step.change - self._mean_pull * mean
+        self.corrections[slot] = np.clip(moved, -FARTHEST, FARTHEST)
         self._move(slot)
         return slot
+
+    @property
+    def every(self) -> int:
+        """Steps from one pull at poses to the next, 1 to 8: more where poses prove to be exact."""
+        return min(max(round(0.5 / max(self._moving, 1e-3)), 1), SELDOM)
 
     def strayed(self, slot: int) -> bool:
         """Whether the slot's pose has left the one for which its warp was last solved.
@@ -158,39 +182,23 @@ class PoseTable:
             rotation=rotation_matrices(turn), shift=shift, pivot=self.rig.rest_joints[0]
         )
 
-    def gradient(self, slot: int) -> Float[np.ndarray, "25 3"]:
-        """Gradient of the loss for a slot's correction, from its bones' wrenches.
+    def gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
+        """Gradient of each kept ray's loss for the slot's correction, from its bones' wrenches.
 
         A joint that turns by ω about its place c carries every bone below it:
         dL/dω = -Σ (M - c × F), in the axes of the body frame; here it is expressed in those of the
         joint, where the corrections live.
         """
-        wrench = self.wrenches[slot].double().cpu().numpy()
-        total = self._below @ wrench
-        force, moment = total[:, :3], total[:, 3:]
-        turning = -(moment - np.cross(self._joint_places(slot), force))
-        gradient = np.empty((25, 3))
-        gradient[:24] = np.einsum("jba,jb->ja", self._posed[slot, :, :3, :3], turning)
-        gradient[24] = -wrench[:, :3].sum(axis=0)
+        wrench = self._pulls[slot, : int(self._rays[slot])].cpu().numpy()
+        felt = np.zeros((25, 3, 24, 6))
+        across = np.cross(np.eye(3), self._joint_places(slot)[:, None])  # c × F = across @ F
+        turned = self._posed[slot, :, :3, :3].swapaxes(1, 2)
+        carried = np.concatenate([turned @ across, -turned], axis=2)
+        felt[:24] = self._below[:, None, :, None] * carried[:, :, None]
         # the shift lives in the given body frame, the force in the corrected one
-        gradient[24] = rotation_matrices(self.corrections[slot, 0]) @ gradient[24]
-        return gradient
-
-    def _descend(self, slot: int, gradient: Float[np.ndarray, "25 3"], rate: float) -> None:
-        first, second = self._first[slot], self._second[slot]
-        self._times[slot] += 1
-        times = self._times[slot]
-        first *= MOMENTS[0]
-        first += (1.0 - MOMENTS[0]) * gradient
-        second *= MOMENTS[1]
-        second += (1.0 - MOMENTS[1]) * gradient**2
-        # how sure the step is, in [-1, 1]: noise has |s| of about 0.2, and moves by its square
-        surely = first / (np.sqrt(second / (1.0 - MOMENTS[1] ** times)) + 1e-12)
-        step = surely * np.abs(surely) * STEP_M * rate / self._lever[:, None]
-        held = [i for i, pose in enumerate(self._given) if pose is not None]
-        mean = self.corrections[held].mean(axis=0)
-        moved = (1.0 - FORGOTTEN) * self.corrections[slot] - step - self._mean_pull * mean
-        self.corrections[slot] = np.clip(moved, -FARTHEST, FARTHEST)
+        felt[24, :, :, :3] = -rotation_matrices(self.corrections[slot, 0])[:, None]
+        flat = felt.reshape(75, 144).astype(np.float32)
+        return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
 
     def _joint_places(self, slot: int) -> Float[np.ndarray, "24 3"]:
         """Where the joints are, body frame, metres."""
@@ -217,9 +225,3 @@ def _subtrees(rig: Rig) -> Float[np.ndarray, "24 24"]:
             below[joint, bone] = 1.0
             joint = int(rig.parents[joint])
     return below
-
-
-def _levers(rig: Rig, below: Float[np.ndarray, "24 24"]) -> Float[np.ndarray, "24"]:
-    """How far from each joint the farthest joint is that it moves, and a hand's width, metres."""
-    gap = np.linalg.norm(rig.rest_joints[:, None] - rig.rest_joints[None], axis=-1)
-    return (gap * below).max(axis=1) + 0.15

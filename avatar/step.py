@@ -11,7 +11,7 @@ from avatar.config import TrainConfig
 from avatar.field import Field
 from avatar.kernels.backend import CellTables, Grid, Samples
 from avatar.kernels.reference import MAX_LOG_DENSITY
-from avatar.refine import PoseTable
+from avatar.refine import PULLING_M, PoseTable
 from avatar.replay import Batch
 from avatar.sampling import Sampler
 
@@ -74,7 +74,7 @@ def gradients(
     grad_empty = _grad_of_emptiness(seen.raw[count:], config.empty_weight)
     grad_features = field.backward(seen, torch.cat([grad, grad_empty]))
     if poses is not None and count:
-        _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells)
+        _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells, loss)
     if remember is not None:
         log_density = seen.raw[:count, 3].contiguous()
         field.backend.keep_highest(seen.points[:count], log_density, remember)
@@ -96,16 +96,14 @@ def _pull(
     grad_features: Float32[Tensor, "samples width"],
     slots: Int32[Tensor, "rays"],
     cells: CellTables,
+    loss: Float32[Tensor, "rays"],
 ) -> None:
     """Lets the samples pull at the poses that they were warped with."""
-    backend = field.backend
-    grad_points = backend.encode_points_backward(
-        samples.points, grad_features, field.table, field.levels
-    )
-    backend.add_wrenches(
-        samples, grad_points, slots, cells, poses.skin, poses.bones, poses.wrenches
-    )
-    poses.count(slots.long())
+    backend, levels = field.backend, field.levels.no_finer_than(PULLING_M)
+    each = grad_features[:, : levels.width] * len(loss)  # of each ray's own loss, not of the mean
+    grad_points = backend.encode_points_backward(samples.points, each, field.table, levels)
+    wrenches = backend.wrenches(samples, grad_points, slots, cells, poses.skin, poses.bones)
+    poses.feel(slots.long(), wrenches, loss)
 
 
 def cosine(progress: float) -> float:

@@ -26,7 +26,7 @@ NETWORK_RATE = 0.3
 """The network's learning rate as a share of the table's."""
 CLEARING_STEPS = 300
 """Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
-REFINED_AFTER_STEPS = 150
+REFINED_AFTER_STEPS = 30
 """Poses are corrected once there is something to compare them with."""
 CORRECTIONS_PER_STEP = 2
 
@@ -109,6 +109,7 @@ class Trainer:
         batch = self.replay.draw(config.rays, self._generator)
         remembers = self.steps % config.occupancy_every < 2
         refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
+        refines = refines and self.steps % self.poses.every == 0
         result = gradients(
             field, self.sampler, self.replay.cells, batch, config,
             hard_share=hard_share,

@@ -211,7 +211,7 @@ class Backend(Protocol):
         """Raises the grid's cached density, in place, to that of the samples."""
         ...
 
-    def add_wrenches(
+    def wrenches(
         self,
         samples: Samples,
         grad_points: Float32[Tensor, "samples 3"],
@@ -219,9 +219,8 @@ class Backend(Protocol):
         cells: CellTables,
         skin: Skin,
         bones: Float32[Tensor, "slots 24 12"],
-        wrenches: Float32[Tensor, "slots 24 6"],
-    ) -> None:
-        """Adds what pulls the samples to the wrenches of the bones that move them."""
+    ) -> Float32[Tensor, "rays 24 6"]:
+        """What each ray's samples, pulled so, exert on the bones that move them."""
         ...
 
     def follow(
@@ -315,7 +314,7 @@ class TorchBackend:
             (grad,) = torch.autograd.grad((features * grad_features).sum(), leaf)
         return grad
 
-    def add_wrenches(
+    def wrenches(
         self,
         samples: Samples,
         grad_points: Float32[Tensor, "samples 3"],
@@ -323,12 +322,12 @@ class TorchBackend:
         cells: CellTables,
         skin: Skin,
         bones: Float32[Tensor, "slots 24 12"],
-        wrenches: Float32[Tensor, "slots 24 6"],
-    ) -> None:
-        slot = slots.repeat_interleave(samples.count).long()
+    ) -> Float32[Tensor, "rays 24 6"]:
+        ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.count)
+        slot = slots[ray].long()
         roots = cells.roots[slot, samples.rows.long()]
         wrench = pose.wrenches(samples.points, grad_points, roots, bones[slot], *skin)
-        wrenches.index_add_(0, slot, wrench)
+        return wrench.new_zeros(len(slots), 24, 6).index_add_(0, ray, wrench)
 
     def follow(
         self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]

@@ -131,7 +131,7 @@ class NumbaBackend:
         )  # fmt: skip
         return grad
 
-    def add_wrenches(
+    def wrenches(
         self,
         samples: Samples,
         grad_points: Float32[Tensor, "samples 3"],
@@ -139,13 +139,14 @@ class NumbaBackend:
         cells: CellTables,
         skin: Skin,
         bones: Float32[Tensor, "slots 24 12"],
-        wrenches: Float32[Tensor, "slots 24 6"],
-    ) -> None:
-        cpu_pose.add_wrenches(
+    ) -> Float32[Tensor, "rays 24 6"]:
+        out = torch.zeros(len(slots), 24, 6)
+        cpu_pose.wrenches(
             samples.points.numpy(), grad_points.numpy(), samples.rows.numpy(),
             samples.first.numpy(), samples.count.numpy(), slots.numpy(), cells.roots.numpy(),
-            *(part.numpy() for part in skin), bones.numpy(), wrenches.numpy(),
+            *(part.numpy() for part in skin), bones.numpy(), out.numpy(),
         )  # fmt: skip
+        return out
 
     def follow(
         self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]

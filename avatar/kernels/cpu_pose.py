@@ -21,12 +21,12 @@ def _weights_at(weights, low, nodes_per_m, x, y, z, out):
     interpolate(weights, low, nodes_per_m, x, y, z, 24, out)
 
 
-@compile_kernel(**FAST)
-def add_wrenches(
+@compile_kernel(parallel=True, **FAST)
+def wrenches(
     points, grad_points, rows, first, count, slots, cell_roots,
-    weights, low, nodes_per_m, bones, wrenches,
+    weights, low, nodes_per_m, bones, out,
 ):  # fmt: skip
-    """Adds every sample's pull to the wrenches of the bones that move it.
+    """Adds up what each ray's samples exert on the bones that move them.
 
     Args:
         points, grad_points: Canonical samples and what pulls them.
@@ -35,10 +35,10 @@ def add_wrenches(
         cell_roots: Roots and inverse Jacobians (slots, roots, 12).
         weights, low, nodes_per_m: The skinning volume.
         bones: Body-from-canonical matrices (slots, 24, 12).
-        wrenches: (slots, 24, 6), force then moment about the body frame's origin.
+        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
     """
-    share = np.empty(24, np.float32)
-    for ray in range(first.shape[0]):
+    for ray in prange(first.shape[0]):
+        share = np.empty(24, np.float32)
         slot = slots[ray]
         for i in range(first[ray], first[ray] + count[ray]):
             inverse = cell_roots[slot, rows[i]]
@@ -52,14 +52,14 @@ def add_wrenches(
                 w = share[joint]
                 if w < F32(1e-3):
                     continue
-                m, out = bones[slot, joint], wrenches[slot, joint]
+                m, felt = bones[slot, joint], out[ray, joint]
                 px, py, pz = moved(m, x, y, z)
-                out[0] += w * fx
-                out[1] += w * fy
-                out[2] += w * fz
-                out[3] += w * (py * fz - pz * fy)
-                out[4] += w * (pz * fx - px * fz)
-                out[5] += w * (px * fy - py * fx)
+                felt[0] += w * fx
+                felt[1] += w * fy
+                felt[2] += w * fz
+                felt[3] += w * (py * fz - pz * fy)
+                felt[4] += w * (pz * fx - px * fz)
+                felt[5] += w * (px * fy - py * fx)
 
 
 @compile_kernel(**FAST)

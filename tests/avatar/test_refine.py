@@ -82,13 +82,15 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
     roots = torch.zeros(2, 400, 12)
     roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
     cells = CellTables(torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03)
-    slots = torch.ones(1, dtype=torch.int32)
-    results = []
-    for backend in (NUMBA, TORCH):
-        wrenches = torch.zeros(2, 24, 6)
-        backend.add_wrenches(samples, pull, slots, cells, table.skin, table.bones, wrenches)
-        results.append(wrenches)
-    assert float(results[0][0].abs().max()) == 0.0
+    samples = samples._replace(
+        first=torch.tensor([0, 150, 150]), count=torch.tensor([150, 0, 250], dtype=torch.int32)
+    )
+    slots = torch.ones(3, dtype=torch.int32)
+    results = [
+        backend.wrenches(samples, pull, slots, cells, table.skin, table.bones)
+        for backend in (NUMBA, TORCH)
+    ]
+    assert float(results[0][1].abs().max()) == 0.0
     torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
 
 
@@ -137,8 +139,9 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
     cells = CellTables(torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03)
     slots = torch.ones(1, dtype=torch.int32)
-    NUMBA.add_wrenches(samples, pull, slots, cells, table.skin, table.bones, table.wrenches)
-    gradient = table.gradient(1)
+    wrenches = NUMBA.wrenches(samples, pull, slots, cells, table.skin, table.bones)
+    table.feel(slots.long(), wrenches, torch.ones(1))
+    (gradient,) = table.gradients(1)
     given = skin.skinned(samples.points, *table.skin, table.bones[1]).double().numpy()
 
     def pulled(joint: int, axis: int, size: float) -> float:
@@ -157,7 +160,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     for joint in (0, 1, 4, 9, 16, 18, 24):
         for axis in range(3):
             measured = (pulled(joint, axis, 2e-3) - pulled(joint, axis, -2e-3)) / 4e-3
-            scale = np.abs(gradient[joint]).max() + 0.1
+            scale = float(np.abs(gradient[joint]).max()) + 0.1
             assert gradient[joint, axis] == pytest.approx(measured, abs=0.08 * scale), joint
 
 
@@ -197,7 +200,7 @@ def test_refining_poses_makes_up_for_a_trackers_jitter(rig, clip, jittered):
             trainer.step(rate=cosine(step / 600), hard_share=1.0)
         scores = [score(trainer.avatar, frame) for frame in held]
         reached[refine_poses] = np.mean([s.psnr_mask for s in scores])
-    assert reached[True] > reached[False] + 0.8
+    assert reached[True] > reached[False] + 2.0
 
 
 def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_off(learnt, clip):

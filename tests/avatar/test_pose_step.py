@@ -1,0 +1,54 @@
+"""A pose's step: it goes where the rays agree, and nowhere where they do not."""
+
+import numpy as np
+import pytest
+
+from avatar.pose_step import CERTAIN, CHANCE, OVERSTEP, SPREAD_M, SPREAD_RAD, pose_step
+
+NONE = np.zeros((25, 3))
+SCALE = np.append(np.full(24, SPREAD_RAD), SPREAD_M)[:, None]
+
+
+@pytest.fixture
+def slopes(rng):
+    """What each of 600 rays' residual does for one spread of each of the 75 numbers."""
+    return rng.normal(size=(600, 25, 3)) / SCALE
+
+
+def rays_of(slopes, off):
+    """Gradients and losses of rays whose residuals are linear, in a pose that is off."""
+    residual = np.einsum("rja,ja->r", slopes, off)
+    gradients = residual[:, None, None] * slopes
+    return gradients.astype(np.float32), (0.5 * residual**2).astype(np.float32)
+
+
+def test_the_step_solves_what_is_linear_and_goes_as_much_farther_as_it_says(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    step = pose_step(*rays_of(slopes, off), NONE)
+    assert step.evidence > CERTAIN
+    np.testing.assert_allclose(step.change / SCALE, -OVERSTEP * off / SCALE, atol=0.05)
+
+
+def test_rays_that_pull_by_chance_move_nothing(slopes, rng):
+    gradients, loss = rays_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)
+    signs = rng.choice([-1.0, 1.0], size=(len(loss), 1, 1)).astype(np.float32)
+    step = pose_step(gradients * signs, loss, NONE)
+    assert step.evidence == pytest.approx(1.0, abs=0.4)
+    assert step.evidence < CHANCE
+    assert not step.change.any()
+
+
+def test_what_no_ray_feels_goes_back_to_where_it_was_given(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    slopes[:, 7] = 0.0
+    off[7] = 0.0
+    correction = np.zeros((25, 3))
+    correction[7] = 0.02
+    step = pose_step(*rays_of(slopes, off), correction)
+    np.testing.assert_allclose(step.change[7], -correction[7], rtol=1e-3)
+
+
+def test_rays_that_feel_nothing_ask_for_nothing():
+    step = pose_step(np.zeros((9, 25, 3), np.float32), np.zeros(9, np.float32), NONE)
+    assert step.evidence == 0.0
+    assert not step.change.any()
