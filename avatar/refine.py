@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend import Skin
-from avatar.pose_step import pose_step
+from avatar.pose_step import CHANCE, pose_step
 from avatar.replay import RootCorrection
 from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
@@ -31,9 +31,11 @@ PULLING_M = 0.025
 """Only levels of the grid with cells as large as this pull at poses: finer ones say where to go
 from a few millimetres away, and point anywhere from farther off."""
 MEMORY = 0.95
-"""Of the share of corrections that moved a pose."""
+"""Of the mean evidence, and of the share of corrections that moved a pose."""
 SELDOM = 8
 """Steps from one pull to the next where poses are exact."""
+FOLLOWED_M = 0.04
+"""No joint moves farther at one correction: the frame's warp must be able to follow."""
 STRAYED_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
@@ -86,7 +88,7 @@ class PoseTable:
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
         self._below = _subtrees(rig)
-        self._moving = 1.0
+        self._moving, self._evidence = 1.0, CHANCE
 
     def put(
         self, slot: int, pose: BodyPose, correction: Float[np.ndarray, "25 3"] | None = None
@@ -146,8 +148,9 @@ class PoseTable:
         if rows < ENOUGH_RAYS:
             return None
         loss = self._losses[slot, :rows].cpu().numpy()
-        step = pose_step(self.gradients(slot), loss, self.corrections[slot])
+        step = pose_step(self.gradients(slot), loss, self.corrections[slot], self._evidence)
         self._rays[slot] = 0
+        self._evidence += (1.0 - MEMORY) * (step.evidence - self._evidence)
         moves = bool(step.change.any())
         self._moving += (1.0 - MEMORY) * (moves - self._moving)
         if not moves:
@@ -155,8 +158,7 @@ class PoseTable:
         held = [i for i, pose in enumerate(self._given) if pose is not None]
         mean = self.corrections[held].mean(axis=0)
         moved = self.corrections[slot] + rate * step.change - self._mean_pull * mean
-        self.corrections[slot] = np.clip(moved, -FARTHEST, FARTHEST)
-        self._move(slot)
+        self._correct(slot, np.clip(moved, -FARTHEST, FARTHEST))
         return slot
 
     @property
@@ -199,6 +201,16 @@ class PoseTable:
         felt[24, :, :, :3] = -rotation_matrices(self.corrections[slot, 0])[:, None]
         flat = felt.reshape(75, 144).astype(np.float32)
         return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
+
+    def _correct(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
+        """Moves a pose to its new correction, or as far towards it as its cells can follow."""
+        before, places = self.corrections[slot].copy(), self._joint_places(slot)
+        self.corrections[slot] = correction
+        self._move(slot)
+        moved = float(np.linalg.norm(self._joint_places(slot) - places, axis=1).max())
+        if moved > FOLLOWED_M:
+            self.corrections[slot] = before + FOLLOWED_M / moved * (correction - before)
+            self._move(slot)
 
     def _joint_places(self, slot: int) -> Float[np.ndarray, "24 3"]:
         """Where the joints are, body frame, metres."""
