@@ -10,7 +10,7 @@ from avatar.kernels.cpu import NumbaBackend
 NUMBA = NumbaBackend()
 OPERATIONS = (
     "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
-    "keep_highest", "add_wrenches", "follow",
+    "keep_highest", "wrenches", "follow",
 )  # fmt: skip
 
 
@@ -26,12 +26,12 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     raw = torch.randn(count, 4, generator=generator)
     slope = torch.randn(count, field.levels.width, generator=generator)
     background = torch.rand(700, 3, generator=generator)
-    grad_table, wrenches = torch.zeros_like(field.table), torch.zeros_like(poses.wrenches)
+    grad_table = torch.zeros_like(field.table)
     NUMBA.encode_backward(points, slope, field.levels, grad_table)
     grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
     NUMBA.keep_highest(points, raw[:, 3].contiguous(), grid)
-    NUMBA.add_wrenches(
-        samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones, wrenches
+    wrenches = NUMBA.wrenches(
+        samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones
     )
     moved = cells._replace(roots=cells.roots.clone())
     NUMBA.follow(moved, 0, poses.skin, poses.bones[0])
@@ -45,7 +45,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
             NUMBA.composite_loss(raw, samples, 0.01, batch.target, background, 0.1, 0.1)
         ),
         "keep_highest": [grid.density],
-        "add_wrenches": [wrenches],
+        "wrenches": [wrenches],
         "follow": [moved.roots[0, : int((cells.index[0] >> 2).max())]],
     }
 
