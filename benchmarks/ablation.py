@@ -32,7 +32,7 @@ from benchmarks.schemes import Drawn, drawn
 from benchmarks.stage import assembled, filmed, opened, recipe
 from benchmarks.stopwatch import use_threads
 
-DRAWN = 4
+DRAWN = 3
 """Novel poses that every scheme draws."""
 PAPER = "union grid, Broyden (the paper)"
 GIVEN = {"refine_poses": False}
