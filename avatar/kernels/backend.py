@@ -111,12 +111,15 @@ class PosedGrid(NamedTuple):
         low: Corner of each slot's grid, metres.
         cells_per_m: Along each axis.
         shape: Cells along each axis.
+        near, far: Corners of the box between whose walls samples lie, metres.
     """
 
     occupied: Integer[Tensor, "slots cells"]
     low: Float32[Tensor, "slots 3"]
     cells_per_m: Float32[Tensor, "slots 3"]
     shape: Int32[Tensor, "slots 3"]
+    near: Float32[Tensor, "slots 3"]
+    far: Float32[Tensor, "slots 3"]
 
 
 class Articulations(NamedTuple):

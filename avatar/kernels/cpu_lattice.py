@@ -14,15 +14,16 @@ F32, I32 = np.float32, np.int32
 
 
 @compile_kernel(**FAST)
-def _walk(origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, points, first):
+def _walk(
+    origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, near, far, points, first
+):
     """Samples of one ray; they are written from row `first` on, unless it is negative."""
     enter, leave = F32(0), F32(1e9)
     for axis in range(3):
         direction = _safe(towards[axis])
-        near = (low[axis] - origin[axis]) / direction
-        far = near + F32(shape[axis]) / cells_per_m[axis] / direction
-        enter = max(enter, min(near, far))
-        leave = min(leave, max(near, far))
+        one, other = (near[axis] - origin[axis]) / direction, (far[axis] - origin[axis]) / direction
+        enter = max(enter, min(one, other))
+        leave = min(leave, max(one, other))
     kept, step = 0, 0
     while True:
         t = enter + (F32(step) + jitter) * step_m
@@ -45,25 +46,49 @@ def _walk(origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, po
 
 @compile_kernel(parallel=True, **FAST)
 def count(
-    origins, directions, slots, jitter, step_m, occupied, low, cells_per_m, shape, nowhere, counts
+    origins,
+    directions,
+    slots,
+    jitter,
+    step_m,
+    occupied,
+    low,
+    cells_per_m,
+    shape,
+    near,
+    far,
+    nowhere,
+    counts,
 ):
     """How many samples each ray has."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
         counts[ray] = _walk(
             origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
-            cells_per_m[slot], shape[slot], nowhere, -1,
+            cells_per_m[slot], shape[slot], near[slot], far[slot], nowhere, -1,
         )  # fmt: skip
 
 
 @compile_kernel(parallel=True, **FAST)
 def place(
-    origins, directions, slots, jitter, step_m, occupied, low, cells_per_m, shape, points, first
+    origins,
+    directions,
+    slots,
+    jitter,
+    step_m,
+    occupied,
+    low,
+    cells_per_m,
+    shape,
+    near,
+    far,
+    points,
+    first,
 ):
     """Writes each ray's samples, from its own row on."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
         _walk(
             origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
-            cells_per_m[slot], shape[slot], points, first[ray],
+            cells_per_m[slot], shape[slot], near[slot], far[slot], points, first[ray],
         )  # fmt: skip

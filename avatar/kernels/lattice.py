@@ -17,18 +17,22 @@ def place(
     low: Float32[Tensor, "slots 3"],
     cells_per_m: Float32[Tensor, "slots 3"],
     shape: Int32[Tensor, "slots 3"],
+    near: Float32[Tensor, "slots 3"],
+    far: Float32[Tensor, "slots 3"],
 ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
     """Samples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
+
+    A ray enters the box between `near` and `far`, and ends where it leaves it. Beyond the grid its
+    outermost cells count.
 
     Returns:
         Points of the body frame, ray by ray, and how many each ray has.
     """
     slot = slots.long()
     towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
-    near = (low[slot] - origins) / towards
-    far = near + shape[slot] / cells_per_m[slot] / towards
-    enter = torch.minimum(near, far).amax(dim=1).clamp(min=0.0)
-    leave = torch.maximum(near, far).amin(dim=1)
+    walls = (near[slot] - origins) / towards, (far[slot] - origins) / towards
+    enter = torch.minimum(*walls).amax(dim=1).clamp(min=0.0)
+    leave = torch.maximum(*walls).amin(dim=1)
     longest = float((leave - enter).max()) if len(slot) else 0.0
     steps = math.ceil(max(longest, 0.0) / step_m) + 1
     t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * step_m

@@ -34,15 +34,22 @@ class Emptiness(Protocol):
         ...
 
 
+def persons_box(
+    cells: CellTables,
+) -> tuple[Float32[Tensor, "slots 3"], Float32[Tensor, "slots 3"]]:
+    """Corners of the box about each slot's person, body frame: the near and far bound of rays."""
+    return cells.low, cells.low + cells.shape * cells.cell_m
+
+
 @final
 class NothingKnown:
     """No skipping: every sample between the walls of the person's box is warped and asked."""
 
     def grid(self, cells: CellTables) -> PosedGrid:
         """A single cell, which is the box."""
-        size = cells.shape * cells.cell_m
+        near, far = persons_box(cells)
         one = torch.ones_like(cells.shape)
-        return PosedGrid(one[:, :1], cells.low, 1.0 / size, one)
+        return PosedGrid(one[:, :1], near, 1.0 / (far - near), one, near, far)
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """None."""
@@ -66,7 +73,7 @@ class BandKnown:
     def grid(self, cells: CellTables) -> PosedGrid:
         """The warp cells themselves."""
         per_m = torch.full_like(cells.low, 1.0 / cells.cell_m)
-        return PosedGrid(cells.index, cells.low, per_m, cells.shape)
+        return PosedGrid(cells.index, cells.low, per_m, cells.shape, *persons_box(cells))
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of canonical cells near the skin that hold nothing."""

@@ -12,6 +12,7 @@ from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
 from avatar.kernels.backend import CellTables, PosedGrid
+from avatar.paper.emptiness import persons_box
 from avatar.paper.posed_field import PosedField
 from avatar.rig import Rig
 
@@ -112,6 +113,7 @@ class UnionGrid:
             self._low.repeat(slots, 1),
             torch.full_like(cells.low, 1.0 / self._cell_m),
             torch.full_like(cells.shape, SIDE),
+            *persons_box(cells),
         )
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
@@ -133,8 +135,7 @@ class UnionGrid:
 
     def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
         """Takes in what one frame holds. Outside the person's box it holds nothing."""
-        low = cells.low[slot] - self._low
-        high = low + cells.shape[slot] * cells.cell_m
+        low, high = (corner[slot] - self._low for corner in persons_box(cells))
         first = (low / self._cell_m).floor().long().clamp(0, SIDE).tolist()
         last = (high / self._cell_m).ceil().long().clamp(0, SIDE).tolist()
         block = cells_between(tuple(first), tuple(last), low.device)
@@ -176,7 +177,9 @@ class FrameGrids:
     def grid(self, cells: CellTables) -> PosedGrid:
         """Each slot's own, in the box that it had when it was probed."""
         shape = torch.full_like(cells.shape, SIDE)
-        return PosedGrid(self.occupied.flatten(1), self._low, 1.0 / self._cell_m, shape)
+        far = self._low + SIDE * self._cell_m
+        occupied = self.occupied.flatten(1)
+        return PosedGrid(occupied, self._low, 1.0 / self._cell_m, shape, self._low, far)
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """From empty cells of the grid that was renewed last."""

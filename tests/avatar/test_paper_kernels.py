@@ -30,11 +30,15 @@ def rays_at(boxes, count, generator):
 def boxes(generator):
     """Two slots with grids of different shapes, half of their cells occupied."""
     shape = torch.tensor([[5, 7, 3], [4, 4, 4]], dtype=torch.int32)
+    low = torch.tensor([[-0.5, -0.8, -0.3], [0.0, 0.1, 0.2]])
+    cells_per_m = torch.tensor([[5.0, 4.0, 5.0], [8.0, 4.0, 2.0]])
     return PosedGrid(
         occupied=(torch.rand(2, 105, generator=generator) < 0.5).to(torch.uint8),
-        low=torch.tensor([[-0.5, -0.8, -0.3], [0.0, 0.1, 0.2]]),
-        cells_per_m=torch.tensor([[5.0, 4.0, 5.0], [8.0, 4.0, 2.0]]),
+        low=low,
+        cells_per_m=cells_per_m,
         shape=shape,
+        near=low,
+        far=low + shape / cells_per_m,
     )
 
 
@@ -69,6 +73,21 @@ def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, ge
     ray = torch.repeat_interleave(torch.arange(100), counts)
     apart = (points[1:] - points[:-1]).norm(dim=1)[ray[1:] == ray[:-1]]
     torch.testing.assert_close(apart, torch.full_like(apart, STEP_M), atol=1e-5, rtol=0)
+
+
+@BACKENDS
+def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
+    """A box that is smaller than the grid on one side and larger on the other."""
+    full = boxes._replace(
+        occupied=torch.ones_like(boxes.occupied), near=boxes.near + 0.1, far=boxes.far + 0.1
+    )
+    rays = rays_at(full, 200, generator)
+    points, counts = backend.place(rays, full, STEP_M)
+    slot = rays.slots.long().repeat_interleave(counts)
+    assert len(points) > 500
+    assert (points > full.near[slot] - 1e-5).all()
+    assert (points < full.far[slot] + 1e-5).all()
+    assert (points > boxes.far[slot]).any()
 
 
 @BACKENDS
