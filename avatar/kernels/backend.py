@@ -107,7 +107,7 @@ class PosedGrid(NamedTuple):
     """Which cells of each slot's body frame may hold anything (`avatar.paper`).
 
     Attributes:
-        occupied: Not 0 where something may be.
+        occupied: Above 0 where something may be.
         low: Corner of each slot's grid, metres.
         cells_per_m: Along each axis.
         shape: Cells along each axis.

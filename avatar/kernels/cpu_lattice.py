@@ -35,7 +35,7 @@ def _walk(
         i = min(max(I32((x - low[0]) * cells_per_m[0]), I32(0)), shape[0] - I32(1))
         j = min(max(I32((y - low[1]) * cells_per_m[1]), I32(0)), shape[1] - I32(1))
         k = min(max(I32((z - low[2]) * cells_per_m[2]), I32(0)), shape[2] - I32(1))
-        if occupied[(i * shape[1] + j) * shape[2] + k] != 0:
+        if occupied[(i * shape[1] + j) * shape[2] + k] > 0:
             if first >= 0:
                 points[first + kept, 0] = x
                 points[first + kept, 1] = y

@@ -41,5 +41,5 @@ def place(
     cell = torch.minimum(cell, shape[slot][:, None].long() - 1)
     sides = shape[slot].long()
     flat = (cell[..., 0] * sides[:, None, 1] + cell[..., 1]) * sides[:, None, 2] + cell[..., 2]
-    kept = (t < leave[:, None]) & (occupied[slot[:, None], flat] != 0)
+    kept = (t < leave[:, None]) & (occupied[slot[:, None], flat] > 0)
     return points[kept], kept.sum(dim=1).int()
