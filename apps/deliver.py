@@ -183,6 +183,7 @@ def _report(
         stream=learnt.meter.note(ready_at=ready_at),
         package=package,
         coverage=CoverageNote.of(learnt.coverage),
+        extended=learnt.extended,
     )
 
 
@@ -193,7 +194,7 @@ def _frames_note(learnt: Learnt) -> FramesNote:
         used=learnt.added,
         held_out=meter.held_out,
         dropped=tuple(meter.dropped),
-        not_replayed=learnt.added - len(learnt.trainer.replay),
+        not_replayed=learnt.added - sum(i >= 0 for i in learnt.trainer.replay.indices),
     )
 
 

@@ -96,6 +96,7 @@ def _trainer(
 ) -> "tuple[Trainer, int, dict[str, Any]]":
     """The trainer, how many frames it has seen of this video, and what checkpoints keep."""
     from apps.device import device_for
+    from apps.extension import Extension
     from apps.learn import new_trainer
     from avatar import checkpoint
 
@@ -110,20 +111,24 @@ def _trainer(
         )  # fmt: skip
         return trainer, 0, {"video": video}
     trainer, notes = checkpoint.load(run.checkpoint, device)
-    had = trainer.wall_seconds
+    had, extension = trainer.wall_seconds, Extension(run, notes)
     if notes.get("video") == video:
+        before = notes.get("before", {"frames": 0, "seconds": 0.0})
+        had, seen = had - before["seconds"], trainer.frames_seen - before["frames"]
         console.say(f"Going on after {had:.0f} seconds of training.")
         if had >= seconds:
             console.warn(
                 f"The run has had {had:.0f} of {seconds:.0f} seconds; only its package and "
                 "report are written again. Give more --seconds to go on learning."
             )
-        trainer.config = replace(trainer.config, seconds=seconds, refine_poses=given.refine_poses)
-        return trainer, trainer.frames_seen, notes
-    console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
-    trainer.config = replace(trainer.config, seconds=had + seconds, refine_poses=given.refine_poses)
-    trainer.corrections.clear()  # they are of the other video's frames
-    return trainer, 0, {**notes, "video": video}
+        extension.recall(trainer, console)
+        seconds += before["seconds"]
+    else:
+        console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
+        extension.begin(trainer, console)
+        seconds, seen, notes["video"] = had + seconds, 0, video
+    trainer.config = replace(trainer.config, seconds=seconds, refine_poses=given.refine_poses)
+    return trainer, seen, notes
 
 
 def _name_of(recording: Recording) -> str:

@@ -9,9 +9,10 @@ from typing import Any, final
 import torch
 
 from apps.console import Bar, Console
+from apps.extension import Extension
 from apps.meter import Meter
 from apps.recording import Recording
-from apps.report import CurvePoint, mean, percent
+from apps.report import CurvePoint, ExtendedNote, mean, percent
 from apps.run_folder import RunFolder
 from avatar import checkpoint
 from avatar.advice import advice
@@ -49,6 +50,7 @@ class Learnt:
         interrupted: Whether Ctrl-C ended it.
         scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
         fitted: The same in poses fitted to them, if poses are refined.
+        extended: What an earlier video lost, if there was one.
     """
 
     trainer: Trainer
@@ -60,6 +62,7 @@ class Learnt:
     interrupted: bool
     scores: tuple[Score, ...] = ()
     fitted: tuple[Score, ...] = ()
+    extended: ExtendedNote | None = None
 
     @property
     def trained(self) -> bool:
@@ -163,11 +166,15 @@ class Lesson:
         """
         scores = self._final_scores()
         self._save()
+        extended = Extension(self._run, self._notes).finish(
+            self._trainer, self._held, self._console
+        )
         return replace(
             learnt,
             scores=scores,
             fitted=() if learnt.interrupted else self._fitted_scores(),
             curve=tuple(self._curve),
+            extended=extended,
         )
 
     def _frames(self) -> Iterator[Item]:

@@ -211,6 +211,38 @@ class CoverageNote:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExtendedNote:
+    """What became of an earlier video when this one was added.
+
+    Attributes:
+        recalled: Its key frames that were learnt from again.
+        frames: Its frames that were scored, by their numbers in it; never trained on.
+        psnr_before, psnr_after: Means over them before this video, and at the end, dB.
+        largest_fall: Of any of them, dB; 0 if none fell.
+    """
+
+    recalled: int
+    frames: tuple[int, ...]
+    psnr_before: float | None
+    psnr_after: float | None
+    largest_fall: float | None
+
+    @classmethod
+    def of(
+        cls, before: tuple[Score, ...], after: tuple[Score, ...], *, recalled: int
+    ) -> "ExtendedNote":
+        """From the scores of the same frames."""
+        falls = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
+        return cls(
+            recalled=recalled,
+            frames=tuple(score.frame for score in before),
+            psnr_before=mean([score.psnr for score in before]),
+            psnr_after=mean([score.psnr for score in after]),
+            largest_fall=max(0.0, *falls) if falls else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """All of it. `package` is None if none was written."""
 
@@ -225,13 +257,14 @@ class Report:
     package: PackageNote | None
     held_out_refined: HeldOutNote | None = None
     coverage: CoverageNote | None = None
+    extended: ExtendedNote | None = None
     format: int = FORMAT
 
     def to_json(self) -> str:
         """The text of report.json; what is not a number is null."""
         content = _plain(dataclasses.asdict(self))
         order = ("format", "command", "recipe", "machine", "frames", "training", "held_out")
-        order += ("held_out_refined", "curve", "stream", "package", "coverage")
+        order += ("held_out_refined", "curve", "stream", "package", "coverage", "extended")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from avatar.cells import WarpCells
 from avatar.rig import Rig
@@ -46,6 +47,18 @@ class BodyRays:
         )
 
 
+class Sight(NamedTuple):
+    """From where, and through which pixels, a frame is learnt from.
+
+    Attributes:
+        camera: Of the picture's size.
+        near: Which pixels are near the person, row by row, eight to a byte.
+    """
+
+    camera: Camera
+    near: UInt8[np.ndarray, "bytes"]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedFrame:
     """What replay keeps of an observation.
@@ -58,6 +71,8 @@ class PreparedFrame:
         directions: Of its trainable pixels, those near the person first.
         colors: Premultiplied RGBA of the same pixels.
         near: How many of them are near the person.
+        sight: By which the frame can be made ready again from its colours alone; None where nobody
+            will ask for that.
     """
 
     index: int
@@ -67,24 +82,39 @@ class PreparedFrame:
     directions: Float32[np.ndarray, "pixels 3"]
     colors: UInt8[np.ndarray, "pixels 4"]
     near: int
+    sight: Sight | None = None
 
 
 def prepare(observation: Observation, rig: Rig) -> PreparedFrame:
     """Solves the frame's warp and picks the pixels worth training on."""
-    near, far = _worthwhile(observation.alpha)
-    chosen = np.concatenate([near, far])
-    camera, world_from_body = observation.camera, rig.world_from_body(observation.pose)
+    mask = _near(observation.alpha)
+    chosen = np.concatenate(_split(mask))
+    sight = Sight(camera=observation.camera, near=np.packbits(mask))
+    colors = _premultiplied(observation, chosen)
+    return restored(observation.frame.index, observation.pose, sight, colors, rig)
+
+
+def restored(
+    index: int, pose: BodyPose, sight: Sight, colors: UInt8[np.ndarray, "pixels 4"], rig: Rig
+) -> PreparedFrame:
+    """Makes a frame ready from what is kept of it: finds its rays, and solves its warp."""
+    camera = sight.camera
+    width, height = camera.size_px
+    mask = np.unpackbits(sight.near, count=width * height).reshape(height, width).astype(bool)
+    near, far = _split(mask)
+    world_from_body = rig.world_from_body(pose)
     camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
     sights = _sights(camera.focal_px, camera.center_px, camera.size_px, camera.distortion)
     origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
     return PreparedFrame(
-        index=observation.frame.index,
-        pose=observation.pose,
-        cells=WarpCells.of(rig, observation.pose.joint_rotations),
+        index=index,
+        pose=pose,
+        cells=WarpCells.of(rig, pose.joint_rotations),
         origin=origin.astype(np.float32),
-        directions=sights[chosen] @ camera_from_body.astype(np.float32),
-        colors=_premultiplied(observation, chosen),
+        directions=sights[np.concatenate([near, far])] @ camera_from_body.astype(np.float32),
+        colors=colors,
         near=len(near),
+        sight=sight,
     )
 
 
@@ -114,15 +144,18 @@ def _premultiplied(
     return np.rint(premultiplied, out=premultiplied).astype(np.uint8)
 
 
-def _worthwhile(
-    alpha: Float32[np.ndarray, "height width"],
+def _near(alpha: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """The pixels near the person."""
+    kernel = np.ones((max(5, int(NEAR * len(alpha)) | 1),) * 2, dtype=np.uint8)
+    return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
+
+
+def _split(
+    near: Bool[np.ndarray, "height width"],
 ) -> tuple[Int[np.ndarray, "near"], Int[np.ndarray, "far"]]:
     """Flat indices of the pixels near the person, and of the others in a box around them."""
-    height = alpha.shape[0]
-    kernel = np.ones((max(5, int(NEAR * height) | 1),) * 2, dtype=np.uint8)
-    near = cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    margin = int(FAR * height)
+    margin = int(FAR * len(near))
     box = np.zeros_like(near)
     box[
         max(0, rows[0] - margin) : rows[-1] + margin + 1,

@@ -9,12 +9,13 @@ from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from avatar.cells import CELL_M, WarpCells
 from avatar.kernels.backend import CellTables, Rays
-from avatar.prepare import PreparedFrame
+from avatar.prepare import PreparedFrame, Sight
+from preprocess.pose import BodyPose
 
 NEAR_SHARE = 0.9
 """Of the rays, how many go through pixels near the person."""
@@ -37,6 +38,22 @@ class RootCorrection(NamedTuple):
     rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]
     pivot: Float[np.ndarray, "3"]
+
+
+class KeyFrame(NamedTuple):
+    """What must be kept of a frame to learn from it again.
+
+    Attributes:
+        index: Its number.
+        pose: As it was given.
+        sight: From where, and through which pixels, it was seen.
+        colors: Premultiplied RGBA of those pixels.
+    """
+
+    index: int
+    pose: BodyPose
+    sight: Sight
+    colors: UInt8[np.ndarray, "pixels 4"]
 
 
 class Batch(NamedTuple):
@@ -64,6 +81,7 @@ class Replay:
         self.capacity = capacity
         self.device = device
         self.indices: list[int] = []
+        self._seen: list[tuple[BodyPose, Sight | None]] = []
         self._likeness = np.zeros((capacity, 3 + 69))
         self._gap = np.full((capacity, capacity), np.inf)
         self._error = torch.zeros(capacity, device=device)
@@ -100,14 +118,26 @@ class Replay:
         if len(self) < self.capacity:
             slot = len(self)
             self.indices.append(frame.index)
+            self._seen.append((frame.pose, frame.sight))
         else:
             slot = self._most_alike()
             self.indices[slot] = frame.index
+            self._seen[slot] = frame.pose, frame.sight
         self._compare(slot, likeness)
         self._fill(slot, frame)
         held = self._error[: len(self)]
         self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
         return slot
+
+    def key_frames(self) -> list[KeyFrame]:
+        """What must be kept of the frames to learn from them again."""
+        kept = []
+        for slot, (pose, sight) in enumerate(self._seen):
+            if sight is not None:
+                pixels = int(self._near[slot] + self._far[slot])
+                colors = self._colors[slot, :pixels].cpu().numpy().copy()
+                kept.append(KeyFrame(self.indices[slot], pose, sight, colors))
+        return kept
 
     def put_cells(self, slot: int, cells: WarpCells) -> None:
         """Gives a slot the warp of its frame's pose."""

@@ -120,6 +120,7 @@ class _Stream:
         held: list[HeldOut],
     ) -> None:
         self._trainer, self._inbox, self._held = trainer, inbox, held
+        self._began = trainer.wall_seconds
         self._ended_at: float | None = None
         self._last_steps = 0
         self.clock = Clock(trainer)
@@ -155,7 +156,8 @@ class _Stream:
 
     def is_behind(self, now: float) -> bool:
         """Whether reading must come first for a while; a video's own pace cannot be hurried."""
-        late = now > READING_SHARE * self._trainer.config.seconds
+        began, end = self._began, self._trainer.config.seconds
+        late = now > began + READING_SHARE * (end - began)
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:

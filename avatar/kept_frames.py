@@ -1,0 +1,185 @@
+"""Frames beside a checkpoint: what a finished avatar still needs when another video is added.
+
+Key frames are kept as replay has them: colours in 8 bits, and from where they were seen; rays and
+warps are found again. A few held-out frames come along, so that it can be said what they lost.
+"""
+
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from avatar.hold import HeldOut, spread
+from avatar.prepare import PreparedFrame, Sight, restored
+from avatar.replay import KeyFrame, Replay
+from avatar.rig import Rig
+from capture.camera import Camera
+from capture.errors import BadInput
+from capture.frame import Frame
+from preprocess.observation import Observation
+from preprocess.pose import BodyPose
+
+FORMAT = 1
+FINISHED, EARLIER = "frames.tensors", "earlier.tensors"
+"""Of the run that ended last; of the runs before the video that is being learnt now."""
+CLIP = 1 << 32
+"""Frames of an earlier video have numbers so much smaller: no two frames share one."""
+HELD_OUT = 12
+"""Held-out frames that are kept."""
+
+
+class KeptFrames(NamedTuple):
+    """What is kept.
+
+    Attributes:
+        key_frames: To learn from.
+        held: To score; never trained on.
+    """
+
+    key_frames: list[KeyFrame]
+    held: list[HeldOut]
+
+    @classmethod
+    def of(cls, replay: Replay, held: Sequence[HeldOut]) -> "KeptFrames":
+        """Everything in replay, and a few of the held-out frames, evenly."""
+        return cls(replay.key_frames(), spread(list(held), HELD_OUT))
+
+    def earlier(self) -> "KeptFrames":
+        """The same with the numbers of an earlier video's frames."""
+        held = [
+            replace(
+                kept,
+                observation=replace(
+                    kept.observation,
+                    frame=replace(
+                        kept.observation.frame, index=kept.observation.frame.index - CLIP
+                    ),
+                ),
+            )
+            for kept in self.held
+        ]
+        return KeptFrames(
+            [frame._replace(index=frame.index - CLIP) for frame in self.key_frames], held
+        )
+
+    def prepared(self, rig: Rig) -> list[PreparedFrame]:
+        """The key frames, ready to be learnt from again."""
+        return [restored(*frame, rig) for frame in self.key_frames]
+
+    def save(self, path: Path) -> None:
+        """Writes them, whole or not at all.
+
+        Raises:
+            OSError: If the disk is full; what was there before stays.
+        """
+        state = {
+            "format": FORMAT,
+            "key_frames": [_key_frame_state(frame) for frame in self.key_frames],
+            "held": [_observation_state(kept.observation) for kept in self.held],
+        }
+        part = path.with_suffix(".part")
+        try:
+            with part.open("wb") as file:
+                torch.save(state, file)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        except RuntimeError as error:  # torch stumbles once more after the disk has failed
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
+        finally:
+            part.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: Path) -> "KeptFrames":
+        """Reads them; none if there is no such file.
+
+        Raises:
+            BadInput: If it cannot be read.
+        """
+        if not path.exists():
+            return cls([], [])
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            return cls(
+                [_key_frame(kept) for kept in state["key_frames"]],
+                [HeldOut(observation=_observation(kept)) for kept in state["held"]],
+            )
+        except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError,
+                pickle.UnpicklingError) as error:  # fmt: skip
+            raise BadInput(
+                f"The frames {path} cannot be read ({error}). Expected those that ia-ingest wrote; "
+                "without the file the older video is no longer learnt from."
+            ) from error
+
+
+def _key_frame_state(frame: KeyFrame) -> dict[str, Any]:
+    return {
+        "index": frame.index,
+        "colors": torch.from_numpy(frame.colors),
+        "near": torch.from_numpy(frame.sight.near),
+        "camera": _camera_state(frame.sight.camera),
+        "pose": _pose_state(frame.pose),
+    }
+
+
+def _key_frame(state: dict[str, Any]) -> KeyFrame:
+    return KeyFrame(
+        index=state["index"],
+        pose=_pose(state["pose"]),
+        sight=Sight(camera=_camera(state["camera"]), near=state["near"].numpy()),
+        colors=state["colors"].numpy(),
+    )
+
+
+def _observation_state(observation: Observation) -> dict[str, Any]:
+    alpha = np.rint(observation.alpha * 65535.0).astype(np.int32)
+    return {
+        "index": observation.frame.index,
+        "time_s": observation.frame.time_s,
+        "rgb": torch.from_numpy(np.ascontiguousarray(observation.frame.rgb)),
+        "alpha": torch.from_numpy(alpha),
+        "camera": _camera_state(observation.camera),
+        "pose": _pose_state(observation.pose),
+    }
+
+
+def _observation(state: dict[str, Any]) -> Observation:
+    alpha = state["alpha"].numpy().astype(np.float32) / np.float32(65535.0)
+    frame = Frame(index=state["index"], time_s=state["time_s"], rgb=state["rgb"].numpy())
+    return Observation(
+        frame=frame, alpha=alpha, pose=_pose(state["pose"]), camera=_camera(state["camera"])
+    )
+
+
+def _camera_state(camera: Camera) -> dict[str, Any]:
+    return {
+        "focal_px": list(camera.focal_px),
+        "center_px": list(camera.center_px),
+        "size_px": list(camera.size_px),
+        "distortion": list(camera.distortion),
+        "camera_from_world": torch.from_numpy(camera.camera_from_world),
+    }
+
+
+def _camera(state: dict[str, Any]) -> Camera:
+    pairs = {name: tuple(state[name]) for name in ("focal_px", "center_px", "size_px")}
+    return Camera(
+        **pairs,
+        distortion=tuple(state["distortion"]),
+        camera_from_world=state["camera_from_world"].numpy(),
+    )
+
+
+def _pose_state(pose: BodyPose) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(np.array(values)) for name, values in vars(pose).items()}
+
+
+def _pose(state: dict[str, torch.Tensor]) -> BodyPose:
+    return BodyPose(**{name: values.numpy() for name, values in state.items()})
