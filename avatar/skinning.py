@@ -5,12 +5,12 @@ from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
-NEIGHBOURS = 30
+NEIGHBOURS = 10
 """Vertices blended at each node; 1 would be the paper's variant (nearest vertex)."""
 CLOSEST_M = 2e-3
 """Distances below this count as this, so that a node on a vertex does not take it alone."""
 SMOOTHED_BEYOND_M = 0.03
-"""Nodes farther from the skin than this are smoothed fully, nearer ones lightly."""
+"""Nodes farther from the skin than this are smoothed; nearer ones, where clothes hang, are not."""
 SMOOTHINGS = 2
 
 
@@ -33,8 +33,9 @@ def skinning_volume(
     """Skinning weights on the nodes of a grid, corner to corner of the box [low, high].
 
     Fast-SNARF (Chen et al. 2022) reads weights from voxels; InstantAvatar takes those of the
-    nearest vertex. Blending the 30 nearest by inverse squared distance, lightly smoothed, keeps
-    the warp invertible near creases.
+    nearest vertex. Blending the 10 nearest by inverse squared distance, smoothed far off, keeps
+    the warp invertible near creases. More of either pulls clothes off the body that they move
+    with: 30 neighbours and smoothing everywhere cost 0.65 dB in poses never filmed.
 
     Args:
         vertices: Canonical vertices, metres.
@@ -67,7 +68,7 @@ def _smoothed(
 ) -> Float32[np.ndarray, "x y z 24"]:
     for _ in range(SMOOTHINGS):
         mean = uniform_filter(weights, 3, axes=(0, 1, 2))
-        weights = np.where(far, mean, 0.7 * weights + 0.3 * mean)
+        weights = np.where(far, mean, weights)
     weights[weights < 1e-4] = 0.0
     return np.ascontiguousarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)
 

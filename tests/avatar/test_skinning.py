@@ -73,14 +73,14 @@ def test_near_one_of_two_bodies_the_weights_are_its_own():
 
 
 def test_weights_fall_with_the_square_of_the_distance():
-    """One far vertex and twenty-nine at three times its distance: 1 against 29 / 9."""
+    """One vertex against the others at three times its distance: each of those weighs a ninth."""
     node = np.array([0.0, 0.0, 0.0])
     around = np.random.default_rng(2).normal(size=(NEIGHBOURS - 1, 3))
     around *= 0.3 / np.linalg.norm(around, axis=1, keepdims=True)
     vertices = np.concatenate([[[0.1, 0.0, 0.0]], around]) + node
     weights = np.concatenate([one_hot(9), one_hot(2, NEIGHBOURS - 1)])
     share = skinning_volume(vertices, weights, -1e-4 + node, 1e-4 + node, 1e-4, 10.0)
-    np.testing.assert_allclose(share[..., 9], 1.0 / (1.0 + 29.0 / 9.0), atol=1e-3)
+    np.testing.assert_allclose(share[..., 9], 1.0 / (1.0 + (NEIGHBOURS - 1) / 9.0), atol=1e-3)
 
 
 def test_a_node_on_a_vertex_is_not_taken_by_it_alone():
@@ -89,7 +89,7 @@ def test_a_node_on_a_vertex_is_not_taken_by_it_alone():
     vertices = np.concatenate([np.zeros((1, 3)), around])
     weights = np.concatenate([one_hot(9), one_hot(2, NEIGHBOURS - 1)])
     share = skinning_volume(vertices, weights, np.full(3, -1e-5), np.full(3, 1e-5), 1e-5, 10.0)
-    own, others = CLOSEST_M**-2, 29 * 0.02**-2
+    own, others = CLOSEST_M**-2, (NEIGHBOURS - 1) * 0.02**-2
     np.testing.assert_allclose(share[..., 9], own / (own + others), atol=1e-3)
 
 
