@@ -55,7 +55,7 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
     scores = []
     for slot, frame in enumerate(held):
         pose = poses.pose(slot)
-        cells = WarpCells.of(avatar.rig, pose.joint_rotations)
+        cells = WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
         scores.append(
             score(avatar, HeldOut(observation=replace(frame.observation, pose=pose), cells=cells))
         )

@@ -55,7 +55,8 @@ def render(
         samples_along: Where samples lie, if not in the avatar's own occupancy
             (`avatar.paper.rendering`).
     """
-    cells = cells or WarpCells.of(avatar.rig, pose.joint_rotations)
+    device = avatar.field.table.device
+    cells = cells or WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
     world_from_body = avatar.rig.world_from_body(pose)
     width, height = camera.size_px
     if samples_along is None:

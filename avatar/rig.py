@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Float, Float32, Int, Int32, Int64
+from scipy.ndimage import maximum_filter
 
 from avatar.skinning import distance_volume, skinning_volume
 from preprocess.body import ShapedBody
@@ -16,8 +18,6 @@ PARTS = np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 
 SEED_SPACING_M = 0.02
 WEIGHT_CELL_M = 0.023
 OCCUPANCY_CELL_M = 0.015
-VISITED_M = 0.14
-"""Root finding may look this far from the skin: the band of the warp cells, and some way beyond."""
 
 
 def canonical_rotations() -> Float[np.ndarray, "23 3"]:
@@ -28,6 +28,22 @@ def canonical_rotations() -> Float[np.ndarray, "23 3"]:
     body_pose = np.zeros(69)
     body_pose[[2, 5, 47, 50]] = 0.2, -0.2, -0.8, 0.8
     return body_pose.reshape(23, 3)
+
+
+class NearNodes(NamedTuple):
+    """Nodes of the weight volume, and the joints that move them.
+
+    Attributes:
+        nodes: Their flat numbers.
+        first: Where each node's joints begin, and the end.
+        joints: Node after node.
+        shares: Weights of these joints, in (0, 1].
+    """
+
+    nodes: Int64[np.ndarray, "nodes"]
+    first: Int64[np.ndarray, "nodes+1"]
+    joints: Int32[np.ndarray, "moving"]
+    shares: Float32[np.ndarray, "moving"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,17 +104,26 @@ class Rig:
             seed_parts=PARTS[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
 
+    def near_nodes(self, reach_m: float) -> NearNodes:
+        """What moves the weight volume's nodes about all that is nearer to the skin than this."""
+        if reach_m not in self._near_nodes:
+            shape, cells = np.array(self.weights.shape[:3]), np.array(self.distance.shape)
+            nearest = [
+                np.minimum(np.linspace(0, cells[k], shape[k]).astype(int), cells[k] - 1)
+                for k in range(3)
+            ]
+            near = maximum_filter(self.distance[np.ix_(*nearest)] < reach_m, 3)
+            nodes = np.flatnonzero(near)
+            weights = self.weights.reshape(-1, 24)[nodes]
+            moving = weights > 0.0
+            first = np.concatenate([[0], moving.sum(axis=1).cumsum()])
+            joints = moving.nonzero()[1].astype(np.int32)
+            self._near_nodes[reach_m] = NearNodes(nodes, first, joints, weights[moving])
+        return self._near_nodes[reach_m]
+
     @cached_property
-    def near_nodes(self) -> tuple[Int[np.ndarray, "near"], Float32[np.ndarray, "near 24"]]:
-        """Flat numbers and weights of the weight volume's nodes that root finding may visit."""
-        shape = np.array(self.weights.shape[:3])
-        cells = np.array(self.distance.shape)
-        nearest = [
-            np.minimum(np.linspace(0, cells[k], shape[k]).astype(int), cells[k] - 1)
-            for k in range(3)
-        ]
-        near = np.flatnonzero(self.distance[np.ix_(*nearest)] < VISITED_M)
-        return near, np.ascontiguousarray(self.weights.reshape(-1, 24)[near])
+    def _near_nodes(self) -> dict[float, NearNodes]:
+        return {}
 
     def body_from_canonical(
         self, joint_rotations: Float[np.ndarray, "23 3"]

@@ -91,7 +91,8 @@ class Trainer:
         self.poses.put(slot, frame.pose, correction=known)
         if known is not None:
             joints = self.poses.pose(slot).joint_rotations
-            self.replay.put_cells(slot, WarpCells.of(self.avatar.rig, joints))
+            cells = WarpCells.of(self.avatar.rig, joints, device=self.replay.device)
+            self.replay.put_cells(slot, cells)
             self.replay.move_root(slot, self.poses.root(slot))
         self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
@@ -176,7 +177,8 @@ def let_follow(
     if slot is None:
         return None
     if poses.strayed(slot):
-        replay.put_cells(slot, WarpCells.of(rig, poses.pose(slot).joint_rotations))
+        joints = poses.pose(slot).joint_rotations
+        replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
     else:
         backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
     replay.move_root(slot, poses.root(slot))

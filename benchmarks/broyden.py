@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from avatar.kernels.backend import Grid
-from avatar.kernels.cpu_cells import _solve
-from avatar.kernels.cpu_skin import moved
+from avatar.kernels.cpu_broyden import solve
+from avatar.kernels.cpu_skin import LANES, moved
 from avatar.kernels.jit import FAST, compile_kernel
 from avatar.kernels.roots import START_BONES
 from avatar.rig import Rig
@@ -21,7 +21,7 @@ F32, I32 = np.float32, np.int32
 def _solve_all(
     points, transforms, low, nodes_per_m, inverse_bones, occupied, density, cells_per_m, out
 ):
-    blend, inverse = np.empty(12, np.float32), np.empty(9, np.float32)
+    blend, inverse = np.empty(LANES, np.float32), np.empty(9, np.float32)
     x = np.empty(3, np.float32)
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -29,7 +29,7 @@ def _solve_all(
         out[i, 0] = out[i, 1] = out[i, 2] = F32(1e3)
         for bone in range(inverse_bones.shape[0]):
             x[0], x[1], x[2] = moved(inverse_bones[bone], px, py, pz)
-            if not _solve(transforms, low, nodes_per_m, px, py, pz, x, blend, inverse):
+            if not solve(transforms, low, nodes_per_m, points[i], x, blend, inverse, True):
                 continue
             a = I32(np.floor((x[0] - low[0]) * cells_per_m[0]))
             b = I32(np.floor((x[1] - low[1]) * cells_per_m[1]))
@@ -48,7 +48,8 @@ class Broyden:
 
     def __init__(self, rig: Rig, joint_rotations: Float[np.ndarray, "23 3"], grid: Grid) -> None:
         bones = rig.body_from_canonical(joint_rotations)
-        flat = bones[:, :3].reshape(24, 12).astype(np.float32)
+        flat = np.zeros((24, LANES), dtype=np.float32)
+        flat[:, :12] = bones[:, :3].reshape(24, 12)
         inverses = np.linalg.inv(bones[list(START_BONES)])[:, :3].reshape(-1, 12)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
         self._given = (

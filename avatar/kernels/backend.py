@@ -2,12 +2,15 @@
 
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int32, Int64, Integer, UInt8
 from torch import Tensor
 
 from avatar.kernels import lattice, pose, reference, roots
+from avatar.kernels.cells import build_cells
 from avatar.levels import HashLevels
+from avatar.rig import Rig
 
 Points = Float32[Tensor, "points 3"]
 """Canonical positions, metres."""
@@ -58,9 +61,9 @@ class CellTables(NamedTuple):
     """Warp cells of many frames, one slot each (`avatar.cells.WarpCells`, padded).
 
     Attributes:
-        index: `first_root * 4 + count` of each cell. Where nothing is near it is 0, or -n to say
-            that all cells less than n away hold nothing either.
-        roots: Root and inverse Jacobian.
+        index: `first_row * 8 + bent * 4 + count` of each cell. Where nothing is near it is 0, or -n
+            to say that all cells less than n away hold nothing either.
+        roots: Roots and how the warp moves about them.
         low: Corner of each slot's grid, body frame, metres.
         shape: Cells along each axis of each slot's grid.
         cell_m: Edge of a cell, metres.
@@ -71,6 +74,20 @@ class CellTables(NamedTuple):
     low: Float32[Tensor, "slots 3"]
     shape: Int32[Tensor, "slots 3"]
     cell_m: float
+
+
+class Cells(NamedTuple):
+    """The warp cells of one frame (`avatar.cells.WarpCells`).
+
+    Attributes:
+        low: Corner of their grid, body frame, metres.
+        index: `first_row * 8 + bent * 4 + count` of each cell.
+        roots: Roots and how the warp moves about them.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    index: Int32[np.ndarray, "gx gy gz"]
+    roots: Float32[np.ndarray, "rows 12"]
 
 
 class Grid(NamedTuple):
@@ -181,6 +198,17 @@ class Backend(Protocol):
         """Gradient of the features with respect to the points."""
         ...
 
+    def build_cells(
+        self,
+        rig: Rig,
+        bones: Float32[np.ndarray, "24 12"],
+        band_m: float,
+        cell_m: float,
+        device: torch.device,
+    ) -> Cells:
+        """The warp of a pose whose bones go from the canonical to the body frame."""
+        ...
+
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         """Canonical samples along rays."""
         ...
@@ -269,6 +297,27 @@ class TorchBackend:
             features = reference.encode(points, table, levels)
             (grad,) = torch.autograd.grad((features * grad_features).sum(), table)
         grad_table += grad
+
+    def build_cells(
+        self,
+        rig: Rig,
+        bones: Float32[np.ndarray, "24 12"],
+        band_m: float,
+        cell_m: float,
+        device: torch.device,
+    ) -> Cells:
+        def there(part: np.ndarray) -> Tensor:
+            return torch.from_numpy(part).to(device)
+
+        extent = rig.box_high - rig.box_low
+        nodes_per_m = (np.array(rig.weights.shape[:3], dtype=np.float32) - 1) / extent
+        cells_per_m = np.array(rig.distance.shape, dtype=np.float32) / extent
+        volume = there(rig.weights), there(rig.box_low), there(nodes_per_m), there(bones)
+        built = build_cells(
+            volume, there(rig.seeds), there(rig.seed_parts), there(rig.distance),
+            there(cells_per_m), band_m, cell_m,
+        )  # fmt: skip
+        return Cells(*(part.cpu().numpy() for part in built))
 
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         return self.march_on(rays, cells, grid, how)[0]

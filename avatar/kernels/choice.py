@@ -8,6 +8,7 @@ the same self-test.
 
 import functools
 import os
+import threading
 import warnings
 
 import torch
@@ -15,6 +16,8 @@ import torch
 from avatar.kernels.backend import Backend, TorchBackend
 from avatar.kernels.selftest import strays
 from capture.errors import BadInput
+
+_ASKING = threading.Lock()
 
 
 def backend_for(device: torch.device) -> Backend:
@@ -33,8 +36,10 @@ def backend_for(device: torch.device) -> Backend:
             f"IA_BACKEND=numba was asked for, but it runs on the CPU only, not on {device}. "
             "Leave it out, or give --device cpu."
         )
-    if device.type == "cpu" and forced != "torch" and _numba_is_sound():
-        return _numba()
+    if device.type == "cpu" and forced != "torch":
+        with _ASKING:  # kernels must not run in two threads at once: who comes second waits
+            if _numba_is_sound():
+                return _numba()
     # a CudaBackend's seat: device.type == "cuda", and `strays` finds nothing on it
     return TorchBackend()
 

@@ -1,5 +1,6 @@
 """The compiled CPU twins behind the common seam."""
 
+import threading
 from typing import final
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from torch import Tensor
 
 from avatar.kernels import (
+    cpu_cells,
     cpu_composite,
     cpu_grid,
     cpu_lattice,
@@ -17,6 +19,7 @@ from avatar.kernels import (
 )
 from avatar.kernels.backend import (
     Articulations,
+    Cells,
     CellTables,
     Features,
     Grid,
@@ -31,6 +34,11 @@ from avatar.kernels.backend import (
     Table,
 )
 from avatar.levels import HashLevels
+from avatar.rig import Rig
+
+_LAST = threading.local()
+KEPT_SAMPLES = 1 << 20
+"""Room for more samples than this is given back at once."""
 
 
 def _levels(
@@ -45,9 +53,26 @@ def _levels(
     return levels.low, levels.cells_per_m, levels.counts, levels.dense, levels.offsets
 
 
+def _room(
+    rays: int, most: int
+) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
+    """Room for the samples of rays before they are packed; what a thread asked for last, if small.
+
+    Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.
+    """
+    key, room = getattr(_LAST, "room", (None, None))
+    if room is None or key != (rays, most):
+        room = np.empty((rays, most, 3), dtype=np.float32), np.empty((rays, most), dtype=np.int32)
+        _LAST.room = ((rays, most), room) if rays * most <= KEPT_SAMPLES else (None, None)
+    return room
+
+
 @final
 class NumbaBackend:
-    """Numba kernels on torch's CPU memory. Only the trainer's thread may call them."""
+    """Numba kernels on torch's CPU memory.
+
+    Only the trainer's thread may call them; `build_cells` alone, which is serial, any thread may.
+    """
 
     name = "numba"
 
@@ -63,23 +88,32 @@ class NumbaBackend:
             points.numpy(), *_levels(levels), grad_features.numpy(), grad_table.numpy()
         )
 
+    def build_cells(
+        self,
+        rig: Rig,
+        bones: Float32[np.ndarray, "24 12"],
+        band_m: float,
+        cell_m: float,
+        device: torch.device,
+    ) -> Cells:
+        return Cells(*cpu_cells.build_cells(rig, bones, band_m, cell_m))
+
     def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
         return self.march_on(rays, cells, grid, how)[0]
 
     def march_on(
         self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
     ) -> tuple[Samples, Float32[Tensor, "rays"]]:
-        padded = np.empty((len(rays.slots), how.most, 3), dtype=np.float32)
-        padded_rows = np.empty((len(rays.slots), how.most), dtype=np.int32)
+        padded, padded_rows = _room(len(rays.slots), how.most)
         count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
+        first = torch.empty(len(rays.slots), dtype=torch.int64)
         cpu_march.march(
             *(part.numpy() for part in rays), np.float32(how.step_m),
             *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
             *(part.numpy() for part in grid), how.grace_steps, padded, padded_rows, count.numpy(),
             reached.numpy(),
         )  # fmt: skip
-        first = torch.cumsum(count, 0) - count
-        total = int(count.sum())
+        total = cpu_march.place(count.numpy(), first.numpy())
         points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
         cpu_march.pack(
             padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()

@@ -3,10 +3,12 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.jit import FAST, LEAN, compile_kernel
 from avatar.kernels.reference import MAX_LOG_DENSITY, OPAQUE_DEPTH
 
-F32, I32, I64 = np.float32, np.int32, np.int64
+F32, I32, U32 = np.float32, np.int32, np.uint32
+ENDLESS = 10**9
+"""A grace of so many samples never ends: `Marching.grace_steps` of exact rendering."""
 
 
 @compile_kernel(inline="always")
@@ -14,14 +16,62 @@ def _safe(x):
     return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 
-@compile_kernel(inline="always")
-def _exit(position, low, cell, index, direction, wide):
-    """Distance along the ray, on one axis, to the far wall of the cells less than `wide` away."""
-    wall = low + F32(index + (wide if direction > 0 else I32(1) - wide)) * cell
-    return abs((wall - position) / _safe(direction))
+@compile_kernel(inline="always", **FAST)
+def _cell(g, count):
+    """The cell along one axis of a place in cells that is inside, but for rounding."""
+    return U32(min(max(I32(g), I32(0)), count - I32(1)))
 
 
-@compile_kernel(parallel=True, **FAST)
+@compile_kernel(inline="always", **FAST)
+def _bend(roots, slot, row, x, y, z):
+    """What a bent warp adds at (x, y, z) from its cell's centre: Σ c_ij d_i d_j."""
+    a, b = row + U32(1), row + U32(2)
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return (
+        xx * roots[slot, a, U32(0)] + yy * roots[slot, a, U32(3)] + zz * roots[slot, a, U32(6)]
+        + xy * roots[slot, a, U32(9)] + xz * roots[slot, b, U32(0)] + yz * roots[slot, b, U32(3)],
+        xx * roots[slot, a, U32(1)] + yy * roots[slot, a, U32(4)] + zz * roots[slot, a, U32(7)]
+        + xy * roots[slot, a, U32(10)] + xz * roots[slot, b, U32(1)] + yz * roots[slot, b, U32(4)],
+        xx * roots[slot, a, U32(2)] + yy * roots[slot, a, U32(5)] + zz * roots[slot, a, U32(8)]
+        + xy * roots[slot, a, U32(11)] + xz * roots[slot, b, U32(2)] + yz * roots[slot, b, U32(5)],
+    )  # fmt: skip
+
+
+@compile_kernel(inline="always", **FAST)
+def _warped(roots, slot, row, bent, x, y, z):
+    """The canonical point of what lies (x, y, z) from the centre of a cell with a root."""
+    u = roots[slot, row, U32(0)] + (
+        roots[slot, row, U32(3)] * x + roots[slot, row, U32(4)] * y + roots[slot, row, U32(5)] * z
+    )
+    v = roots[slot, row, U32(1)] + (
+        roots[slot, row, U32(6)] * x + roots[slot, row, U32(7)] * y + roots[slot, row, U32(8)] * z
+    )
+    w = roots[slot, row, U32(2)] + (
+        roots[slot, row, U32(9)] * x + roots[slot, row, U32(10)] * y + roots[slot, row, U32(11)] * z
+    )
+    if bent:
+        a, b, c = _bend(roots, slot, row, x, y, z)
+        u, v, w = u + a, v + b, w + c
+    return u, v, w
+
+
+@compile_kernel(inline="always", **FAST)
+def _cached(occupied, density, low, cells_per_m, x, y, z, asked):
+    """Cached density of the canonical cell that holds a point; -1 where nothing may be.
+
+    Where nobody asks for the density it is 0: the occupancy alone fits a core's cache.
+    """
+    a = U32(I32(np.floor((x - low[0]) * cells_per_m[0])))  # below 0 it wraps round: too far
+    b = U32(I32(np.floor((y - low[1]) * cells_per_m[1])))
+    c = U32(I32(np.floor((z - low[2]) * cells_per_m[2])))
+    if a >= U32(occupied.shape[0]) or b >= U32(occupied.shape[1]) or c >= U32(occupied.shape[2]):
+        return F32(-1)
+    if occupied[a, b, c] == 0:
+        return F32(-1)
+    return density[a, b, c] if asked else F32(0)
+
+
+@compile_kernel(parallel=True, **LEAN)
 def march(
     origins, directions, slots, jitter, step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
@@ -34,77 +84,81 @@ def march(
     counts. A ray ends `grace_steps` samples after its cached optical depth has passed
     `OPAQUE_DEPTH`, or when `points` holds no more; `reached` is where it would go on.
     """
-    most = points.shape[1]
+    most = U32(points.shape[1])
+    ends = grace_steps < ENDLESS
+    cells_a_m, steps_a_m = F32(1) / cell_m, F32(1) / step_m
     for ray in prange(origins.shape[0]):
-        slot = slots[ray]
-        kept = 0
-        ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        lx, ly, lz = cell_low[slot, 0], cell_low[slot, 1], cell_low[slot, 2]
+        slot = U32(slots[ray])
         nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
-        enter, leave = F32(0), F32(1e9)
-        for axis in range(3):
-            towards = _safe(directions[ray, axis])
-            near = (cell_low[slot, axis] - origins[ray, axis]) / towards
-            far = near + F32(cell_shape[slot, axis]) * cell_m / towards
-            enter = max(enter, min(near, far))
-            leave = min(leave, max(near, far))
-        optical = F32(0)
-        left = grace_steps
-        step = I32(0)
-        while True:
-            t = enter + (F32(step) + jitter[ray]) * step_m
-            if t >= leave or kept >= most:
+        # the place on the ray is told in cells, t in metres; g + t d; ix = dt / dg
+        ox = (origins[ray, 0] - cell_low[slot, 0]) * cells_a_m
+        oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
+        oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
+        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        ix, iy, iz = cell_m / _safe(dx), cell_m / _safe(dy), cell_m / _safe(dz)
+        dx, dy, dz = dx * cells_a_m, dy * cells_a_m, dz * cells_a_m
+        ax, ay, az = -ox * ix, -oy * iy, -oz * iz
+        bx, by, bz = (F32(nx) - ox) * ix, (F32(ny) - oy) * iy, (F32(nz) - oz) * iz
+        enter = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), F32(0)))
+        leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
+        wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
+        wy = F32(1) if iy > 0 else F32(0)
+        wz = F32(1) if iz > 0 else F32(0)
+        optical, left, kept, step = F32(0), grace_steps, U32(0), F32(0)
+        while kept < most:
+            t = enter + (step + jitter[ray]) * step_m
+            if t >= leave:
                 break
-            px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
-            i = min(max(I32((px - lx) / cell_m), I32(0)), nx - I32(1))
-            j = min(max(I32((py - ly) / cell_m), I32(0)), ny - I32(1))
-            k = min(max(I32((pz - lz) / cell_m), I32(0)), nz - I32(1))
-            packed = cell_index[slot, (i * ny + j) * nz + k]
+            gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
+            i, j, k = _cell(gx, nx), _cell(gy, ny), _cell(gz, nz)
+            packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
             if packed <= 0:
-                wide = max(I32(1), -packed)
-                beyond = min(
-                    _exit(px, lx, cell_m, i, dx, wide),
-                    min(_exit(py, ly, cell_m, j, dy, wide), _exit(pz, lz, cell_m, k, dz, wide)),
-                )
-                step += max(I32(1), I32(np.ceil(beyond / step_m)))
+                way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
+                way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
+                if packed < -1:  # so many cells more, whichever way the ray goes
+                    more = F32(-packed - 1)
+                    way = min(way_x + more * abs(ix), way_y + more * abs(iy))
+                    way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
+                step += max(F32(1), np.ceil(way * steps_a_m))
                 continue
-            ex = px - (lx + (F32(i) + F32(0.5)) * cell_m)
-            ey = py - (ly + (F32(j) + F32(0.5)) * cell_m)
-            ez = pz - (lz + (F32(k) + F32(0.5)) * cell_m)
-            best = F32(-1)
-            row = I32(0)
-            bx, by, bz = F32(0), F32(0), F32(0)
-            for candidate in range(packed >> 2, (packed >> 2) + (packed & 3)):
-                r = cell_roots[slot, candidate]
-                x = r[0] + r[3] * ex + r[4] * ey + r[5] * ez
-                y = r[1] + r[6] * ex + r[7] * ey + r[8] * ez
-                z = r[2] + r[9] * ex + r[10] * ey + r[11] * ez
-                a = I32(np.floor((x - low[0]) * cells_per_m[0]))
-                b = I32(np.floor((y - low[1]) * cells_per_m[1]))
-                c = I32(np.floor((z - low[2]) * cells_per_m[2]))
-                if a < 0 or b < 0 or c < 0:
-                    continue
-                if a >= occupied.shape[0] or b >= occupied.shape[1] or c >= occupied.shape[2]:
-                    continue
-                if occupied[a, b, c] != 0 and density[a, b, c] > best:
-                    best = density[a, b, c]
-                    bx, by, bz = x, y, z
-                    row = I32(candidate)
+            ex = (gx - (F32(i) + F32(0.5))) * cell_m
+            ey = (gy - (F32(j) + F32(0.5))) * cell_m
+            ez = (gz - (F32(k) + F32(0.5))) * cell_m
+            best, chosen = F32(-1), U32(0)
+            px, py, pz = F32(0), F32(0), F32(0)
+            row, bent = U32(packed >> 3), packed & 4
+            asked = ends or packed & 3 > 1
+            for _ in range(packed & 3):
+                x, y, z = _warped(cell_roots, slot, row, bent, ex, ey, ez)
+                here = _cached(occupied, density, low, cells_per_m, x, y, z, asked)
+                if here > best:
+                    best, chosen = here, row
+                    px, py, pz = x, y, z
+                row += U32(3) if bent else U32(1)
             if best >= F32(0):
-                points[ray, kept, 0] = bx
-                points[ray, kept, 1] = by
-                points[ray, kept, 2] = bz
-                rows[ray, kept] = row
-                kept += 1
+                points[ray, kept, 0] = px
+                points[ray, kept, 1] = py
+                points[ray, kept, 2] = pz
+                rows[ray, kept] = chosen
+                kept += U32(1)
                 optical += best * step_m
                 if optical > F32(OPAQUE_DEPTH):
                     left -= 1
                     if left < 0:
                         break
-            step += I32(1)
+            step += F32(1)
         counts[ray] = kept
-        reached[ray] = step
+        reached[ray] = I32(step)
+
+
+@compile_kernel(**LEAN)
+def place(counts, first):
+    """Writes where each ray's samples begin when they stand without gaps; how many there are."""
+    total = 0
+    for ray in range(counts.shape[0]):
+        first[ray] = total
+        total += counts[ray]
+    return total
 
 
 @compile_kernel(parallel=True, nogil=True)

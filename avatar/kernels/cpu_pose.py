@@ -81,7 +81,7 @@ def follow(index, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bon
     Args:
         index: The frame's cells, flat.
         shape, grid_low, cell_m: Their grid.
-        roots: Roots, updated in place, and inverse Jacobians, which stay.
+        roots: Roots, updated in place; inverse Jacobians and bends, which stay.
         weights, low, nodes_per_m: The skinning volume.
         bones: The new pose's matrices (24, 12).
     """
@@ -90,8 +90,9 @@ def follow(index, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bon
         for j in range(shape[1]):
             for k in range(shape[2]):
                 packed = index[(i * shape[1] + j) * shape[2] + k]
-                for row in range(packed >> 2, (packed >> 2) + (packed & 3)):
-                    r = roots[row]
+                rows = 3 if packed & 4 else 1
+                for candidate in range(packed & 3):
+                    r = roots[(packed >> 3) + candidate * rows]
                     sx, sy, sz = _skinned(
                         weights, low, nodes_per_m, bones, r[0], r[1], r[2], share, blend
                     )

@@ -18,6 +18,22 @@ def _span(root, across, low, per_m, cells):
 
 
 @compile_kernel(inline="always")
+def _reach(roots, row, bent, half):
+    """How far from its root, at most, a cell's warp reaches along each canonical axis."""
+    r = roots[row]
+    x = half * (abs(r[3]) + abs(r[4]) + abs(r[5]))
+    y = half * (abs(r[6]) + abs(r[7]) + abs(r[8]))
+    z = half * (abs(r[9]) + abs(r[10]) + abs(r[11]))
+    if bent:
+        a, b = roots[row + 1], roots[row + 2]
+        square = half * half
+        x += square * (abs(a[0]) + abs(a[3]) + abs(a[6]) + abs(a[9]) + abs(b[0]) + abs(b[3]))
+        y += square * (abs(a[1]) + abs(a[4]) + abs(a[7]) + abs(a[10]) + abs(b[1]) + abs(b[4]))
+        z += square * (abs(a[2]) + abs(a[5]) + abs(a[8]) + abs(a[11]) + abs(b[2]) + abs(b[5]))
+    return x, y, z
+
+
+@compile_kernel(inline="always")
 def _any(occupied, a0, a1, b0, b1, c0, c1):
     for a in range(a0, a1 + 1):
         for b in range(b0, b1 + 1):
@@ -31,24 +47,21 @@ def _any(occupied, a0, a1, b0, b1, c0, c1):
 def prune(index, roots, cell_m, occupied, low, cells_per_m, pruned):
     """The index without those cells of which no sample can lie in an occupied canonical cell.
 
-    A cell's warp is affine, so the box about its image holds every sample in it: none is lost.
+    A cell's warp is affine, or of second order where it is bent, so that a box about its image
+    holds every sample in it: none is lost.
     """
     half = F32(0.5 * MARGIN) * cell_m
     nx, ny, nz = occupied.shape
     for cell in range(index.shape[0]):
         packed = index[cell]
         pruned[cell] = 0
-        for row in range(packed >> 2, (packed >> 2) + (packed & 3)):
-            r = roots[row]
-            a0, a1 = _span(
-                r[0], half * (abs(r[3]) + abs(r[4]) + abs(r[5])), low[0], cells_per_m[0], nx
-            )
-            b0, b1 = _span(
-                r[1], half * (abs(r[6]) + abs(r[7]) + abs(r[8])), low[1], cells_per_m[1], ny
-            )
-            c0, c1 = _span(
-                r[2], half * (abs(r[9]) + abs(r[10]) + abs(r[11])), low[2], cells_per_m[2], nz
-            )
+        rows = 3 if packed & 4 else 1
+        for candidate in range(packed & 3):
+            row = (packed >> 3) + candidate * rows
+            x, y, z = _reach(roots, row, rows > 1, half)
+            a0, a1 = _span(roots[row, 0], x, low[0], cells_per_m[0], nx)
+            b0, b1 = _span(roots[row, 1], y, low[1], cells_per_m[1], ny)
+            c0, c1 = _span(roots[row, 2], z, low[2], cells_per_m[2], nz)
             if _any(occupied, a0, a1, b0, b1, c0, c1):
                 pruned[cell] = packed
                 break

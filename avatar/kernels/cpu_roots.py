@@ -3,8 +3,8 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.cpu_cells import _solve
-from avatar.kernels.cpu_skin import moved
+from avatar.kernels.cpu_broyden import solve
+from avatar.kernels.cpu_skin import LANES, moved
 from avatar.kernels.jit import FAST, compile_kernel
 from avatar.kernels.roots import SAME_ROOT_M
 
@@ -18,14 +18,14 @@ def find_all(points, slots, blended, low, nodes_per_m, inverses, roots, valid):
     """Where each search of each sample ends, and whether no earlier one had found that root."""
     count = points.shape[0]
     for chunk in prange((count + AT_ONCE - 1) // AT_ONCE):
-        blend, inverse = np.empty(12, np.float32), np.empty(9, np.float32)
+        blend, inverse = np.empty(LANES, np.float32), np.empty(9, np.float32)
         x = np.empty(3, np.float32)
         for i in range(chunk * AT_ONCE, min((chunk + 1) * AT_ONCE, count)):
             slot = slots[i]
             px, py, pz = points[i, 0], points[i, 1], points[i, 2]
             for start in range(inverses.shape[1]):
                 x[0], x[1], x[2] = moved(inverses[slot, start], px, py, pz)
-                found = _solve(blended[slot], low, nodes_per_m, px, py, pz, x, blend, inverse)
+                found = solve(blended[slot], low, nodes_per_m, points[i], x, blend, inverse, True)
                 roots[i, start, 0], roots[i, start, 1], roots[i, start, 2] = x[0], x[1], x[2]
                 for other in range(start):
                     dx = roots[i, other, 0] - x[0]

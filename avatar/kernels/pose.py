@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+from avatar.kernels.reference import root_row
 from avatar.kernels.skin import skinned, weights_at
 
 LONGEST_STEP_M = 0.05
@@ -42,12 +43,15 @@ def follow(
     nodes_per_m: Float[Tensor, "3"],
     bones: Float[Tensor, "24 12"],
 ) -> None:
-    """Moves roots, in place, by one chord step towards what is skinned to their cell's centre."""
+    """Moves roots, in place, by one chord step towards what is skinned to their cell's centre.
+
+    How the warp bends about a root is taken along as it is, like the inverse Jacobian.
+    """
     cell = (index > 0).nonzero()
     packed = index[tuple(cell.T)]
     for candidate in range(3):
         held = (packed & 3) > candidate
-        row = ((packed[held] >> 2) + candidate).long()
+        row = root_row(packed[held], candidate).long()
         center = grid_low + (cell[held] + 0.5) * cell_m
         x, inverse = roots[row, :3], roots[row, 3:].unflatten(1, (3, 3))
         error = center - skinned(x, weights, low, nodes_per_m, bones)

@@ -176,10 +176,8 @@ def march(
     rows = torch.zeros_like(packed)
     for candidate in range(3):
         exists = (packed & 3) > candidate
-        row = torch.where(exists, (packed >> 2) + candidate, 0)
-        root = cell_roots[slot[:, None], row.long()]
-        warp = root[..., 3:].unflatten(-1, (3, 3))
-        canonical = root[..., :3] + (warp @ offset[..., None])[..., 0]
+        row = root_row(packed, candidate)
+        canonical = warped(cell_roots, slot[:, None], row, packed & 4 > 0, offset)
         cached, kept = _look_up(canonical, occupied, density, low, cells_per_m)
         better = exists & kept & (cached > best)
         best = torch.where(better, cached, best)
@@ -193,6 +191,33 @@ def march(
     kept &= torch.cumsum(kept.int(), dim=1) <= most
     after = torch.arange(1, steps + 1, device=slot.device) * kept
     return points[kept], rows[kept].int(), kept.sum(dim=1).int(), after.amax(dim=1).int()
+
+
+def root_row(packed: Int32[Tensor, "*cells"], candidate: int) -> Int32[Tensor, "*cells"]:
+    """Row of a cell's candidate root; 0, which nobody uses, where the cell has no such root."""
+    row = (packed >> 3) + candidate * torch.where(packed & 4 > 0, 3, 1)
+    return torch.where((packed & 3) > candidate, row, 0).int()
+
+
+def warped(
+    roots: Float32[Tensor, "slots roots 12"],
+    slot: Int64[Tensor, "*#points"],
+    row: Int32[Tensor, "*points"],
+    bent: Bool[Tensor, "*points"],
+    offset: Float32[Tensor, "*points 3"],
+) -> Float32[Tensor, "*points 3"]:
+    """The canonical points of what lies `offset` from the centres of cells.
+
+    x* + A d, and Σ c_ij d_i d_j where the warp is bent (`avatar.cells.WarpCells.roots`).
+    """
+    root = roots[slot, row.long()]
+    straight = root[..., :3] + (root[..., 3:].unflatten(-1, (3, 3)) @ offset[..., None])[..., 0]
+    x, y, z = offset.unbind(dim=-1)
+    products = torch.stack([x * x, y * y, z * z, x * y, x * z, y * z], dim=-1)
+    after = torch.where(bent, row, 0).long()  # what is not bent has no rows of its own there
+    more = torch.cat([roots[slot, after + bent], roots[slot, after + 2 * bent, :6]], dim=-1)
+    bend = (products[..., None] * more.unflatten(-1, (6, 3))).sum(dim=-2)
+    return torch.where(bent[..., None], straight + bend, straight)
 
 
 def _look_up(

@@ -4,11 +4,24 @@ import math
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
-from avatar.kernels.backend import Backend, Samples, TorchBackend
+from avatar.kernels.backend import (
+    Backend,
+    Cells,
+    CellTables,
+    Grid,
+    Marching,
+    Rays,
+    Samples,
+    TorchBackend,
+)
+from avatar.kernels.skin import skinned
 from avatar.levels import FEATURES, HashLevels
+from avatar.rig import Rig
 
 POINTS = 256
+CELL_M = 0.05
 TOLERANCE = 1e-3
 """Largest difference allowed, as a share of the largest value."""
 
@@ -34,6 +47,10 @@ def strays(backend: Backend) -> str | None:
     target = torch.rand(16, 4, generator=generator)
     background = torch.rand(16, 3, generator=generator)
 
+    rig, bones = _bent_tube()
+    canonical = torch.from_numpy(rig.seeds) * torch.tensor([1.0, 1.2, 1.2])
+    cells = _cells(TorchBackend(), rig, bones)
+
     def results(of: Backend) -> dict[str, torch.Tensor]:
         grad_table = torch.zeros_like(table)
         of.encode_backward(points, slope, levels, grad_table)
@@ -42,6 +59,10 @@ def strays(backend: Backend) -> str | None:
             "encode": of.encode(points, table, levels),
             "encode_backward": grad_table,
             "encode_points_backward": of.encode_points_backward(points, slope, table, levels),
+            "build_cells": _looked_up(
+                TorchBackend(), _cells(of, rig, bones), rig, bones, canonical
+            ),
+            "march": _looked_up(of, cells, rig, bones, canonical),
             "composite": of.composite(raw, samples, 0.01),
             "composite_loss": torch.cat([rendered.flatten(), loss, grad.flatten() * len(loss)]),
         }
@@ -52,3 +73,65 @@ def strays(backend: Backend) -> str | None:
         if not off <= TOLERANCE or math.isnan(off):
             return name
     return None
+
+
+def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
+    """A tube of 256 seeds along x, and bones that bend it by half a radian in its middle."""
+    low, high = np.array([-0.3, -0.2, -0.2]), np.array([0.3, 0.2, 0.2])
+    x = np.linspace(low[0], high[0], 25)[:, None, None]
+    weights = np.zeros((25, 17, 17, 24), dtype=np.float32)
+    weights[..., 1] = 1.0 / (1.0 + np.exp(-30.0 * x))
+    weights[..., 0] = 1.0 - weights[..., 1]
+    centers = np.stack(
+        np.meshgrid(*(np.linspace(-0.95, 0.95, 20) * side for side in high), indexing="ij"), axis=-1
+    )
+    turn, along = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 16, False), np.linspace(-0.2, 0.2, 16))
+    seeds = np.stack([along, 0.05 * np.cos(turn), 0.05 * np.sin(turn)], axis=-1).reshape(-1, 3)
+    rig = Rig(
+        rest_joints=np.zeros((24, 3)), parents=np.full(24, -1),
+        canonical_rotations=np.zeros((23, 3)),
+        box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
+        distance=np.abs(np.linalg.norm(centers[..., 1:], axis=-1) - 0.05).astype(np.float32),
+        seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * POINTS],
+        seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
+    )  # fmt: skip
+    bones = np.tile(np.eye(4)[:3], (24, 1, 1))
+    bones[1, :2, :2] = [[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]]
+    return rig, bones.reshape(24, 12).astype(np.float32)
+
+
+def _cells(of: Backend, rig: Rig, bones: Float32[np.ndarray, "24 12"]) -> CellTables:
+    built: Cells = of.build_cells(rig, bones, 0.05, CELL_M, torch.device("cpu"))
+    return CellTables(
+        torch.from_numpy(built.index.reshape(1, -1)), torch.from_numpy(built.roots[None]),
+        torch.from_numpy(built.low[None]),
+        torch.tensor([built.index.shape], dtype=torch.int32), CELL_M,
+    )  # fmt: skip
+
+
+def _looked_up(
+    of: Backend,
+    cells: CellTables,
+    rig: Rig,
+    bones: Float32[np.ndarray, "24 12"],
+    canonical: Float32[torch.Tensor, "points 3"],
+) -> Float32[torch.Tensor, "points 3"]:
+    """Where marching finds what skinning has carried off; 0 where it finds nothing."""
+    extent = rig.box_high - rig.box_low
+    low, shape = torch.from_numpy(rig.box_low), np.array(rig.distance.shape, dtype=np.float32)
+    nodes_per_m = torch.from_numpy((np.array(rig.weights.shape[:3], np.float32) - 1) / extent)
+    posed = skinned(
+        canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
+    )
+    grid = Grid(
+        torch.ones(rig.distance.shape, dtype=torch.uint8), torch.ones(rig.distance.shape), low,
+        torch.from_numpy(shape / extent),
+    )  # fmt: skip
+    rays = Rays(
+        posed, torch.tensor([[0.6, 0.64, 0.48]]).repeat(len(posed), 1),
+        torch.zeros(len(posed), dtype=torch.int32), torch.zeros(len(posed)),
+    )  # fmt: skip
+    samples = of.march(rays, cells, grid, Marching(9.0, math.inf, 1))
+    found = torch.zeros_like(posed)
+    found[samples.count > 0] = samples.points
+    return found

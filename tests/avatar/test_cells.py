@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from avatar.cells import WarpCells
-from avatar.kernels import skin
+from avatar.kernels import reference, skin
 
 
 def skinning(rig, rotations):
@@ -22,18 +22,29 @@ def posed(rig, rotations, canonical):
 
 def nearest_root_error(cells, targets, canonical):
     """How far the nearest of a cell's candidate roots is from where the point came from."""
+    return np.linalg.norm(candidates(cells, targets) - canonical[:, None], axis=2).min(axis=1)
+
+
+def candidates(cells, targets, bends=True):
+    """What each root of their cells makes of posed points; far off where there is no such root."""
     place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
-    packed = cells.index[tuple(place.T)]
-    offset = targets - (cells.low + (place + 0.5) * cells.cell_m)
-    error = np.full(len(targets), np.inf)
+    packed = torch.from_numpy(cells.index[tuple(place.T)])
+    offset = torch.from_numpy(targets - (cells.low + (place + 0.5) * cells.cell_m)).float()
+    slot, roots = torch.zeros(len(targets), dtype=torch.int64), torch.from_numpy(cells.roots)[None]
+    found = []
     for candidate in range(3):
-        exists = (packed & 3) > candidate
-        root = cells.roots[np.where(exists, (packed >> 2) + candidate, 0)]
-        warp = root[:, 3:].reshape(-1, 3, 3)
-        found = root[:, :3] + np.einsum("nab,nb->na", warp, offset)
-        off = np.linalg.norm(found - canonical, axis=1)
-        error = np.where(exists, np.minimum(error, off), error)
-    return error
+        row = reference.root_row(packed, candidate)
+        bent = (packed & 4 > 0) & bends
+        point = reference.warped(roots, slot, row, bent, offset)
+        found.append(torch.where(row[:, None] > 0, point, 1e3))
+    return torch.stack(found, dim=1).numpy()
+
+
+def solved_roots(cells):
+    """Roots and inverse Jacobians, without the rows that say how bent cells bend."""
+    packed = torch.from_numpy(cells.index[cells.index > 0])
+    rows = torch.cat([reference.root_row(packed, candidate) for candidate in range(3)])
+    return cells.roots[rows[rows > 0].numpy()]
 
 
 def around_the_skin(rig, rng, count=20000, spread=0.02):
@@ -61,7 +72,7 @@ def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
     cells = WarpCells.of(rig, bent_pose)
     place = np.argwhere((cells.index & 3) == 1)[::37]
     centers = torch.from_numpy((cells.low + (place + 0.5) * cells.cell_m).astype(np.float32))
-    roots = torch.from_numpy(cells.roots[cells.index[tuple(place.T)] >> 2])
+    roots = torch.from_numpy(cells.roots[cells.index[tuple(place.T)] >> 3])
     found, rested = skin.find_roots(centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose))
     assert rested.float().mean() > 0.95
     off = (found - roots[:, :3]).norm(dim=1)[rested]
@@ -70,7 +81,7 @@ def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
 
 def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
     cells = WarpCells.of(rig, bent_pose)
-    roots = cells.roots[1:][::29]
+    roots = solved_roots(cells)[::29]
     step = rng.normal(size=(len(roots), 3)).astype(np.float32)
     step *= 1e-3 / np.linalg.norm(step, axis=1, keepdims=True)
     moved = posed(rig, bent_pose, roots[:, :3] + step) - posed(rig, bent_pose, roots[:, :3])
@@ -81,7 +92,7 @@ def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
 
 def test_no_cell_is_far_from_the_body(rig, bent_pose):
     cells = WarpCells.of(rig, bent_pose, band_m=0.05)
-    place = (cells.roots[1:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
+    place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
     cell = (place * rig.distance.shape).astype(int)
     assert rig.distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
 
@@ -91,11 +102,75 @@ def test_wild_poses_are_solved_without_harm(rig, rng):
     for _ in range(20):
         cells = WarpCells.of(rig, rng.normal(size=(23, 3)) * 2.0)
         assert np.isfinite(cells.roots[1:]).all()
-        place = (cells.roots[1:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
+        place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
         assert ((place >= 0.0) & (place <= 1.0)).all()
 
 
 def test_only_nodes_near_the_skin_are_blended(rig):
-    near, weights = rig.near_nodes
-    assert len(near) < 0.4 * rig.weights[..., 0].size
-    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near])
+    near = rig.near_nodes(0.11)
+    assert len(near.nodes) < 0.4 * rig.weights[..., 0].size
+    weights = np.zeros((len(near.nodes), 24), dtype=np.float32)
+    weights[np.repeat(np.arange(len(near.nodes)), np.diff(near.first)), near.joints] = near.shares
+    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.nodes])
+    assert len(rig.near_nodes(0.2).nodes) > len(near.nodes)
+
+
+def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeypatch):
+    few = WarpCells.of(rig, bent_pose)
+    all_nodes = rig.near_nodes(9.0)
+    monkeypatch.setattr(type(rig), "near_nodes", lambda self, reach_m: all_nodes)
+    everywhere = WarpCells.of(rig, bent_pose)
+    np.testing.assert_array_equal(few.index, everywhere.index)
+    same = np.abs(few.roots - everywhere.roots).max(axis=1) < 1e-3
+    assert same.mean() > 0.995  # in folds rounding decides
+
+
+def test_the_second_order_term_betters_bent_cells_and_only_those_have_it(rig, rng, bent_pose):
+    canonical = around_the_skin(rig, rng)
+    targets = posed(rig, bent_pose, canonical).numpy()
+    cells = WarpCells.of(rig, bent_pose)
+    place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
+    bent = (cells.index[tuple(place.T)] & 4) > 0
+    assert 0.02 < bent.mean() < 0.4
+    errors = [
+        np.linalg.norm(candidates(cells, targets[bent], on) - canonical[bent, None], axis=2).min(1)
+        for on in (False, True)
+    ]
+    assert np.median(errors[1]) < 0.4 * np.median(errors[0])
+    assert np.quantile(errors[1], 0.9) < 0.4 * np.quantile(errors[0], 0.9)
+
+
+def test_the_compiled_build_agrees_with_its_meaning(rig, rng, bent_pose, monkeypatch):
+    ours = WarpCells.of(rig, bent_pose)
+    monkeypatch.setenv("IA_BACKEND", "torch")
+    theirs = WarpCells.of(rig, bent_pose)
+    np.testing.assert_allclose(ours.low, theirs.low, atol=1e-5)
+    assert ours.index.shape == theirs.index.shape
+    assert np.mean((ours.index & 3) == (theirs.index & 3)) > 0.995
+    assert np.mean((ours.index & 4) == (theirs.index & 4)) > 0.98
+    targets = posed(rig, bent_pose, around_the_skin(rig, rng)).numpy()
+    found = [candidates(cells, targets)[:, :2] for cells in (ours, theirs)]
+    gap = np.linalg.norm(found[0][:, :, None] - found[1][:, None], axis=3).min(axis=2)[:, 0]
+    assert np.median(gap) < 2e-5
+    assert np.quantile(gap, 0.99) < 5e-4
+    assert np.mean(gap > 1e-2) < 2e-3
+
+
+def test_a_pose_is_solved_the_same_way_every_time(rig, bent_pose):
+    first, second = WarpCells.of(rig, bent_pose), WarpCells.of(rig, bent_pose)
+    np.testing.assert_array_equal(first.index, second.index)
+    np.testing.assert_array_equal(first.roots, second.roots)
+
+
+def test_a_wider_band_holds_all_that_a_narrow_one_holds_and_more(rig, rng, bent_pose):
+    canonical = around_the_skin(rig, rng, spread=0.06)
+    place = (canonical - rig.box_low) / (rig.box_high - rig.box_low) * rig.distance.shape
+    inside = ((place >= 0) & (place < rig.distance.shape)).all(axis=1)
+    canonical, cell = canonical[inside], place[inside].astype(int)
+    off_skin = rig.distance[tuple(cell.T)]
+    far = (off_skin > 0.1) & (off_skin < 0.14)
+    targets = posed(rig, rig.canonical_rotations + 0.02, canonical).numpy()
+    wide = WarpCells.of(rig, rig.canonical_rotations + 0.02, band_m=0.15)
+    error = nearest_root_error(wide, targets, canonical)
+    assert far.sum() > 1000
+    assert np.mean(error[far] < 2e-3) > 0.99

@@ -126,7 +126,7 @@ def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, tab
 def residual(rig, table, cells, roots, bones):
     """How far each root, skinned, is from its cell's centre."""
     place = np.argwhere(cells.index > 0)
-    rows = cells.index[tuple(place.T)] >> 2
+    rows = cells.index[tuple(place.T)] >> 3
     posed = skin.skinned(roots[rows, :3], *table.skin, bones).numpy()
     return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avatar.kernels import choice
-from avatar.kernels.backend import TorchBackend
+from avatar.kernels.backend import Cells, Samples, TorchBackend
 from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.selftest import strays
@@ -28,6 +28,10 @@ class Spoiled:
             if result is None:  # works in place, on its last argument
                 arguments[-1].mul_(self._factor)
                 return None
+            if isinstance(result, Cells):
+                return result._replace(roots=result.roots * self._factor)
+            if isinstance(result, Samples):
+                return result._replace(points=result.points * self._factor)
             if isinstance(result, tuple):
                 return tuple(part * self._factor for part in result)
             return result * self._factor
@@ -41,8 +45,11 @@ def test_the_compiled_backend_is_sound():
 
 @pytest.mark.parametrize(
     "operation",
-    ["encode", "encode_backward", "encode_points_backward", "composite", "composite_loss"],
-)
+    [
+        "encode", "encode_backward", "encode_points_backward", "build_cells", "march",
+        "composite", "composite_loss",
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
 def test_an_operation_that_is_off_is_named(operation, factor):
     assert strays(Spoiled(operation, factor)) == operation

@@ -46,7 +46,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         ),
         "keep_highest": [grid.density],
         "wrenches": [wrenches],
-        "follow": [moved.roots[0, : int((cells.index[0] >> 2).max())]],
+        "follow": [moved.roots[0, : int((cells.index[0] >> 3).max())]],
     }
 
 
