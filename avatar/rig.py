@@ -130,8 +130,12 @@ class Rig:
     ) -> Float[np.ndarray, "24 4 4"]:
         """The matrices that linear blend skinning blends, from canonical to body frame."""
         posed = body_from_rest(self.rest_joints, self.parents, joint_rotations)
+        return posed @ self._rest_from_canonical
+
+    @cached_property
+    def _rest_from_canonical(self) -> Float[np.ndarray, "24 4 4"]:
         canonical = body_from_rest(self.rest_joints, self.parents, self.canonical_rotations)
-        return posed @ np.linalg.inv(canonical)
+        return np.linalg.inv(canonical)
 
     def world_from_body(self, pose: BodyPose) -> Float[np.ndarray, "4 4"]:
         """The root's rigid motion."""
