@@ -28,6 +28,8 @@ class Page:
         drawn: Rendering by each scheme.
         exact, noisy: Refinement of exact and of noisy poses.
         core_minutes: What all of it took.
+
+    A table without figures (all but `losses` and `by_time` may have none) is left out.
     """
 
     hardware: list[str]
@@ -79,9 +81,11 @@ class Page:
         by_time = self.by_time
         lines = [f"## Empty-space skipping and root finding in training ({self.seconds:g} core-s)"]
         lines += ["", *self._paced(by_time), ""]
-        lines += [f"The same after {self.steps} steps:", "", *self._paced(self.by_steps), ""]
+        if self.by_steps:
+            lines += [f"The same after {self.steps} steps:", "", *self._paced(self.by_steps), ""]
+        longer = self.by_steps or by_time
         paper, none = (
-            _named(self.by_steps, name)
+            _named(longer, name)
             for name in ("union grid, Broyden (the paper)", "no skipping, Broyden")
         )
         unskipped = _named(by_time, "no skipping, cells")
@@ -90,7 +94,7 @@ class Page:
             "The paper, Tab. 3: 100 epochs in 3m10s without skipping, 1m47s with it: 1.78 times. "
             f"Here ours is {number(unskipped.late_ms / ours.late_ms)} times faster with skipping "
             "than without, by the last fifth of the time; the paper's own scheme "
-            f"{number(none.late_ms / paper.late_ms)} times, by the last fifth of {self.steps} "
+            f"{number(none.late_ms / paper.late_ms)} times, by the last fifth of {paper.steps} "
             "steps. Every row also keeps the canonical occupancy with which its avatar is scored: "
             f"{self.occupancy_ms:.1f} ms of each step, which only ours needs. Broyden is compiled, "
             "and searches nine times for each sample.",
@@ -113,6 +117,8 @@ class Page:
         )  # fmt: skip
 
     def _rendering(self, some: int) -> list[str]:
+        if not self.drawn:
+            return []
         rows = [
             (
                 row.name, number(row.ready_ms), number(row.draw_ms),
@@ -132,6 +138,8 @@ class Page:
         ]
 
     def _refinement(self) -> list[str]:
+        if not self.exact:
+            return []
         rows = [
             *(_scored(row, f"{row.steps:,}", name=f"exact, {row.name}") for row in self.exact),
             *(
