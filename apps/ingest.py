@@ -11,7 +11,7 @@ import tyro
 
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
-from apps.ingest_arguments import IngestArguments
+from apps.ingest_arguments import IngestArguments, with_port
 from apps.interrupt import asked_to_stop
 from apps.recording import Recording
 from apps.run_folder import RunFolder
@@ -21,12 +21,14 @@ from capture.camera_device import camera_address
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
     from apps.learn import Learnt
+    from apps.view.viewer import Viewer
     from avatar.trainer import Trainer
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = tyro.cli(IngestArguments, prog="ia-ingest", args=arguments)
+    words = with_port(sys.argv[1:] if arguments is None else arguments)
+    given = tyro.cli(IngestArguments, prog="ia-ingest", args=words)
     return exit_code("ia-ingest", lambda: ingest(given, Console()))
 
 
@@ -59,10 +61,14 @@ def ingest(given: IngestArguments, console: Console) -> int:
         backend_for(device_for(given.device))  # a bad --device is said here, too
     trainer, recall, notes = _trainer(given, recording, run, console)
     _warm_up(trainer, console)
+    viewer = _viewer(given, recording, run, console)
     run.begin(resume=given.resume)
     try:
         with asked_to_stop(console) as stop:
-            lesson = Lesson(trainer, recording, run, console, stop, notes)
+            lesson = Lesson(
+                trainer, recording, run, console, stop, notes,
+                watchers=() if viewer is None else (viewer,),
+            )  # fmt: skip
             learnt = lesson.learn(recall=recall)
             _check_learnt(learnt, recording)
             startup = (learnt.meter.first_at or started) - started
@@ -74,11 +80,17 @@ def ingest(given: IngestArguments, console: Console) -> int:
             delivered = deliver(lesson.scored(learnt), taken, recording, run, note, console)
             if given.json is not None:
                 write_text(given.json, delivered.report.to_json())
-            return _conclude(delivered, run, console, interrupted=stop.is_set())
+            code = _conclude(delivered, run, console, interrupted=stop.is_set())
+        if viewer is not None and code == DONE:
+            console.say(f"The page stays at {viewer.page.address}. Ctrl-C ends it.")
+            viewer.stay(lesson)
+        return code
     except (OSError, KeyboardInterrupt) as error:
         error.add_note(run.what_is_kept())
         raise
     finally:
+        if viewer is not None:
+            viewer.close()
         run.tidy()
 
 
@@ -146,6 +158,16 @@ def _warm_up(trainer: "Trainer", console: Console) -> None:
     with console.waiting("warming up"):
         warm_up(trainer)
         compiled.warm_up()
+
+
+def _viewer(
+    given: IngestArguments, recording: Recording, run: RunFolder, console: Console
+) -> "Viewer | None":
+    if given.view is None:
+        return None
+    from apps.view.viewer import Viewer
+
+    return Viewer(recording, run, console, given.view)
 
 
 def _check_learnt(learnt: "Learnt", recording: Recording) -> None:

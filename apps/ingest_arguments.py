@@ -1,6 +1,8 @@
 """What ia-ingest can be told; the text under each field is its --help."""
 
+import importlib.util
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +19,9 @@ LEARNABLE_PX = 540
 """Longer side of the pictures that a minute is enough for."""
 
 A_MINUTE = 60.0
+
+VIEW_PORT = 8008
+"""Of the page that --view opens."""
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -79,6 +84,10 @@ class IngestArguments:
     """Which frames, START:STOP:STEP, counted from 0."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
+    view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
+    """Watch it learn on a page of this machine, http://127.0.0.1:PORT (8008 if PORT is left out):
+    turn the avatar, see what the camera has not seen yet, pause, save a package now. Needs viser:
+    pip install 'instant-avatar-stream[viewer]'. Ctrl-C closes the page in the end."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto takes a GPU if there is one."""
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -110,6 +119,15 @@ class IngestArguments:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.mask_invert and self.no_mask_invert:
             raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
+
+        if self.view is not None and not 0 <= self.view < 1 << 16:
+            raise BadInput(f"--view is {self.view}; a port from 0 to 65535 was expected.")
+        if self.view is not None and importlib.util.find_spec("viser") is None:
+            raise BadInput(
+                "--view shows a page made with viser, which is not installed. Install it with: "
+                "pip install 'instant-avatar-stream[viewer]' (or: pip install viser). Or leave "
+                "--view out: report.html shows the result afterwards."
+            )
 
     def run_folder(self) -> RunFolder:
         """Where the run lies."""
@@ -151,6 +169,19 @@ class IngestArguments:
             name: str(value) if isinstance(value, Path) else value
             for name, value in vars(self).items()
         }
+
+
+def with_port(words: Sequence[str]) -> list[str]:
+    """The command line with the port that may be left out after --view.
+
+    argparse would take the next word for it, whatever that is.
+    """
+    filled: list[str] = []
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        filled.append(word)
+        if word == "--view" and not after.isdecimal():
+            filled.append(str(VIEW_PORT))
+    return filled
 
 
 def parsed_frames(text: str) -> slice | None:

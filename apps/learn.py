@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -14,19 +14,19 @@ from apps.meter import Meter
 from apps.recording import Recording
 from apps.report import CurvePoint, ExtendedNote, mean, percent
 from apps.run_folder import RunFolder
+from apps.view.watcher import Watcher, shown
 from avatar import checkpoint
 from avatar.advice import advice
 from avatar.config import TrainConfig
 from avatar.coverage import Coverage
 from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
-from avatar.hold import HeldOut, is_held_out, keep, prepared, score
+from avatar.hold import HeldOut, keep, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
-from preprocess.observation import Observation
 from preprocess.observe import Dropped
 
 CHECKPOINT_EVERY_S = 5.0
@@ -86,7 +86,15 @@ def new_trainer(
 
 @final
 class Lesson:
-    """One recording taught to one trainer."""
+    """One recording taught to one trainer.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        curve: Scores so far.
+        coverage: What of the person has been seen so far.
+        meter: What it saw of the stream.
+    """
 
     def __init__(
         self,
@@ -96,6 +104,8 @@ class Lesson:
         console: Console,
         stop: threading.Event,
         notes: dict[str, Any],
+        *,
+        watchers: Sequence[Watcher] = (),
     ) -> None:
         """Nothing happens yet.
 
@@ -106,16 +116,23 @@ class Lesson:
             console: Where progress is shown.
             stop: Ends training as soon as it is set.
             notes: Kept with each checkpoint.
+            watchers: Who looks on.
         """
-        self._trainer, self._recording, self._run = trainer, recording, run
+        self.trainer, self._recording, self._run = trainer, recording, run
         self._console, self._stop, self._notes = console, stop, notes
-        self._curve: list[CurvePoint] = [CurvePoint.again(kept) for kept in notes.get("curve", [])]
-        self._held: list[HeldOut] = []
+        self._watchers = watchers
+        self.curve: list[CurvePoint] = [CurvePoint.again(kept) for kept in notes.get("curve", [])]
+        self.held: list[HeldOut] = []
         self._saved_at = time.perf_counter()
         self.meter = Meter(stop, recording.source)
         self.coverage = Coverage(recording.shaped)
         if "coverage" in notes:
             self.coverage.recall(notes["coverage"])
+
+    @property
+    def stopping(self) -> bool:
+        """Whether somebody wants it to end."""
+        return self._stop.is_set()
 
     def learn(self, *, recall: int = 0) -> Learnt:
         """Trains until the time is up or somebody stops it. Scores come later (`scored`).
@@ -130,11 +147,14 @@ class Lesson:
         source = self._recording.source
         self._inbox = inbox = Inbox(self._frames(), paced=source.paced, live=source.live)
         try:
-            added = self._recall(inbox, recall) - self._trainer.frames_seen
+            added = self._recall(inbox, recall) - self.trainer.frames_seen
             self._saved_at = time.perf_counter()
-            with self._console.bar("learning", self._trainer.config.seconds) as bar:
-                for event in train(self._trainer, inbox, self._held):
+            with self._console.bar("learning", self.trainer.config.seconds) as bar:
+                for event in train(self.trainer, inbox, self.held):
                     self._listen(event, bar)
+                    for watcher in self._watchers:
+                        watcher.heard(event)
+                        watcher.tend(self)
                     if self._stop.is_set():
                         break
         finally:
@@ -145,17 +165,17 @@ class Lesson:
         for warning in [*source.warnings, *self._how_late()]:
             self._console.warn(warning)
         self._console.count_the_rest()
-        if len(self._trainer.replay):
+        if len(self.trainer.replay):
             self._save()
             seen = percent(self.coverage.seen)
             self._console.say(f"{seen} of the person was seen. {advice(self.coverage)}")
         return Learnt(
-            trainer=self._trainer,
-            held=self._held,
-            curve=tuple(self._curve),
+            trainer=self.trainer,
+            held=self.held,
+            curve=tuple(self.curve),
             meter=self.meter,
             coverage=self.coverage,
-            added=added + self._trainer.frames_seen,
+            added=added + self.trainer.frames_seen,
             interrupted=interrupted,
         )
 
@@ -167,13 +187,13 @@ class Lesson:
         scores = self._final_scores()
         self._save()
         extended = Extension(self._run, self._notes).finish(
-            self._trainer, self._held, self._console
+            self.trainer, self.held, self._console
         )
         return replace(
             learnt,
             scores=scores,
             fitted=() if learnt.interrupted else self._fitted_scores(),
-            curve=tuple(self._curve),
+            curve=tuple(self.curve),
             extended=extended,
         )
 
@@ -181,21 +201,10 @@ class Lesson:
         """Frames as they become ready; runs on the inbox's thread."""
         frames = self.meter.frames(self._recording.source.frames())
         found = self.meter.watched(map(self._recording.observer(), frames))
-        observations = self._looked_at(found)
-        rig, every = self._trainer.avatar.rig, self._trainer.config.hold_every
+        rig, every = self.trainer.avatar.rig, self.trainer.config.hold_every
         total = self._recording.source.frame_count
+        observations = shown(found, self.coverage, self._watchers, every=every, total=total)
         return self.meter.timed(prepared(observations, rig, every=every, total=total))
-
-    def _looked_at(
-        self, observations: Iterator[Observation | Dropped]
-    ) -> Iterator[Observation | Dropped]:
-        """Passes observations on; what those show that will be trained on has been seen."""
-        every, total = self._trainer.config.hold_every, self._recording.source.frame_count
-        for position, item in enumerate(observations):
-            held_out = is_held_out(position, every=every, total=total)
-            if isinstance(item, Observation) and not held_out:
-                self.coverage.add(item)
-            yield item
 
     def _recall(self, inbox: Inbox[Item], count: int) -> int:
         """Puts frames back into the memory of a trainer that has learnt from them before."""
@@ -206,10 +215,10 @@ class Lesson:
             while seen < count and not (inbox.finished or self._stop.is_set()):
                 for item in inbox.take(wait_s=0.1):
                     if isinstance(item, HeldOut):
-                        keep(self._held, item)
+                        keep(self.held, item)
                         self.meter.arrived(item.observation.frame.index, held_out=True)
                     elif isinstance(item, PreparedFrame):
-                        self._trainer.add(item, again=True)
+                        self.trainer.add(item, again=True)
                         seen += 1
         return seen
 
@@ -230,9 +239,9 @@ class Lesson:
                 self._console.warn(message)
 
     def _progress(self, event: Stepped) -> str:
-        config = self._trainer.config
-        psnr = self._curve[-1].psnr if self._curve else None
-        rays = self._trainer.rays / max(event.wall_seconds, 1e-6)
+        config = self.trainer.config
+        psnr = self.curve[-1].psnr if self.curve else None
+        rays = self.trainer.rays / max(event.wall_seconds, 1e-6)
         parts = [
             f"{event.wall_seconds:.0f}/{config.seconds:.0f} s",
             f"{event.frames_seen} frames",
@@ -266,32 +275,32 @@ class Lesson:
         point = CurvePoint(
             wall_seconds=wall_s,
             cpu_seconds=cpu_s,
-            frames_seen=self._trainer.frames_seen,
+            frames_seen=self.trainer.frames_seen,
             psnr=mean([s.psnr for s in scores]),
             psnr_mask=mean([s.psnr_mask for s in scores]),
             frames=tuple((s.frame, s.psnr) for s in scores),
         )
-        self._curve.append(point)
+        self.curve.append(point)
         return point
 
     def _final_scores(self) -> tuple[Score, ...]:
-        if not self._held:
+        if not self.held:
             return ()
-        with self._console.waiting(f"scoring {len(self._held)} held-out frames"):
-            scores = tuple(score(self._trainer.avatar, held) for held in self._held)
-        last = self._curve[-1].wall_seconds if self._curve else -1.0
-        if self._trainer.wall_seconds > last:
-            self._mark(scores, self._trainer.wall_seconds, self._trainer.cpu_seconds)
+        with self._console.waiting(f"scoring {len(self.held)} held-out frames"):
+            scores = tuple(score(self.trainer.avatar, held) for held in self.held)
+        last = self.curve[-1].wall_seconds if self.curve else -1.0
+        if self.trainer.wall_seconds > last:
+            self._mark(scores, self.trainer.wall_seconds, self.trainer.cpu_seconds)
         return scores
 
     def _fitted_scores(self) -> tuple[Score, ...]:
-        if not (self._held and self._trainer.config.refine_poses):
+        if not (self.held and self.trainer.config.refine_poses):
             return ()
         with self._console.waiting("fitting poses to the held-out frames"):
-            return fitted_scores(self._trainer, self._held)
+            return fitted_scores(self.trainer, self.held)
 
     def _save(self) -> None:
-        curve = [vars(point) for point in self._curve]
+        curve = [vars(point) for point in self.curve]
         notes = {**self._notes, "curve": curve, "coverage": self.coverage.as_notes()}
-        checkpoint.save(self._trainer, self._run.checkpoint, notes=notes)
+        checkpoint.save(self.trainer, self._run.checkpoint, notes=notes)
         self._saved_at = time.perf_counter()

@@ -24,19 +24,20 @@ MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 
 @final
 class Clock:
-    """Training time, wall and CPU, on top of what earlier runs have used."""
+    """Training time, wall and CPU, on top of what earlier runs have used; pauses do not count."""
 
     def __init__(self, trainer: Trainer) -> None:
         """Starts now."""
         self._trainer = trainer
-        self._wall = time.perf_counter() - trainer.wall_seconds
-        self._cpu = time.process_time() - trainer.cpu_seconds
+        self._wall = time.perf_counter() - trainer.wall_seconds - trainer.held_up_wall
+        self._cpu = time.process_time() - trainer.cpu_seconds - trainer.held_up_cpu
 
     def read(self) -> float:
         """Wall seconds; the trainer's own counts are set to now."""
-        self._trainer.wall_seconds = time.perf_counter() - self._wall
-        self._trainer.cpu_seconds = time.process_time() - self._cpu
-        return self._trainer.wall_seconds
+        trainer = self._trainer
+        trainer.wall_seconds = time.perf_counter() - self._wall - trainer.held_up_wall
+        trainer.cpu_seconds = time.process_time() - self._cpu - trainer.held_up_cpu
+        return trainer.wall_seconds
 
 
 def train(

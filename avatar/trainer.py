@@ -1,5 +1,8 @@
 """The trainer: everything that training changes, and one step of it."""
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import final
 
 import numpy as np
@@ -47,6 +50,7 @@ class Trainer:
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
         frames_seen: Frames taken in so far, whether or not they are still kept.
+        held_up_wall, held_up_cpu: Seconds for which somebody held training up (`held_up`).
     """
 
     def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
@@ -68,6 +72,7 @@ class Trainer:
         self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
+        self.held_up_wall = self.held_up_cpu = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
         rate = config.learning_rate
         self.optimizer = Adam(
@@ -98,6 +103,16 @@ class Trainer:
         self.frames_seen += not again
         if not again:
             self._forget_corrections()
+
+    @contextmanager
+    def held_up(self) -> Iterator[None]:
+        """Time that passes in this block does not count as training."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            self.held_up_wall += time.perf_counter() - wall
+            self.held_up_cpu += time.process_time() - cpu
 
     def step(self, *, rate: float, hard_share: float) -> StepResult:
         """Draws rays, follows their gradient once, and keeps the occupancy up to date.

@@ -1,0 +1,59 @@
+"""What looks on while an avatar is learnt: it hears of everything, and is let in between steps."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+from avatar.coverage import Coverage
+from avatar.events import TrainEvent
+from avatar.hold import is_held_out
+from preprocess.observation import Observation
+from preprocess.observe import Dropped
+
+if TYPE_CHECKING:  # a lesson knows its watchers, too
+    from apps.learn import Lesson
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Somebody who looks on. A lesson without watchers does nothing for them."""
+
+    def frame(self, observation: Observation, *, held_out: bool) -> None:
+        """A frame in which the person was found, before the trainer has it.
+
+        Called on the reader's thread: it must be quick, and may run no parallel kernel.
+        """
+
+    def heard(self, event: TrainEvent) -> None:
+        """Something happened; called on the thread that trains."""
+
+    def tend(self, lesson: "Lesson") -> None:
+        """Between two steps, on the thread that trains: kernels may run here.
+
+        What it takes counts as training time, except inside `Trainer.held_up`.
+        """
+
+
+def shown(
+    observations: Iterator[Observation | Dropped],
+    coverage: Coverage,
+    watchers: Sequence[Watcher],
+    *,
+    every: int,
+    total: int | None,
+) -> Iterator[Observation | Dropped]:
+    """Passes observations on; watchers see them, and what will be trained on has been seen.
+
+    Args:
+        observations: As they are found.
+        coverage: Takes in those that are not held out.
+        watchers: See all of them.
+        every, total: Which are held out (`is_held_out`).
+    """
+    for position, item in enumerate(observations):
+        if isinstance(item, Observation):
+            held_out = is_held_out(position, every=every, total=total)
+            if not held_out:
+                coverage.add(item)
+            for watcher in watchers:
+                watcher.frame(item, held_out=held_out)
+        yield item

@@ -1,0 +1,125 @@
+"""The page's scene: where a browser looks, which pose it sees, and what is drawn for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from apps.recording import Recording, RecordingPaths
+from apps.view.poser import CHOICES, DANCE, FILMED, NEWEST, STANDING, Poser
+from apps.view.scene import PAPER, Look, drawn
+from apps.view.watcher import shown
+from avatar.cells import WarpCells
+from avatar.config import TrainConfig
+from avatar.coverage import Coverage
+from avatar.render import render
+from avatar.trainer import Trainer
+from preprocess.kinematics import rotation_matrices
+from preprocess.observe import Dropped
+
+
+@pytest.fixture(scope="module")
+def recording(film) -> Recording:
+    return Recording.open(RecordingPaths(video=film))
+
+
+@pytest.fixture(scope="module")
+def observations(recording):
+    return [item for item in recording.observations() if not isinstance(item, Dropped)]
+
+
+def look(**changes) -> Look:
+    """From 3.7 m before the origin, level."""
+    first = Look(
+        world_from_camera=np.diag([1.0, -1.0, -1.0]),
+        position=np.array([0.0, 0.0, 3.7]),
+        fov=0.6,
+        aspect=1.5,
+        moved_at=0.0,
+    )
+    return replace(first, **changes)
+
+
+def test_the_camera_looks_where_the_browser_does():
+    camera = look().camera(100)
+    assert camera.size_px == (150, 100)
+    assert camera.project(np.zeros(3)) == pytest.approx([75.0, 50.0])
+    right, up = camera.project(np.eye(3)[:2])
+    assert right[0] > 75.0
+    assert up[1] < 50.0
+    half = 3.7 * np.tan(0.3)  # what the field of view holds, above and below
+    assert camera.project(np.array([0.0, half, 0.0]))[1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_pose_has_its_pelvis_at_the_origin(recording, observations, choice):
+    poser = Poser(recording)
+    for seconds in (0.0, 0.3, 100.0):
+        pose = poser.pose(choice, seconds, observations[3])
+        assert recording.shaped.with_pose(pose).joints()[0] == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_the_first_look_sees_the_newest_frame_as_its_camera_did(recording, observations):
+    poser, newest = Poser(recording), observations[5]
+    page = recording.shaped.with_pose(poser.pose(NEWEST, 0.0, newest)).joints()
+    world = recording.shaped.with_pose(newest.pose).joints()
+    rotation = newest.camera.camera_from_world[:3, :3]
+    seen_there = (world - world[0]) @ rotation.T
+    seen_here = page @ look().camera(100).camera_from_world[:3, :3].T
+    assert seen_here == pytest.approx(seen_there, abs=1e-6)
+
+
+def test_motions_go_on_and_begin_again(recording, observations):
+    poser, motion = Poser(recording), recording.motion
+    times = motion.times_s if motion.times_s is not None else np.arange(len(motion)) / 30.0
+    filmed = poser.pose(FILMED, float(times[4] - times[0]) + 1e-3, None)
+    assert filmed.joint_rotations == pytest.approx(motion[4].joint_rotations)
+    first, later = poser.pose(DANCE, 0.0, None), poser.pose(DANCE, 1.0, None)
+    assert not np.allclose(first.joint_rotations, later.joint_rotations)
+    assert poser.pose(DANCE, 3.0, None).joint_rotations == pytest.approx(first.joint_rotations)
+    standing = poser.pose(STANDING, 0.0, None)
+    assert rotation_matrices(standing.root_rotation) == pytest.approx(np.eye(3))
+    # before the first frame the newest is nobody's
+    assert np.array_equal(poser.pose(NEWEST, 0.0, None).joint_rotations, standing.joint_rotations)
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.0, 3.7), (1.2, 0.8, 1.5), (0.0, 0.0, 0.3)])
+def test_drawing_a_part_of_the_picture_leaves_nothing_out(recording, rig, position):
+    config = TrainConfig(rays=64, step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
+    avatar = Trainer(rig, config, torch.device("cpu")).avatar  # nothing learnt: fog all around
+    pose = Poser(recording).pose(STANDING, 0.0, None)
+    cells = WarpCells.of(rig, pose.joint_rotations)
+    camera = look(position=np.array(position), aspect=1.2).camera(60)
+    patches = Coverage(recording.shaped).patches
+    picture = drawn(avatar, recording.shaped, patches, pose, camera, cells=cells)
+    rgba = render(avatar, pose, camera, cells=cells)
+    whole = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(PAPER)
+    assert np.abs(picture - whole).max() < 1.0
+    assert (rgba[..., 3] > 0.05).any()
+
+
+def test_watchers_see_every_frame_and_coverage_those_that_are_learnt(recording, observations):
+    class Seen:
+        def __init__(self):
+            self.frames = []
+
+        def frame(self, observation, *, held_out):
+            self.frames.append((observation.frame.index, held_out))
+
+        def heard(self, event): ...
+
+        def tend(self, lesson): ...
+
+    stream = [*observations[:4], Dropped(index=4, reason="lost"), *observations[5:24]]
+    watcher, coverage = Seen(), Coverage(recording.shaped)
+    passed = list(shown(iter(stream), coverage, [watcher], every=10, total=24))
+    assert passed == stream
+    held = [index for index, held_out in watcher.frames if held_out]
+    assert held == [9, 19]
+    assert len(watcher.frames) == 23
+    alone = Coverage(recording.shaped)
+    for item in stream:
+        if not isinstance(item, Dropped) and item.frame.index not in held:
+            alone.add(item)
+    assert np.array_equal(coverage.cosines, alone.cosines)
