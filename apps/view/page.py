@@ -1,6 +1,7 @@
 """The page itself: a picture that a browser's camera looks at, and a panel beside it (viser)."""
 
 import io
+import logging
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -60,6 +61,7 @@ class Page:
         self.paused = self.saving = False
         self.choice, self.chosen_at = NEWEST, time.perf_counter()
         self._looks: dict[int, Look] = {}
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # who hangs up is no error
         with redirect_stdout(io.StringIO()):  # viser greets there
             self._server = ViserServer(host=HOST, port=port, label=name, verbose=False)
         # no button asks for a public tunnel, and nobody else may: any page that a browser has

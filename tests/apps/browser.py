@@ -70,7 +70,7 @@ class Browser:
 
     def text(self) -> str:
         """All words on the page."""
-        return self.run("document.body.innerText")
+        return self.run("document.body ? document.body.innerText : ''")
 
     def click(self, label: str) -> None:
         """Presses the button that bears these words."""

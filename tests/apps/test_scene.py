@@ -84,7 +84,7 @@ def test_motions_go_on_and_begin_again(recording, observations):
     assert np.array_equal(poser.pose(NEWEST, 0.0, None).joint_rotations, standing.joint_rotations)
 
 
-@pytest.mark.parametrize("position", [(0.0, 0.0, 3.7), (1.2, 0.8, 1.5), (0.0, 0.0, 0.3)])
+@pytest.mark.parametrize("position", [(0.0, 0.0, 3.7), (0.4, 0.3, 1.5), (0.0, 0.0, 0.3)])
 def test_drawing_a_part_of_the_picture_leaves_nothing_out(recording, rig, position):
     config = TrainConfig(rays=64, step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
     avatar = Trainer(rig, config, torch.device("cpu")).avatar  # nothing learnt: fog all around
