@@ -25,7 +25,7 @@ from preprocess.pose import BodyPose
 
 SHARE, IDLE_SHARE = 0.1, 0.9
 """Of the time, how much the page may take: while the avatar learns, and while it does not."""
-MOVING_PX, RESTING_PX, SHARP_PX = 200, 360, 720
+MOVING_PX, RESTING_PX, SHARP_PX = 160, 360, 720
 """Height of the picture: while something moves, at rest, and at rest while nothing is learnt."""
 RESTS_AFTER_S = 0.4
 PANEL_EVERY_S, MAP_EVERY_S = 0.25, 1.0
@@ -201,10 +201,8 @@ class Viewer:
                 continue
             self._shown.pop(browser, None)  # to the end of the queue
             self._shown[browser] = wanted
-            camera = look.camera(height)
-            body, patches = self._recording.shaped, lesson.coverage.patches
-            avatar = lesson.trainer.avatar
-            self.page.show(browser, drawn(avatar, body, patches, pose, camera, cells=cells))
+            picture = drawn(lesson.trainer.avatar, pose, look.camera(height), cells=cells)
+            self.page.show(browser, picture)
             self._show_frame(newest)
             return True
         return False
