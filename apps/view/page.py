@@ -17,7 +17,7 @@ from apps.view.poser import CHOICES, NEWEST
 from apps.view.scene import PAPER, Look
 
 if TYPE_CHECKING:  # an optional extra, loaded when the page is opened
-    import viser
+    import viser  # pyright: ignore[reportMissingImports]
 
 HOST = "127.0.0.1"
 PANEL_PX = 380
@@ -56,7 +56,7 @@ class Page:
             name: Of what is learnt.
             port: Tried first; the next free one is taken. 0 for any.
         """
-        from viser import ViserServer
+        from viser import ViserServer  # pyright: ignore[reportMissingImports]
 
         self.paused = self.saving = False
         self.choice, self.chosen_at = NEWEST, time.perf_counter()
@@ -157,7 +157,7 @@ class Page:
         self._curve = self._add_curve()
 
     def _add_curve(self) -> "viser.GuiUplotHandle":
-        from viser import uplot
+        from viser import uplot  # pyright: ignore[reportMissingImports]
 
         grid = uplot.Axis_Grid(stroke="#e4dfd4", width=1)
         return self._server.gui.add_uplot(
@@ -193,7 +193,7 @@ class Page:
         self._looks.pop(client.client_id, None)
 
     def _look(self, client: "viser.ClientHandle") -> None:
-        from viser import transforms
+        from viser import transforms  # pyright: ignore[reportMissingImports]
 
         camera = client.camera
         self._looks[client.client_id] = Look(
