@@ -186,9 +186,7 @@ class Lesson:
         """
         scores = self._final_scores()
         self._save()
-        extended = Extension(self._run, self._notes).finish(
-            self.trainer, self.held, self._console
-        )
+        extended = Extension(self._run, self._notes).finish(self.trainer, self.held, self._console)
         return replace(
             learnt,
             scores=scores,

@@ -125,7 +125,7 @@ def stay_and_dance(browser: Browser, log: Path) -> None:
     for _ in range(4):
         time.sleep(1.0)
         pictures.append(scene(browser)[0])
-    assert shows_a_person(scene(browser)[1])
+    until(lambda: shows_a_person(scene(browser)[1]), 30.0)
     moved = [np.abs(b - a).max(axis=2).mean() for a, b in itertools.pairwise(pictures)]
     assert max(moved) > 0.5
 
