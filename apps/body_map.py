@@ -17,7 +17,7 @@ VIEWS = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (2, 1
 """What each view calls right in its picture: an axis of the body and its sign."""
 DOT_CM = 2.7
 """From one dot to the next; rows are shifted by half of it in turn."""
-BLENDED, REACH_CM = 3, 2.6
+BLENDED, REACH_CM = 3, 3.2
 """A dot stands for so many visible patches, the nearest of them no farther than that."""
 GAP_CM, LABEL_CM = 14.0, 12.0
 LEVELS = ("never", "slant", "well")
@@ -66,7 +66,7 @@ class BodyMap:
         """The map as it is now; colours are those of the classes never, slant and well."""
         level = np.digitize(self._coverage.cosines, [1e-6, WELL_COSINE])
         width, height = self._size
-        margin = DOT_CM
+        margin = 1.5 * DOT_CM
         parts = [
             f'<svg class="body-map" viewBox="{-margin:.1f} {-margin:.1f} '
             f'{width + 2 * margin:.1f} {height + 2 * margin + LABEL_CM:.1f}" role="img" '
