@@ -7,7 +7,8 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from avatar.kernels import reference
-from avatar.kernels.backend import Marching, TorchBackend
+from avatar.kernels.backend import Marching
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.replay import Batch, Replay
 from avatar.step import gradients
 from benchmarks.marks import Mark

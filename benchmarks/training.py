@@ -110,10 +110,10 @@ def large_marks(folder: Path, device: torch.device) -> Iterator[Mark]:
     large = filmed(folder / "sample540", 540, frames=300, turns=5.0)
     asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
     yield from wall_marks(large, asked, device)
-    printed = dict.fromkeys(asked, ("", ""))
-    yield from wall_marks(large, printed, device, seconds=TEN_MINUTES)
     yield from start_marks(large)
     yield from memory_marks(large, folder / "run540")
+    printed = dict.fromkeys(asked, ("", ""))
+    yield from wall_marks(large, printed, device, seconds=TEN_MINUTES)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,9 @@ import warnings
 
 import torch
 
-from avatar.kernels.backend import Backend, TorchBackend
+from avatar.kernels.backend import Backend
 from avatar.kernels.selftest import strays
+from avatar.kernels.torch_backend import TorchBackend
 from capture.errors import BadInput
 
 _ASKING = threading.Lock()

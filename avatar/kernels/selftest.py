@@ -14,9 +14,9 @@ from avatar.kernels.backend import (
     Marching,
     Rays,
     Samples,
-    TorchBackend,
 )
 from avatar.kernels.skin import skinned
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES, HashLevels
 from avatar.rig import Rig
 

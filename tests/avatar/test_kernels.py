@@ -9,9 +9,10 @@ from scipy.ndimage import distance_transform_cdt
 
 from avatar.cells import WarpCells
 from avatar.kernels import reference
-from avatar.kernels.backend import Grid, Marching, Rays, Samples, TorchBackend
+from avatar.kernels.backend import Grid, Marching, Rays, Samples
 from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES
 from avatar.occupancy import Occupancy
 from avatar.render import cell_tables

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.kernels.backend import PosedGrid, Rays, TorchBackend
+from avatar.kernels.backend import PosedGrid, Rays
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.roots import SAME_ROOT_M
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.paper.warp import BroydenWarp
 from avatar.trainer import Trainer
 

@@ -13,8 +13,9 @@ from avatar.config import TrainConfig
 from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, prepared, score
 from avatar.kernels import skin
-from avatar.kernels.backend import CellTables, Samples, TorchBackend
+from avatar.kernels.backend import CellTables, Samples
 from avatar.kernels.cpu import NumbaBackend
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES
 from avatar.refine import PoseTable
 from avatar.render import cell_tables

@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from avatar.kernels import choice
-from avatar.kernels.backend import Cells, Samples, TorchBackend
+from avatar.kernels.backend import Cells, Samples
 from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.selftest import strays
+from avatar.kernels.torch_backend import TorchBackend
 
 
 class Spoiled:

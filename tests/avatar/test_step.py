@@ -8,8 +8,9 @@ import torch
 from avatar import step as step_module
 from avatar.config import TrainConfig
 from avatar.kernels import reference
-from avatar.kernels.backend import Marching, Samples, TorchBackend
+from avatar.kernels.backend import Marching, Samples
 from avatar.kernels.cpu import NumbaBackend
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.prepare import prepare
 from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients

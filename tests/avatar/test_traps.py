@@ -19,9 +19,10 @@ from apps.studio.actor import Actor
 from apps.studio.framing import framed
 from avatar.config import TrainConfig
 from avatar.hold import HeldOut, prepared, score
-from avatar.kernels.backend import CellTables, Grid, Marching, Rays, TorchBackend
+from avatar.kernels.backend import CellTables, Grid, Marching, Rays
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.reference import OPAQUE_DEPTH
+from avatar.kernels.torch_backend import TorchBackend
 from avatar.metrics import overlap
 from avatar.model import Avatar
 from avatar.occupancy import DECAY, OPACITY, Occupancy
