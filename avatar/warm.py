@@ -10,7 +10,7 @@ from avatar.cells import WarpCells
 from avatar.prepare import BodyRays, PreparedFrame
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.trainer import Trainer
+from avatar.trainer import REFINED_AFTER_STEPS, Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
@@ -31,8 +31,11 @@ def warm_up(trainer: Trainer) -> float:
     stand_in = Trainer(rig, config, device)
     camera = _camera_before(rig)
     stand_in.add(_frame(rig, camera))
-    for _ in range(2):
+    stand_in.steps = REFINED_AFTER_STEPS
+    for _ in range(config.occupancy_every):
         stand_in.step(rate=1.0, hard_share=1.0)
+    poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
+    stand_in.backend.follow(stand_in.replay.cells, 0, poses.skin, poses.bones[0])
     render(stand_in.avatar, BodyPose.rest(), camera)
     return time.perf_counter() - began
 

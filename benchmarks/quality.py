@@ -88,6 +88,7 @@ def core_second_marks(folder: Path, device: torch.device) -> Iterator[Mark]:
     for seconds, least, moonshot in ((5.0, "32", "34"), (10.0, "34", "36"), (60.0, "36", "39")):
         use_threads(1)
         seen = assembled(recording, rig, recipe(recording, seconds), device)
+        warm_up(seen.trainer)
         train_for_core_seconds(seen.trainer, seconds)
         held, trainer = quality(seen.trainer.avatar, seen.held), seen.trainer
         yield Mark(

@@ -71,7 +71,7 @@ def in_the_box(cells: CellTables, inside: Float32[Tensor, "3"]) -> Unskipped:
     slots, row, _ = cells.roots.shape
     stand_in = torch.zeros(slots, 1, 12, device=cells.roots.device)
     stand_in[:, 0, :3] = inside
-    index = torch.where(cells.index == 0, row * 4 + 1, cells.index)
+    index = torch.where(cells.index <= 0, row * 8 + 1, cells.index)
     filled = cells._replace(index=index, roots=torch.cat([cells.roots, stand_in], dim=1))
     return Unskipped(filled, row, cells, None)
 
@@ -112,14 +112,14 @@ def surrounded(
     before = np.ceil((cells.low - low) / cells.cell_m).clip(0).astype(int) + 1
     after = np.ceil((high - cells.low) / cells.cell_m - shape).clip(0).astype(int) + 1
     index = np.pad(cells.index, np.stack([before, after], axis=1))
-    nearest = distance_transform_edt(index == 0, return_distances=False, return_indices=True)
-    copies = ((index >> 2) + most)[tuple(np.asarray(nearest))] * 4 + 1
+    nearest = distance_transform_edt(index <= 0, return_distances=False, return_indices=True)
+    copies = ((index >> 3) + most)[tuple(np.asarray(nearest))] * 8 + 1
     roots = np.zeros((most + len(cells.roots), 12), dtype=np.float32)
     roots[: len(cells.roots)] = roots[most:] = cells.roots
     return WarpCells(
         low=(cells.low - before * cells.cell_m).astype(np.float32),
         cell_m=cells.cell_m,
-        index=np.where(index == 0, copies, index).astype(np.int32),
+        index=np.where(index <= 0, copies, index).astype(np.int32),
         roots=roots,
     )
 

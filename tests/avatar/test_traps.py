@@ -53,7 +53,7 @@ def flat_world() -> CellTables:
     roots = np.zeros((1, len(centers) + 1, 12), dtype=np.float32)
     roots[0, 1:, :3] = centers
     roots[0, :, [3, 7, 11]] = 1.0
-    index = (np.arange(1, len(centers) + 1, dtype=np.int32) * 4 + 1)[None]
+    index = (np.arange(1, len(centers) + 1, dtype=np.int32) * 8 + 1)[None]
     shape = torch.tensor([[SIDE, SIDE, 8]], dtype=torch.int32)
     return CellTables(
         torch.from_numpy(index), torch.from_numpy(roots), torch.zeros(1, 3), shape, CELL_M
