@@ -193,7 +193,8 @@ def test_a_bent_knee_moves_the_leg_alone(avatar, shot, picture):
     change = np.abs(bent - picture).max(axis=(1, 2))
     half = len(change) // 2
     assert change[half:].max() > 0.5
-    assert change[:half].max() < 0.05
+    # a longer leg makes a longer box, and rays that enter it elsewhere are sampled elsewhere
+    assert change[:half].max() < 0.1
 
 
 # --- the field behind it ----------------------------------------------------------------------
