@@ -40,6 +40,9 @@ STRAYED_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
+SETTLED_AFTER_STEPS = 3000
+"""Steps after which a frame's pose stays as it is: what the field shows of it by then is as much
+its own memory of that pose as evidence, and in a run of ten minutes poses would drift."""
 FARTHEST = 0.35
 """A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
 
@@ -89,12 +92,21 @@ class PoseTable:
         )
         self._below = _subtrees(rig)
         self._moving, self._evidence = 1.0, CHANCE
+        self._since = np.zeros(capacity, dtype=np.int64)
+        self._open = torch.ones(capacity, dtype=torch.bool, device=device)
 
     def put(
-        self, slot: int, pose: BodyPose, correction: Float[np.ndarray, "25 3"] | None = None
+        self,
+        slot: int,
+        pose: BodyPose,
+        correction: Float[np.ndarray, "25 3"] | None = None,
+        *,
+        step: int = 0,
     ) -> None:
-        """Takes in a frame's given pose, and its correction if one is known."""
+        """Takes in a frame's given pose, its correction if one is known, and since which step."""
         self._given[slot] = pose
+        self._since[slot] = step
+        self._open[slot] = True
         self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
@@ -119,6 +131,14 @@ class PoseTable:
             ).as_rotvec(),
         )
 
+    def settle(self, step: int) -> bool:
+        """Leaves alone the poses that were refined for long enough; whether any others are left."""
+        held = np.array([pose is not None for pose in self._given])
+        young = held & (step - self._since < SETTLED_AFTER_STEPS)
+        self._open.copy_(torch.from_numpy(young))
+        self._rays *= self._open
+        return bool(young.any())
+
     def feel(
         self,
         slots: Int64[Tensor, "rays"],
@@ -129,10 +149,10 @@ class PoseTable:
         counts = torch.bincount(slots, minlength=len(self._rays))
         rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
         place = self._rays[slots] + rank
-        kept = place < ROWS
+        kept = (place < ROWS) & self._open[slots]
         self._pulls[slots[kept], place[kept]] = wrenches[kept]
         self._losses[slots[kept], place[kept]] = loss[kept]
-        self._rays = (self._rays + counts).clamp(max=ROWS)
+        self._rays = (self._rays + counts * self._open).clamp(max=ROWS)
 
     def correct_one(self, *, rate: float) -> int | None:
         """Corrects the pose about which most has been found out; cells and rays must follow.

@@ -93,7 +93,8 @@ class Trainer:
         """
         slot = self.replay.add(frame)
         known = self.corrections.get(frame.index)
-        self.poses.put(slot, frame.pose, correction=known)
+        step = 0 if again else self.steps
+        self.poses.put(slot, frame.pose, correction=known, step=step)
         if known is not None:
             joints = self.poses.pose(slot).joint_rotations
             cells = WarpCells.of(self.avatar.rig, joints, device=self.replay.device)
@@ -125,7 +126,7 @@ class Trainer:
         batch = self.replay.draw(config.rays, self._generator)
         remembers = self.steps % config.occupancy_every < 2
         refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
-        refines = refines and self.steps % self.poses.every == 0
+        refines = refines and self.steps % self.poses.every == 0 and self.poses.settle(self.steps)
         result = gradients(
             field, self.sampler, self.replay.cells, batch, config,
             hard_share=hard_share,

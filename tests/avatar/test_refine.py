@@ -17,7 +17,7 @@ from avatar.kernels.backend import CellTables, Samples
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES
-from avatar.refine import PoseTable
+from avatar.refine import SETTLED_AFTER_STEPS, PoseTable
 from avatar.render import cell_tables
 from avatar.step import cosine
 from avatar.trainer import Trainer
@@ -214,6 +214,24 @@ def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_o
     (fitted,) = fitted_scores(learnt.trainer, [held])
     assert fitted.psnr_mask > score(learnt.trainer.avatar, held).psnr_mask + 2.0
     assert torch.equal(table, learnt.trainer.avatar.field.table)
+
+
+def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator):
+    """Its rays pull no more; those of a frame that came later do."""
+    table, pose = PoseTable(rig, 2, torch.device("cpu")), pose_of(bent_pose)
+    table.put(0, pose, step=0)
+    table.put(1, pose, step=1000)
+    slots = torch.arange(2).repeat_interleave(300)
+    wrenches, loss = torch.randn(600, 24, 6, generator=generator), torch.full((600,), 0.1)
+
+    def corrected(step):
+        if table.settle(step):
+            table.feel(slots, wrenches + 3.0, loss)
+        return {table.correct_one(rate=1.0) for _ in range(2)} - {None}
+
+    assert corrected(SETTLED_AFTER_STEPS - 1) == {0, 1}
+    assert corrected(SETTLED_AFTER_STEPS) == {1}
+    assert corrected(SETTLED_AFTER_STEPS + 1000) == set()
 
 
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
