@@ -29,3 +29,21 @@ def asked_to_stop(console: Console) -> Iterator[threading.Event]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def ended_by_ctrl_c() -> Iterator[threading.Event]:
+    """An event that every Ctrl-C sets, and that none of them can miss.
+
+    A KeyboardInterrupt may be raised in a callback that swallows it, and then nothing ends. Off the
+    main thread the event is never set.
+    """
+    ended = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield ended
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: ended.set())
+    try:
+        yield ended
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 
 from apps.body_map import BodyMap
 from apps.console import Console
+from apps.interrupt import ended_by_ctrl_c
 from apps.learn import Lesson
 from apps.recording import Recording
 from apps.report import percent
@@ -89,12 +90,9 @@ class Viewer:
         status = f"Done after {lesson.trainer.wall_seconds:.0f} s"
         self._note = f"The avatar: {self._run.package}"
         self._next_panel = 0.0
-        try:
-            while True:
+        with ended_by_ctrl_c() as ended:
+            while not ended.wait(0.02):
                 self._look_after(lesson, status, idle=True)
-                time.sleep(0.02)
-        except KeyboardInterrupt:
-            pass
 
     def close(self) -> None:
         """Takes the page down."""
