@@ -1,7 +1,6 @@
 """What training has learnt, on disk: written whole or not at all, read as plain data."""
 
 import dataclasses
-import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.rig import Rig
+from avatar.save_whole import save_whole
 from avatar.trainer import Trainer
 from capture.errors import BadInput
 
@@ -32,19 +32,8 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
     """
     folder.mkdir(parents=True, exist_ok=True)
     state = {**_state(trainer), "notes": notes or {}}
-    path, part = folder / FILE, folder / (FILE + ".part")
-    try:
-        with part.open("wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except RuntimeError as error:  # torch stumbles once more after the disk has failed
-        if isinstance(error.__context__, OSError):
-            raise error.__context__ from None
-        raise
-    finally:
-        part.unlink(missing_ok=True)
+    path = folder / FILE
+    save_whole(state, path)
     return path
 
 

@@ -4,7 +4,6 @@ Key frames are kept as replay has them: colours in 8 bits, and from where they w
 warps are found again. A few held-out frames come along, so that it can be said what they lost.
 """
 
-import os
 import pickle
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from avatar.hold import HeldOut, spread
 from avatar.prepare import PreparedFrame, Sight, restored
 from avatar.replay import KeyFrame, Replay
 from avatar.rig import Rig
+from avatar.save_whole import save_whole
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -82,19 +82,7 @@ class KeptFrames(NamedTuple):
             "key_frames": [_key_frame_state(frame) for frame in self.key_frames],
             "held": [_observation_state(kept.observation) for kept in self.held],
         }
-        part = path.with_suffix(".part")
-        try:
-            with part.open("wb") as file:
-                torch.save(state, file)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
-        except RuntimeError as error:  # torch stumbles once more after the disk has failed
-            if isinstance(error.__context__, OSError):
-                raise error.__context__ from None
-            raise
-        finally:
-            part.unlink(missing_ok=True)
+        save_whole(state, path)
 
     @classmethod
     def load(cls, path: Path) -> "KeptFrames":
