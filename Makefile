@@ -6,7 +6,7 @@ BIN = $(VENV)/bin
 
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: install demo test check
+.PHONY: install demo web test check
 
 install: $(VENV)/installed
 
@@ -20,7 +20,11 @@ demo: install
 	$(BIN)/python -m apps.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
 	$(BIN)/python -m apps.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm
 
+web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
+	$(BIN)/python -m apps.fetch_runtime
+
 test: install
+	-$(BIN)/python -m apps.fetch_runtime # without it the browser's tests are skipped
 	$(BIN)/python -m pytest -q
 
 check: install

@@ -11,8 +11,9 @@ import tyro
 
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
-from apps.ingest_arguments import IngestArguments, with_port
+from apps.ingest_arguments import VIEW_PORT, IngestArguments
 from apps.interrupt import asked_to_stop
+from apps.port import with_port
 from apps.recording import Recording
 from apps.run_folder import RunFolder
 from apps.whole import write_text
@@ -27,7 +28,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    words = with_port(sys.argv[1:] if arguments is None else arguments)
+    words = with_port(sys.argv[1:] if arguments is None else arguments, "--view", VIEW_PORT)
     given = tyro.cli(IngestArguments, prog="ia-ingest", args=words)
     return exit_code("ia-ingest", lambda: ingest(given, Console()))
 

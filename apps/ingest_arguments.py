@@ -2,7 +2,6 @@
 
 import importlib.util
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -169,19 +168,6 @@ class IngestArguments:
             name: str(value) if isinstance(value, Path) else value
             for name, value in vars(self).items()
         }
-
-
-def with_port(words: Sequence[str]) -> list[str]:
-    """The command line with the port that may be left out after --view.
-
-    argparse would take the next word for it, whatever that is.
-    """
-    filled: list[str] = []
-    for word, after in zip(words, [*words[1:], ""], strict=True):
-        filled.append(word)
-        if word == "--view" and not after.isdecimal():
-            filled.append(str(VIEW_PORT))
-    return filled
 
 
 def parsed_frames(text: str) -> slice | None:

@@ -1,4 +1,4 @@
-"""ia-play: an avatar in poses it was never filmed in, as a clip, frames, or figures."""
+"""ia-play: an avatar in poses it was never filmed in, as a clip, a web page, or figures."""
 
 import sys
 import time
@@ -13,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, exit_code
+from apps.port import with_port
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose, Motion
@@ -20,6 +21,7 @@ from preprocess.pose import BodyPose, Motion
 if TYPE_CHECKING:
     from export.player import Player  # onnxruntime is loaded after --help has been answered
 
+WEB_PORT = 8010
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
@@ -46,13 +48,16 @@ class PlayArguments:
     """A cameras.npz to look through (one camera, or one for each pose)."""
     out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
     """Clip to write (.webm, .mp4, .gif), or a folder for RGBA frames 0000.png …; without it a
-    .webm beside the package, named after the poses."""
+    .webm beside the package, named after the poses. With --web: a folder for the page."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side in pixels; without it 540, or what --camera says."""
     fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Pictures a second; without it what the poses say, else 30."""
     background: str = "white"
     """Of clips: a colour (white, #203040) or a picture. Frames keep their alpha."""
+    web: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
+    """Play it in a browser, http://127.0.0.1:PORT (8010 if PORT is left out): turn it, pause, seek.
+    With --out FOLDER nothing is served; the page is written there, for any static host."""
     bench: Flag = False
     """Write no pictures; say how long one takes. Without --poses it moves through a turn."""
     verify: Flag = False
@@ -76,7 +81,8 @@ class Shots:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = tyro.cli(PlayArguments, prog="ia-play", args=arguments)
+    words = with_port(sys.argv[1:] if arguments is None else arguments, "--web", WEB_PORT)
+    given = tyro.cli(PlayArguments, prog="ia-play", args=words)
     return exit_code("ia-play", lambda: play(given, Console()))
 
 
@@ -95,6 +101,8 @@ def play(given: PlayArguments, console: Console) -> int:
         raise BadInput(f"--size is {given.size}; 16 to 4096 pixels can be drawn.")
     if given.fps is not None and not 0.1 <= given.fps <= 240.0:
         raise BadInput(f"--fps is {given.fps}; 0.1 to 240 pictures a second were expected.")
+    if given.web is not None:
+        return _web(given, given.web, console)
     return _bench(given, console) if given.bench else _clip(given, console)
 
 
@@ -143,6 +151,37 @@ def _bench(given: PlayArguments, console: Console) -> int:
         f"{result.pixels_covered:.0%} covered); loaded in {result.load_ms:.0f} ms; "
         f"reference graph {result.reference_ms:.1f} ms"
     )
+    return DONE
+
+
+def _web(given: PlayArguments, port: int, console: Console) -> int:
+    from apps.web import check_folder, clip_of, serve, write_site
+    from export.player import Player
+    from export.web.runtime import runtime_files
+    from export.web.site import site
+
+    if given.camera is not None or given.bench:
+        raise BadInput("--web has a camera of its own: leave out --camera and --bench.")
+    if not 0 < port < 1 << 16:
+        raise BadInput(f"--web {port} is no port; 1 to 65535 were expected.")
+    runtime_files()
+    if given.out is not None:
+        check_folder(given.out)
+    player = Player.load(given.avatar)
+    shots = _shots(given, player, console)
+    clip = clip_of(player, shots.motion, shots.rows, given.fps or _rate(shots.motion))
+    name = (
+        given.avatar.resolve().parent.name if given.avatar.stem == "avatar" else given.avatar.stem
+    )
+    with console.waiting("unpacking the avatar for the page"):
+        files = site(given.avatar, clip, name=name, level=1 if given.out is None else 6)
+    if given.out is None:
+        serve(files, port, console)
+        return DONE
+    write_site(files, given.out)
+    megabytes = sum(map(len, files.values())) / 1e6
+    console.say(f"Wrote {len(files)} files, {megabytes:.1f} MB; any static host serves them:")
+    print(given.out)  # noqa: T201 - what was made goes to stdout, for scripts
     return DONE
 
 

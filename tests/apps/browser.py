@@ -1,13 +1,15 @@
-"""A headless Chromium for tests, driven by the DevTools protocol."""
+"""A headless Chromium for tests, driven by the DevTools protocol through a pipe."""
 
 import base64
 import io
 import itertools
 import json
+import os
+import select
 import shutil
 import subprocess
+import sys
 import time
-import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,17 @@ FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--mute-audio", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--enable-unsafe-swiftshader", "--hide-scrollbars",
-    "--force-color-profile=srgb", "--remote-debugging-port=0",
+    "--force-color-profile=srgb", "--remote-debugging-pipe",
 ]  # fmt: skip
+
+LAUNCH = """
+import fcntl, os, sys
+hears, says = (fcntl.fcntl(int(pipe), fcntl.F_DUPFD, 10) for pipe in sys.argv[1:3])
+os.dup2(hears, 3)
+os.dup2(says, 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+"""Chromium listens on descriptor 3 and answers on 4."""
 
 
 def chromium() -> str | None:
@@ -35,36 +46,39 @@ class Browser:
         program = chromium()
         assert program is not None
         window = f"--window-size={size[0]},{size[1]}"
+        hears, self._says = os.pipe()
+        self._hears, says = os.pipe()
+        launch = [sys.executable, "-S", "-c", LAUNCH, str(hears), str(says)]
+        profile = f"--user-data-dir={folder}"
         self._process = subprocess.Popen(
-            [program, *FLAGS, window, f"--user-data-dir={folder}", "about:blank"],
+            [*launch, program, *FLAGS, window, profile, "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            pass_fds=(hears, says),
         )
-        self._folder, self._numbers = folder, itertools.count(1)
+        os.close(hears)
+        os.close(says)
+        self._session, self._held, self._numbers = "", b"", itertools.count(1)
 
     def __enter__(self) -> "Browser":
-        from websockets.sync.client import connect
-
-        port_file = self._folder / "DevToolsActivePort"
-        until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, 60.0)
-        port = int(port_file.read_text().split()[0])
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-            pages = json.load(answer)
-        address = next(page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page")
-        self._socket = connect(address, max_size=None)
+        target = self._ask("Target.createTarget", url="about:blank")["targetId"]
+        attached = self._ask("Target.attachToTarget", targetId=target, flatten=True)
+        self._session = attached["sessionId"]
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._socket.close()
         self._process.terminate()
         self._process.wait(timeout=20.0)
+        os.close(self._says)
+        os.close(self._hears)
 
     def go(self, address: str) -> None:
         self._ask("Page.navigate", url=address)
 
-    def run(self, script: str) -> Any:
-        """The value of an expression in the page."""
-        answer = self._ask("Runtime.evaluate", expression=script, returnByValue=True)
+    def run(self, script: str, *, seconds: float = 60.0) -> Any:
+        """The value of an expression in the page; what it promises is waited for."""
+        question = {"expression": script, "returnByValue": True, "awaitPromise": True}
+        answer = self._ask("Runtime.evaluate", seconds=seconds, **question)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
@@ -86,14 +100,55 @@ class Browser:
         data = self._ask("Page.captureScreenshot", format="png")["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
-    def _ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def emulate(self, *, scheme: str, size: tuple[int, int]) -> None:
+        """A device's size, and whether its owner likes it dark."""
+        preference = {"name": "prefers-color-scheme", "value": scheme}
+        self._ask("Emulation.setEmulatedMedia", features=[preference])
+        width, height = size
+        self._ask(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
+
+    def press(self, key: str) -> None:
+        """A key goes down and up; characters are typed."""
+        text = {"text": key} if len(key) == 1 else {}
+        self._ask("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
+        self._ask("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def drag(self, start: tuple[int, int], end: tuple[int, int]) -> None:
+        """The mouse is pressed at one place and let go at another."""
+        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+            held = {"button": "left", "buttons": 1, "clickCount": 1}
+            self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+
+    def _ask(self, method: str, *, seconds: float = 60.0, **parameters: Any) -> dict[str, Any]:
         number = next(self._numbers)
-        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        question = {"id": number, "method": method, "params": parameters}
+        if self._session:
+            question["sessionId"] = self._session
+        os.write(self._says, json.dumps(question).encode() + b"\0")
+        end = time.perf_counter() + seconds
         while True:
-            answer = json.loads(self._socket.recv(timeout=60.0))
+            answer = self._answer(end, method)
             if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer["result"]
+
+    def _answer(self, end: float, method: str) -> dict[str, Any]:
+        """The next message, answer or not."""
+        while b"\0" not in self._held:
+            left = end - time.perf_counter()
+            ready = select.select([self._hears], [], [], max(left, 0.0))[0]
+            assert ready, f"the browser does not answer {method}"
+            part = os.read(self._hears, 1 << 20)
+            assert part, "the browser has ended"
+            self._held += part
+        message, self._held = self._held.split(b"\0", 1)
+        return json.loads(message)
 
 
 def until(condition: Any, seconds: float) -> None:

@@ -1,0 +1,41 @@
+// Draws with the package's ONNX graph: asks the worker, one picture at a time.
+
+export class GraphEngine {
+  /** heard: called with {arrived: bytes} and {preparing: true} while a tier is being opened. */
+  constructor(avatar, heard) {
+    this.avatar = avatar;
+    this.waiting = new Map();
+    this.next = 0;
+    this.worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
+    this.worker.onmessage = ({ data }) => {
+      if (data.number === undefined) return heard(data);
+      const { resolve, reject } = this.waiting.get(data.number);
+      this.waiting.delete(data.number);
+      data.failed ? reject(new Error(data.failed)) : resolve(data);
+    };
+    this.worker.onerror = (event) => {
+      const error = new Error(event.message || "The player's worker could not be started.");
+      for (const { reject } of this.waiting.values()) reject(error);
+      this.waiting.clear();
+    };
+  }
+
+  async open(tier) {
+    await this.ask("open", { tier, note: this.avatar.tiers[tier], runtime: this.avatar.runtime });
+  }
+
+  /** Straight-alpha RGBA of width × height, and the milliseconds it took. */
+  async draw(tier, shot) {
+    const samples = shot.samples ?? this.avatar.tiers[tier].samples;
+    const { rgba, ms } = await this.ask("draw", { tier, ...shot, samples });
+    return { rgba: new Uint8ClampedArray(rgba), ms };
+  }
+
+  ask(kind, content) {
+    const number = this.next++;
+    return new Promise((resolve, reject) => {
+      this.waiting.set(number, { resolve, reject });
+      this.worker.postMessage({ number, kind, ...content });
+    });
+  }
+}

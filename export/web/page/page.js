@@ -1,0 +1,182 @@
+// The page: buttons, settings and words around the show.
+
+import { listen } from "./gestures.js";
+import { Orbit } from "./orbit.js";
+import { Player } from "./player.js";
+import { Show } from "./show.js";
+
+const TIERS = { hq: "Full", lite: "Lite" };
+const ENGINES = { wasm: "CPU", webgl: "GPU" };
+const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
+const THEMES = { system: "System", light: "Light", dark: "Dark" };
+const $ = (id) => document.getElementById(id);
+
+export async function start() {
+  const loading = new Loading();
+  const player = await Player.load((news) => loading.hear(news));
+  const { avatar } = player;
+  $("name").textContent = document.title = avatar.name;
+  $("licence").textContent = avatar.licence;
+  const state = { engine: "wasm", tier: "hq", sharpness: "auto", playing: false, speed: 1 };
+  loading.expect(avatar, "hq");
+  await player.open(state);
+  const orbit = new Orbit(avatar.look);
+  const show = new Show($("picture"), player, orbit, state, (news) => tell(news, player, loading));
+  settings(player, state, show, loading);
+  transport(player, state, show, orbit);
+  listen($("picture"), orbit, () => show.changed());
+  window.player = player; // for scripts: verify(), measure()
+  show.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
+  markPlaying(state);
+  show.run();
+  loading.done();
+}
+
+/** What is shown while a tier is being loaded. */
+class Loading {
+  constructor() {
+    this.bytes = 0;
+    this.total = 1;
+  }
+
+  expect(avatar, tier) {
+    const { graph, tables } = avatar.tiers[tier];
+    this.bytes = 0;
+    this.total = [avatar.runtime, graph, ...tables].reduce((sum, entry) => sum + entry.bytes, 0);
+    $("status").hidden = false;
+  }
+
+  hear({ arrived, preparing }) {
+    this.bytes += arrived || 0;
+    const [done, all] = [this.bytes, this.total].map((bytes) => (bytes / 1e6).toFixed(1));
+    $("status-bar").value = preparing ? 1 : this.bytes / this.total;
+    $("status-text").textContent = preparing ? "Preparing …" : `Loading ${done} of ${all} MB`;
+  }
+
+  done() {
+    $("status").hidden = true;
+  }
+
+  failed(message) {
+    $("status").hidden = false;
+    $("status").classList.add("failed");
+    $("status-text").textContent = message;
+  }
+}
+
+function tell({ failed, row, ms, rate, playing }, player, loading) {
+  if (failed) return loading.failed(failed.message);
+  const second = (value) => (value / player.fps).toFixed(1);
+  $("timeline").value = row;
+  $("time").textContent = `${second(row)} / ${second(player.count)} s`;
+  const pace = document.createElement("span");
+  pace.className = "ms";
+  pace.textContent = `${ms.toFixed(0)} ms`;
+  $("rate").replaceChildren(pace, ...(playing ? [` · ${rate} fps`] : []));
+  return undefined;
+}
+
+/** Radio buttons; chosen hears the value. */
+function choices(fieldset, values, current, chosen, dress = (span, label) => { span.textContent = label; }) {
+  const box = fieldset.querySelector(".choices");
+  for (const [value, label] of Object.entries(values)) {
+    const [line, input, span] = ["label", "input", "span"].map((tag) => document.createElement(tag));
+    Object.assign(input, { type: "radio", name: fieldset.id, value, checked: value === current });
+    input.addEventListener("change", () => chosen(value));
+    dress(span, label, value, input);
+    line.append(input, span);
+    box.append(line);
+  }
+  fieldset.hidden = Object.keys(values).length < 2;
+  return box;
+}
+
+const known = (names, there) => Object.fromEntries(there.map((name) => [name, names[name] ?? name]));
+
+function settings(player, state, show, loading) {
+  const change = (key) => async (value) => {
+    const wanted = { ...state, [key]: value };
+    loading.expect(player.avatar, wanted.tier);
+    try {
+      await player.open(wanted);
+      state[key] = value;
+      show.changed();
+      loading.done();
+    } catch (error) {
+      loading.failed(error.message);
+    }
+  };
+  choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, change("tier"));
+  choices($("engines"), known(ENGINES, Object.keys(player.engines)), state.engine, change("engine"));
+  choices($("themes"), THEMES, "system", (theme) => { document.documentElement.dataset.theme = theme; });
+  backgrounds();
+  $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; show.changed(); };
+  $("speed").onchange = () => { state.speed = Number($("speed").value); };
+  $("check").onclick = () => check(player, state);
+  $("save").onclick = () => save(player.avatar.name, show);
+}
+
+function backgrounds() {
+  const paint = (color) => document.documentElement.style.setProperty("--stage", color || "var(--paper)");
+  const names = Object.fromEntries(Object.entries(BACKGROUNDS).map(([name, color]) => [color, name]));
+  const box = choices($("backgrounds"), names, "", paint, (span, name, color, input) => {
+    span.style.background = color || "linear-gradient(135deg, #fbfaf7 50%, #181715 50%)";
+    span.title = name;
+    input.setAttribute("aria-label", name);
+  });
+  const other = document.createElement("input");
+  Object.assign(other, { type: "color", value: "#203040", title: "Another colour" });
+  other.setAttribute("aria-label", "Another colour");
+  other.oninput = () => {
+    for (const input of box.querySelectorAll("input[type=radio]")) input.checked = false;
+    paint(other.value);
+  };
+  box.append(other);
+}
+
+async function check(player, { engine }) {
+  $("checked").textContent = "Drawing the golden frames …";
+  try {
+    const found = await player.verify(engine);
+    const alike = found.filter((each) => each.alike).length;
+    const worst = Math.max(...found.map((each) => each.largest));
+    $("checked").textContent = alike === found.length
+      ? `All ${alike} golden frames look the same here (largest difference ${worst.toFixed(0)}/255).`
+      : `${found.length - alike} of ${found.length} golden frames look DIFFERENT here.`;
+  } catch (error) {
+    $("checked").textContent = error.message;
+  }
+}
+
+/** The picture as it is shown, with its alpha. */
+function save(name, show) {
+  show.canvas.toBlob((blob) => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = `${name}-${String(show.row).padStart(4, "0")}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  });
+}
+
+function markPlaying({ playing }) {
+  $("play").classList.toggle("playing", playing);
+  $("play").setAttribute("aria-label", playing ? "Pause" : "Play");
+}
+
+function transport(player, state, show, orbit) {
+  const play = (playing) => { show.play(playing); markPlaying(state); };
+  const step = (by) => { play(false); show.seek(show.row + by); };
+  $("timeline").max = player.count - 1;
+  $("timeline").oninput = () => { play(false); show.seek(Number($("timeline").value)); };
+  $("play").onclick = () => play(!state.playing);
+  $("front").onclick = () => { orbit.reset(); show.changed(); };
+  document.addEventListener("visibilitychange", () => { show.began = undefined; });
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const typing = event.target.closest("button, select, #panel");
+    if (event.key === " " && !typing) { event.preventDefault(); play(!state.playing); }
+    if (event.key === ",") step(-1);
+    if (event.key === ".") step(1);
+  });
+}

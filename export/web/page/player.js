@@ -1,0 +1,106 @@
+// The avatar, its motion and whoever draws it, without the page around them.
+
+import { load } from "./arrays.js";
+import { GraphEngine } from "./graph_engine.js";
+import { moved } from "./matrices.js";
+import { Orbit, windowOf } from "./orbit.js";
+import { Skeleton, bones } from "./skeleton.js";
+
+const CLOSE = 2; // two pictures are alike where no premultiplied channel differs by more, in 1/255 …
+const ALIKE = 0.999; // … on at least this share of the pixels
+const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
+
+export class Player {
+  /** heard: as of GraphEngine. */
+  static async load(heard) {
+    const answer = await fetch(new URL("./avatar.json", import.meta.url));
+    if (!answer.ok) throw new Error(`avatar.json could not be loaded (${answer.status}).`);
+    const avatar = await answer.json();
+    return new Player(avatar, await load(avatar.motion.poses), heard);
+  }
+
+  constructor(avatar, poses, heard) {
+    this.avatar = avatar;
+    this.poses = poses;
+    this.count = poses.length / POSE;
+    this.fps = avatar.motion.fps;
+    this.skeleton = new Skeleton(avatar);
+    this.engines = { wasm: new GraphEngine(avatar, heard) };
+  }
+
+  pose(row) {
+    return this.poses.subarray(POSE * row, POSE * (row + 1));
+  }
+
+  open({ engine, tier }) {
+    return this.engines[engine].open(tier);
+  }
+
+  /** A pose seen by a camera: {x, y, width, height, rgba, ms}, the part where the avatar is; or null. */
+  async draw({ engine, tier }, pose, camera) {
+    const { worldFromCanonical, joints } = this.skeleton.posed(pose);
+    const seen = joints.map((joint) => moved(camera.cameraFromWorld, joint));
+    const part = windowOf(camera, seen);
+    if (!part) return null;
+    const center = [camera.center[0] - part.x, camera.center[1] - part.y];
+    const drawn = await this.engines[engine].draw(tier, {
+      bones: bones(worldFromCanonical, camera.cameraFromWorld),
+      camera: [...camera.focal, ...center],
+      width: part.width,
+      height: part.height,
+    });
+    return { ...part, ...drawn };
+  }
+
+  /** Draws the package's golden frames again: for each, how far the picture is from the stored one. */
+  async verify(engine = "wasm") {
+    await this.open({ engine, tier: "hq" });
+    const likenesses = [];
+    for (const golden of this.avatar.golden) {
+      const stored = await load(golden.picture);
+      const { worldFromCanonical } = this.skeleton.posed(golden.pose);
+      const { rgba } = await this.engines[engine].draw("hq", {
+        bones: bones(worldFromCanonical, golden.camera.cameraFromWorld),
+        camera: [...golden.camera.focal, ...golden.camera.center],
+        width: golden.camera.width,
+        height: golden.camera.height,
+      });
+      likenesses.push(likeness(rgba, stored));
+    }
+    return likenesses;
+  }
+
+  /** Milliseconds of every frame of the motion, whole square pictures from the front. */
+  async measure({ engine = "wasm", tier = "hq", size = 540, frames = 24 } = {}) {
+    await this.open({ engine, tier });
+    const orbit = new Orbit(this.avatar.look);
+    const times = [];
+    for (let frame = 0; frame < frames; frame++) {
+      const pose = this.pose(frame % this.count);
+      const camera = orbit.camera(pose, size, size);
+      const { ms } = await this.engines[engine].draw(tier, {
+        bones: bones(this.skeleton.posed(pose).worldFromCanonical, camera.cameraFromWorld),
+        camera: [...camera.focal, ...camera.center],
+        width: size,
+        height: size,
+      });
+      times.push(ms);
+    }
+    return times;
+  }
+}
+
+/** How far two straight-alpha pictures are apart, premultiplied, as `ia-play --verify` counts it. */
+export function likeness(a, b) {
+  let largest = 0, close = 0;
+  for (let i = 0; i < a.length; i += 4) {
+    let most = Math.abs(a[i + 3] - b[i + 3]);
+    for (let c = i; c < i + 3; c++) {
+      most = Math.max(most, Math.abs(a[c] * a[i + 3] - b[c] * b[i + 3]) / 255);
+    }
+    largest = Math.max(largest, most);
+    if (most <= CLOSE) close++;
+  }
+  const share = close / (a.length / 4);
+  return { largest, close: share, alike: a.length === b.length && share >= ALIKE };
+}

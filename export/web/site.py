@@ -1,0 +1,160 @@
+"""An avatar and a motion as the files of a page: the package's graph, unpacked tables, no CDN."""
+
+import hashlib
+import json
+import zlib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float, Float32, Shaped
+
+from export.manifest import GoldenFrame
+from export.package import AvatarPackage, read_package
+from export.tables import initialisers
+from export.web.runtime import MODULE, runtime_files
+from preprocess.pose import BodyPose
+
+PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
+NARROW = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
+"""Element types that the page reads (arrays.js)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Look:
+    """Where the page's camera stands at first; it follows the pelvis.
+
+    Attributes:
+        axes: Rows: the picture's right, down and forward in the world.
+        height_m: Of the person standing.
+        middle_m: How far the person's middle is above the pelvis.
+    """
+
+    axes: Float[np.ndarray, "3 3"]
+    height_m: float
+    middle_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clip:
+    """The motion that the page plays.
+
+    Attributes:
+        poses: Root rotation, root translation and 23 joint rotations, one row a pose.
+        fps: Poses a second.
+        look: At the first pose, from the front.
+    """
+
+    poses: Float32[np.ndarray, "poses 75"]
+    fps: float
+    look: Look
+
+
+def pose_row(pose: BodyPose) -> Float32[np.ndarray, "75"]:
+    """A pose as the page takes it."""
+    parts = (pose.root_rotation, pose.root_translation, pose.joint_rotations.ravel())
+    return np.concatenate(parts).astype(np.float32)
+
+
+def site(path: Path, clip: Clip, *, name: str, level: int = 6) -> dict[str, bytes]:
+    """All files of the page by their relative paths; index.html is the one to open.
+
+    Args:
+        path: The `.iavatar` package; every tier of it goes in.
+        clip: What it plays.
+        name: Of the avatar, for people.
+        level: How hard arrays are deflated: 1 on the way to one's own browser, 6 for a host.
+
+    Raises:
+        BadInput: If the package is not sound, or onnxruntime-web is not there.
+    """
+    runtime = runtime_files()
+    draft = _Draft(level)
+    package = read_package(path)
+    manifest = package.manifest
+    content = {
+        "name": name,
+        "licence": manifest.licence,
+        "rest_joints": manifest.rest_joints.tolist(),
+        "parents": manifest.parents.tolist(),
+        "canonical_rotations": manifest.canonical_rotations.tolist(),
+        "look": {
+            "axes": clip.look.axes.tolist(),
+            "pelvis": manifest.rest_joints[0].tolist(),
+            "height_m": clip.look.height_m,
+            "middle_m": clip.look.middle_m,
+        },
+        "motion": {"fps": clip.fps, "poses": draft.array(clip.poses)},
+        "runtime": draft.array(_bytes(runtime.pop(MODULE))),
+        "tiers": {
+            tier: _tier(draft, package if tier == "hq" else read_package(path, tier=tier), tier)
+            for tier in manifest.tiers
+        },
+        "golden": [
+            _golden(draft, frame, picture)
+            for frame, picture in zip(manifest.golden, package.golden, strict=True)
+        ],
+    }
+    draft.files["avatar.json"] = json.dumps(content, allow_nan=False).encode()
+    draft.files.update({f"runtime/{file}": held for file, held in runtime.items()})
+    return {**page_files(), **draft.files}
+
+
+def page_files() -> dict[str, bytes]:
+    """The page itself, the same for every avatar."""
+    folder = resources.files("export.web").joinpath("page")
+    files = [file for file in folder.iterdir() if file.name.endswith(PAGE_SUFFIXES)]
+    return {file.name: file.read_bytes() for file in sorted(files, key=lambda file: file.name)}
+
+
+@final
+class _Draft:
+    """Files that name themselves after their content: what two tiers share is stored once."""
+
+    def __init__(self, level: int) -> None:
+        self.files: dict[str, bytes] = {}
+        self._level = level
+
+    def array(self, array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
+        """Stores an array; returns what the page must know to read it."""
+        assert array.dtype.name in NARROW
+        plain = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
+        planes = plain.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T
+        packed = zlib.compress(np.ascontiguousarray(planes).tobytes(), self._level)
+        file = f"data/{hashlib.sha256(packed).hexdigest()[:16]}.bin"
+        self.files[file] = packed
+        shape = list(array.shape)
+        return {"file": file, "dtype": array.dtype.name, "shape": shape, "bytes": len(packed)}
+
+
+def _bytes(content: bytes) -> Shaped[np.ndarray, "bytes"]:
+    return np.frombuffer(content, dtype=np.uint8)
+
+
+def _tier(draft: _Draft, package: AvatarPackage, tier: str) -> dict[str, Any]:
+    tables = initialisers(package.tables[tier])
+    return {
+        "samples": package.manifest.tiers[tier].rules.samples,
+        "graph": draft.array(_bytes(package.graphs[tier])),
+        "tables": [{"name": name, **draft.array(array)} for name, array in tables.items()],
+    }
+
+
+def _golden(
+    draft: _Draft, frame: GoldenFrame, picture: Shaped[np.ndarray, "height width 4"]
+) -> dict[str, Any]:
+    camera = frame.camera
+    width, height = camera.size_px
+    return {
+        "pose": [float(number) for number in pose_row(frame.pose)],
+        "camera": {
+            "focal": list(camera.focal_px),
+            "center": list(camera.center_px),
+            "width": width,
+            "height": height,
+            "cameraFromWorld": camera.camera_from_world[:3].ravel().tolist(),
+        },
+        "picture": draft.array(picture),
+    }

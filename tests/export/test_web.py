@@ -1,0 +1,97 @@
+"""The page's files: what they hold, what they refuse, and that they come from nowhere else."""
+
+import json
+import re
+import zlib
+
+import numpy as np
+import pytest
+
+from capture.errors import BadInput
+from export.package import read_package
+from export.tables import initialisers
+from export.web import runtime, site
+from export.web.site import Clip, Look, pose_row
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder with all of onnxruntime-web's files; what is in them is of no matter here."""
+    folder = tmp_path_factory.mktemp("runtime")
+    for name in (*runtime.MEMBERS, *runtime.NOTICES):
+        (folder / name).write_bytes(name.encode())
+    return folder
+
+
+@pytest.fixture
+def clip(bent):
+    return Clip(
+        poses=np.stack([pose_row(bent)] * 3),
+        fps=25.0,
+        look=Look(axes=np.diag([1.0, -1.0, -1.0]), height_m=1.7, middle_m=-0.1),
+    )
+
+
+@pytest.fixture
+def files(exported, clip, kept, monkeypatch):
+    monkeypatch.setattr(site, "runtime_files", lambda: runtime.runtime_files(kept))
+    return site.site(exported.path, clip, name="somebody")
+
+
+def unpacked(files, entry):
+    """An array as the page reads it."""
+    dtype = np.dtype(entry["dtype"]).newbyteorder("<")
+    planes = np.frombuffer(zlib.decompress(files[entry["file"]]), dtype=np.uint8)
+    elements = np.ascontiguousarray(planes.reshape(dtype.itemsize, -1).T)
+    return elements.view(dtype).reshape(entry["shape"])
+
+
+def test_every_array_comes_back_as_it_was(files, exported, clip):
+    package, told = read_package(exported.path), json.loads(files["avatar.json"])
+    assert set(told["tiers"]) == set(package.manifest.tiers)
+    tables = {entry["name"]: unpacked(files, entry) for entry in told["tiers"]["hq"]["tables"]}
+    expected = initialisers(package.tables["hq"])
+    assert tables.keys() == expected.keys()
+    for name, array in expected.items():
+        assert tables[name].dtype == array.dtype
+        np.testing.assert_array_equal(tables[name], array)
+    graph = unpacked(files, told["tiers"]["hq"]["graph"])
+    assert graph.tobytes() == package.graphs["hq"]
+    np.testing.assert_array_equal(unpacked(files, told["motion"]["poses"]), clip.poses)
+    for golden, picture in zip(told["golden"], package.golden, strict=True):
+        np.testing.assert_array_equal(unpacked(files, golden["picture"]), picture)
+    for entry in told["tiers"]["hq"]["tables"]:
+        assert entry["bytes"] == len(files[entry["file"]])
+
+
+def test_the_page_asks_nobody_else_for_anything(files):
+    own = {name: text for name, text in files.items() if not name.startswith(("data/", "runtime/"))}
+    assert {"index.html", "avatar.json", "worker.js"} <= own.keys()
+    for name, content in own.items():
+        found = set(re.findall(r"(?:https?:)?//[\w.-]+\.\w+", content.decode()))
+        assert found <= {"http://www.w3.org"}, name  # SVG's name, which nobody fetches
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', own["index.html"].decode())
+    assert "default-src 'none'" in policy.group(1)
+    assert "http" not in policy.group(1)
+
+
+def test_every_file_that_the_page_names_is_there(files):
+    scripts = {name: text.decode() for name, text in files.items() if name.endswith(".js")}
+    for name, script in scripts.items():
+        named = re.findall(r'(?:from|import|URL)\s*\(?\s*"\./([\w./]+)"', script)
+        assert set(named) <= files.keys(), name
+    named = re.findall(r'(?:src|href)="([^"]+)"', files["index.html"].decode())
+    assert set(named) <= files.keys()
+    assert {"runtime/LICENSE", "runtime/ThirdPartyNotices.txt"} <= files.keys()
+
+
+def test_a_runtime_that_is_not_there_is_asked_for(tmp_path):
+    with pytest.raises(BadInput, match="make web"):
+        runtime.runtime_files(tmp_path)
+
+
+def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path):
+    folder = tmp_path / "runtime"
+    with pytest.raises(BadInput, match="Nothing was kept"):
+        runtime.install(b"something else", folder)
+    assert not folder.exists()
