@@ -45,7 +45,11 @@ class IngestArguments:
     """Video file, folder of pictures, or capture folder; camera:0 for a camera, or the address of
     a stream, as in camera:rtsp://…"""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """SMPL poses, one a frame: an .npz with global_orient, body_pose, transl (or poses, trans)."""
+    """SMPL poses: an .npz with global_orient, body_pose, transl (or poses, trans), or what
+    4D-Humans, WHAM, VIBE, GVHMR, TRAM, PromptHMR, ROMP, BEV or EasyMocap wrote (a file, or a folder
+    of them); see docs/formats.md. Pickles are read without executing them."""
+    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """Whose poses, by the file's own number; without it whoever has most."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, one a frame: a folder of pictures, or an .npz; 255 where the person is."""
     mask_invert: Flag = False
@@ -148,6 +152,7 @@ class IngestArguments:
             frames=parsed_frames(self.frames),
             mask_invert=invert,
             live=self.live,
+            person=self.person,
             idle_s=self.idle_seconds,
         )
         recording = Recording.open(wanted)

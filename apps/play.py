@@ -43,7 +43,10 @@ class PlayArguments:
     avatar: Positional[Path]
     """The .iavatar package."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Poses to move it through: an .npz with global_orient, body_pose, transl (or poses, trans)."""
+    """Poses to move it through: an .npz with global_orient, body_pose, transl (or poses, trans), or
+    a file of AMASS, AIST++ or any tracker (docs/formats.md)."""
+    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """Whose poses, where the file holds several people's; without it whoever has most."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A cameras.npz to look through (one camera, or one for each pose)."""
     out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
@@ -206,9 +209,16 @@ def _verify(path: Path, console: Console) -> int:
 def _shots(given: PlayArguments, player: "Player", console: Console) -> Shots:
     from apps.follow import FollowingCamera
     from apps.novel import novel_motion
-    from preprocess.pose_file import read_motion
+    from preprocess.poses import read_poses
+    from preprocess.poses.place import about_pelvis
 
-    motion = novel_motion() if given.poses is None else read_motion(given.poses)
+    if given.poses is None:
+        motion = novel_motion()
+    else:
+        motion = read_poses(given.poses, person=given.person, driving=True)
+        motion = about_pelvis(motion, player.manifest.rest_joints)
+        if motion.note is not None:
+            console.say(f"note: {motion.note}")
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
     if not rows:
         raise BadInput(f"None of the {len(motion)} poses in {given.poses} is valid.")

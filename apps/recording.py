@@ -21,7 +21,8 @@ from preprocess.masks import Masks, open_masks
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
-from preprocess.pose_file import read_motion
+from preprocess.poses import read_poses
+from preprocess.poses.place import placed
 from preprocess.shape import betas_for
 
 
@@ -37,6 +38,7 @@ class RecordingPaths:
         frames: Which frames are wanted.
         mask_invert: Whether the person is dark in the masks; None finds out.
         live: Whether `video` is a folder that grows; a camera is live without it.
+        person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Of a live source: how long nothing new may come.
     """
 
@@ -48,6 +50,7 @@ class RecordingPaths:
     frames: slice | None = None
     mask_invert: bool | None = None
     live: bool = False
+    person: str | None = None
     idle_s: float = IDLE_S
 
 
@@ -91,7 +94,7 @@ class Recording:
         paths = find_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
         source = open_source(paths.video, frames=wanted.frames)
         body = Body.load(wanted.body)
-        motion = read_motion(paths.poses, default_model=body.family)
+        motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
         masks = None
         if paths.masks is not None:
             masks = open_masks(paths.masks, invert=wanted.mask_invert)
@@ -99,13 +102,15 @@ class Recording:
             cameras = read_cameras(paths.cameras, source.size_px)
         else:
             cameras = default_cameras(motion, source.size_px)
+        shaped = body.with_shape(betas_for(body, motion))
+        motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
         recording = cls(
             paths=paths,
             source=source,
             motion=motion,
             masks=masks,
             cameras=cameras,
-            shaped=body.with_shape(betas_for(body, motion)),
+            shaped=shaped,
             size_px=size_px,
             notes=tuple(_notes(body, motion, masks, cameras)),
         )
@@ -181,6 +186,8 @@ class Recording:
 
 
 def _notes(body: Body, motion: Motion, masks: Masks | None, cameras: CameraTrack) -> Iterator[str]:
+    if motion.note is not None:
+        yield motion.note
     if cameras.note is not None:
         yield cameras.note
     if masks is not None and masks.inverted:

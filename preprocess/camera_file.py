@@ -10,7 +10,7 @@ from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.masks import same_shape
 from preprocess.npz import read_npz
-from preprocess.pose import Motion
+from preprocess.pose import Lens, Motion
 
 DEFAULT_FOCAL = 0.85
 """Focal length of a phone's main camera in video, in units of the picture's longer side."""
@@ -92,20 +92,41 @@ def read_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
 
 
 def default_cameras(motion: Motion, size_px: tuple[int, int]) -> CameraTrack:
-    """One camera at the world's origin: the tracker's K if the poses hold it, else a phone's."""
-    width, height = size_px
-    if motion.intrinsic is not None:
-        camera = Camera.from_intrinsic(motion.intrinsic, size_px)
-        return CameraTrack(cameras=(camera,), source="K of the poses")
+    """One camera at the world's origin: the tracker's K or focal length, else a phone's."""
+    intrinsic = tracker_intrinsic(motion, size_px)
+    if intrinsic is not None and (motion.lens is None or motion.lens.is_plausible):
+        camera = Camera.from_intrinsic(intrinsic, size_px)
+        if motion.lens is None:
+            return CameraTrack(cameras=(camera,), source="K of the poses")
+        note = (
+            f"No camera was given; the tracker's focal length of {intrinsic[0, 0]:.0f} px is used."
+        )
+        return CameraTrack(cameras=(camera,), source="focal length of the tracker", note=note)
     focal = DEFAULT_FOCAL * max(size_px)
-    camera = Camera(
-        focal_px=(focal, focal),
-        center_px=(width / 2.0, height / 2.0),
-        size_px=size_px,
-        camera_from_world=np.eye(4),
-    )
+    camera = Camera.from_intrinsic(Lens(share=DEFAULT_FOCAL).intrinsic(size_px), size_px)
     note = f"No camera was given; a focal length of {focal:.0f} px is assumed."
+    if motion.lens is not None:
+        note += (
+            f" The tracker's own ({motion.lens.share:.1f} times the {motion.lens.of}) is no "
+            "camera's; the person's distance was solved anew."
+        )
     return CameraTrack(cameras=(camera,), source=f"{DEFAULT_FOCAL} x longer side", note=note)
+
+
+def tracker_intrinsic(motion: Motion, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:
+    """The tracker's K for pictures of a size; None if it is not known.
+
+    A K whose principal point is the middle of a larger or smaller picture belongs to such a one.
+    """
+    if motion.lens is not None:
+        return motion.lens.intrinsic(size_px)
+    if motion.intrinsic is None or (motion.intrinsic[:2, 2] <= 0.0).any():
+        return motion.intrinsic
+    scale = np.array(size_px) / (2.0 * motion.intrinsic[:2, 2])
+    of_other_size = abs(scale[0] / scale[1] - 1.0) < 0.02 and abs(scale.mean() - 1.0) > 0.05
+    return (
+        np.diag([scale[0], scale[1], 1.0]) @ motion.intrinsic if of_other_size else motion.intrinsic
+    )
 
 
 def _matrices(

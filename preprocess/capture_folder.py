@@ -5,6 +5,9 @@ from pathlib import Path
 
 from capture.errors import BadInput
 
+POSES = ["poses.npz", "poses.pkl", "hmr4d_results.pt", "wham_output.pkl", "vibe_output.pkl"]
+"""Names under which poses lie in a capture folder."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CapturePaths:
@@ -36,7 +39,7 @@ def find_capture(
 
     Args:
         video: Video file, folder of pictures, or native capture folder.
-        poses: Pose file; needed unless `video` is a folder that holds poses.npz.
+        poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
         masks: Folder or file of masks.
         cameras: Camera file, or "static" for a static camera that nobody described.
 
@@ -52,11 +55,11 @@ def find_capture(
         if not path.exists():
             raise BadInput(f"{path} does not exist; check the path.")
     if poses is None:
-        poses = _first([video], ["poses.npz"])
+        poses = _first([video], POSES)
     if poses is None:
         raise BadInput(
-            f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys). Finding "
-            "poses in the video itself is a tracker's work."
+            f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
+            "tracker wrote: docs/formats.md). Finding poses in the video is a tracker's work."
         )
     inside = video.is_dir() and video.name != "images"
     places = [video if inside else video.parent, poses.parent]

@@ -1,6 +1,7 @@
 """What a body does: one pose of the 24-joint tree, and poses over time."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -33,6 +34,35 @@ class BodyPose:
         )
 
 
+Anchor = Literal["pelvis", "origin", "hips"]
+Space = Literal["camera", "world"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """A focal length that is known only as a share of the picture, looking at its middle.
+
+    Attributes:
+        share: The focal length in units of `of`.
+        of: The picture's longer side, or its diagonal.
+    """
+
+    share: float
+    of: Literal["longer side", "diagonal"] = "longer side"
+
+    def intrinsic(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+        """The camera matrix K for pictures of a size (width, height)."""
+        width, height = size_px
+        unit = max(size_px) if self.of == "longer side" else float(np.hypot(width, height))
+        focal = self.share * unit
+        return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether a camera may have it; trackers that cut out the person assume far longer ones."""
+        return 0.4 <= self.share <= 2.5
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
     """Poses over time, as one pose file holds them.
@@ -45,6 +75,15 @@ class Motion:
         frames: Index of the video frame that each row belongs to, if the file says so.
         times_s: Time of each row in seconds, if the file says so.
         intrinsic: The tracker's own camera matrix K, if the file holds one.
+        lens: What the tracker took for the focal length, where the file holds no K.
+        anchor: Which point of the resting body `root_translations` speak of. "pelvis": the root
+            turns about it, and they are SMPL's. "origin" and "hips" (the middle between both):
+            that point is carried to `root_translations` (EasyMocap; BEV). `preprocess.poses.place`
+            makes them SMPL's, once the body is known.
+        space: "world", or "camera": each row in the camera of its frame.
+        camera_from_world: The camera of each row, if the file holds them.
+        bridged: Which rows the tracker had lost, filled in between their neighbours.
+        note: What a user should know about how the file was read.
     """
 
     root_rotations: Float[np.ndarray, "poses 3"]
@@ -56,6 +95,12 @@ class Motion:
     frames: Int[np.ndarray, "poses"] | None = None
     times_s: Float[np.ndarray, "poses"] | None = None
     intrinsic: Float[np.ndarray, "3 3"] | None = None
+    lens: Lens | None = None
+    anchor: Anchor = "pelvis"
+    space: Space = "world"
+    camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
+    bridged: Bool[np.ndarray, "poses"] | None = None
+    note: str | None = None
 
     def __len__(self) -> int:
         """How many rows there are, valid or not."""

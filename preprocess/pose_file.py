@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from capture.errors import BadInput
 from preprocess.npz import read_npz
 from preprocess.pose import Motion
+from preprocess.rotations import joint_rotations
 
 LAYOUTS = (
     ("global_orient", "body_pose", "transl"),
@@ -17,6 +18,8 @@ LAYOUTS = (
     ("poses", "trans"),
 )
 """The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
+
+CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
@@ -26,7 +29,8 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
 
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
-    (N, 3, 3), model. Rows with NaN are marked as not valid.
+    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model. Rows with NaN are marked as not
+    valid. Rotations may be 3x3 matrices; a body_pose of 63 numbers has no hands.
 
     A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
     a last line that is half written is left out.
@@ -44,19 +48,35 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
             "with the same keys, a frame a line."
         )
     arrays = read_npz(path) if path.suffix == ".npz" else _read_lines(path)
+    return motion_of(arrays, path, default_model=default_model)
+
+
+def motion_of(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
+    """The poses in the arrays of a file (see `read_motion`).
+
+    Raises:
+        BadInput: If they are no such poses; `path` is for the message.
+    """
     layout = next((keys for keys in LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in LAYOUTS)
         raise BadInput(
             f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}."
         )
-    poses = np.concatenate([_rows(arrays, key, path) for key in layout[:-1]], axis=1)
-    translations = _rows(arrays, layout[-1], path)
-    count = len(poses)
-    if poses.shape[1] != 72 or translations.shape != (count, 3) or not count:
+    rows = [_rows(arrays, key, path) for key in layout]
+    translations = rows.pop().reshape(len(rows[0]), -1)
+    count = len(translations)
+    try:
+        poses = joint_rotations(rows).reshape(count, 72)
+    except ValueError as cause:
         raise BadInput(
-            f"{path}: {' + '.join(layout)} have {poses.shape} and {translations.shape} numbers; "
-            "expected (N, 72) rotations (SMPL's root and 23 joints) and (N, 3) metres."
+            f"{path}: {' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} "
+            f"numbers ({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or "
+            "rotation matrices."
+        ) from cause
+    if translations.shape != (count, 3):
+        raise BadInput(
+            f"`{layout[-1]}` in {path} has {translations.shape}; expected (N, 3) metres."
         )
     times = _per_row(arrays, "time", count, path)
     return Motion(
@@ -69,6 +89,7 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
         frames=_frame_numbers(arrays, count, path),
         times_s=times,
         intrinsic=_intrinsic(arrays, path),
+        camera_from_world=_cameras(arrays, count, path),
     )
 
 
@@ -101,6 +122,7 @@ def write_motion(path: Path, motion: Motion) -> None:
         "frame": motion.frames,
         "time": motion.times_s,
         "K": motion.intrinsic,
+        "camera": motion.camera_from_world,
     }
     present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
     np.savez_compressed(path, **present)
@@ -112,8 +134,8 @@ def _numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
     return arrays[key].astype(np.float64)
 
 
-def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses numbers"]:
-    """An array of one row a pose; (N, 1, 3) and (N, 23, 3) are flattened."""
+def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses *numbers"]:
+    """An array of one row a pose."""
     rows = _numbers(arrays, key, path)
     if rows.ndim < 2 or not rows.size:
         raise BadInput(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
@@ -123,7 +145,7 @@ def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses numb
             f"{path} holds {len(rows)} rows of `{key}` but {len(np.atleast_1d(first))} "
             "translations; expected one of each per pose."
         )
-    return rows.reshape(len(rows), -1)
+    return rows
 
 
 def _per_row(arrays: Arrays, key: str, count: int, path: Path) -> Float[np.ndarray, "poses"] | None:
@@ -188,3 +210,20 @@ def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
     if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
         raise BadInput(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
     return intrinsic
+
+
+def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses 4 4"] | None:
+    """The camera of each row; one alone is that of all rows."""
+    key = next((key for key in CAMERA_KEYS if key in arrays), None)
+    if key is None:
+        return None
+    cameras = _numbers(arrays, key, path)
+    if cameras.shape not in ((4, 4), (count, 4, 4)) or not np.isfinite(cameras).all():
+        raise BadInput(
+            f"`{key}` in {path} has the shape {cameras.shape}; expected finite camera-from-world "
+            f"transforms (4, 4) or ({count}, 4, 4)."
+        )
+    rotations = cameras[..., :3, :3]
+    if np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max() > 1e-3:
+        raise BadInput(f"`{key}` in {path} is not rigid; expected no scale, OpenCV's axes.")
+    return np.broadcast_to(cameras, (count, 4, 4)).copy()

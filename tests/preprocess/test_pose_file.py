@@ -95,7 +95,7 @@ def test_a_camera_matrix_per_row_becomes_their_median(write):
     ("changes", "message"),
     [
         ({"transl": None}, "expected global_orient and body_pose and transl"),
-        ({"body_pose": np.zeros((6, 63))}, r"\(N, 72\)"),
+        ({"body_pose": np.zeros((6, 60))}, r"\(N, 72\)"),
         ({"global_orient": np.zeros((5, 3))}, "5 rows of `global_orient` but 6"),
         ({"body_pose": np.full((6, 69), "a")}, "no numbers"),
         ({"global_orient": np.array([{}])}, "plain arrays"),

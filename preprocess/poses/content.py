@@ -1,0 +1,134 @@
+"""What a file of any container holds, as dictionaries, lists, numbers, texts and numpy arrays.
+
+The container is told by the first bytes, not by the file's name: people rename.
+"""
+
+import io
+import json
+import lzma
+import zipfile
+import zlib
+from bz2 import BZ2Decompressor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.errors import BadInput
+from capture.images import natural_key
+from preprocess.inert import product
+from preprocess.pickles import MAX_BYTES, bounded_bytes, guarded, plain_pickle
+
+SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"})
+"""Endings of files that may hold poses; in a folder only these are read."""
+
+MOST_FILES = 100_000
+"""Of a folder: more files are no poses, a file a frame."""
+
+
+def read_content(path: Path) -> Any:
+    """What a file holds; of a folder a dictionary of its files in natural order, by their names.
+
+    Raises:
+        BadInput: If it is missing, damaged, too large, or asks to run something.
+    """
+    if path.is_dir():
+        return _folder(path)
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist (or is no file); a file of poses was expected.")
+    return guarded(path, lambda: _decoded(bounded_bytes(path), path), "file of poses")
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    files = sorted(
+        (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=natural_key
+    )
+    if not files or len(files) > MOST_FILES:
+        raise BadInput(
+            f"{path} is a folder with {len(files)} files ({', '.join(sorted(SUFFIXES))}); expected "
+            "a file of poses, or a folder with one for each frame or person."
+        )
+    return {file.name: read_content(file) for file in files}
+
+
+def _decoded(data: bytes, path: Path) -> Any:
+    """What the bytes hold, whatever they are packed in."""
+    if data.startswith(b"PK"):
+        return _zip(data)
+    if data.startswith(b"\x93NUMPY"):
+        return _npy(data)
+    if data[:1] == b"\x78" and (data[0] * 256 + data[1]) % 31 == 0:
+        return plain_pickle(_inflated(data, zlib.MAX_WBITS))
+    if data.startswith(b"\x1f\x8b"):
+        return plain_pickle(_inflated(data, 16 + zlib.MAX_WBITS))
+    if data.startswith(b"BZ"):
+        return plain_pickle(_bounded(BZ2Decompressor().decompress(data, MAX_BYTES + 1)))
+    if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
+        return plain_pickle(_bounded(lzma.LZMADecompressor().decompress(data, MAX_BYTES + 1)))
+    if data[:64].lstrip()[:1] in (b"{", b"["):
+        return _json(data, path)
+    return plain_pickle(data)
+
+
+def _json(data: bytes, path: Path) -> Any:
+    try:
+        return json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError):
+        if path.suffix == ".json":
+            raise
+        return plain_pickle(data)  # a pickle may begin with a bracket, too
+
+
+def _zip(data: bytes) -> Any:
+    """An .npz, or what torch.save writes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {entry.filename: entry for entry in archive.infolist()}
+        if sum(entry.file_size for entry in entries.values()) > 4 * MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {4 * MAX_BYTES >> 20} MiB")
+        program = next((name for name in entries if name.endswith("data.pkl")), None)
+        if program is None:
+            names = [name for name in entries if name.endswith(".npy")]
+            return {name.removesuffix(".npy"): _npy(archive.read(name)) for name in names}
+        root = program.removesuffix("data.pkl")
+        order = archive.read(root + "byteorder") if root + "byteorder" in entries else b"little"
+        if order != b"little":
+            raise ValueError("numbers of a big-endian machine")
+
+        def fetch(name: str, length: int) -> bytes:
+            raw = archive.read(f"{root}data/{name}")
+            if len(raw) < length:
+                raise ValueError("a storage that is cut off")
+            return raw or bytes(1)
+
+        return plain_pickle(archive.read(program), fetch)
+
+
+def _npy(data: bytes) -> Any:
+    """An array of numbers or texts; objects are unpickled."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, by_columns, kind = read(stream)
+    if kind.hasobject:
+        return plain_pickle(data[stream.tell() :])
+    if kind.names or kind.subdtype:
+        raise ValueError("an array of records")
+    numbers = np.frombuffer(data, kind, product(shape), stream.tell())
+    array = numbers.reshape(shape, order="F" if by_columns else "C")
+    if kind.kind in "US":
+        return array.item() if array.ndim == 0 else array.tolist()
+    return array
+
+
+def _inflated(data: bytes, bits: int) -> bytes:
+    return _bounded(zlib.decompressobj(bits).decompress(data, MAX_BYTES + 1))
+
+
+def _bounded(data: bytes) -> bytes:
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
+    return data

@@ -1,0 +1,58 @@
+"""A video with poses as a stranger's tracker wrote them."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from apps.recording import Recording, RecordingPaths
+from capture.errors import BadInput
+from preprocess.kinematics import rotation_matrices
+from preprocess.rotations import axis_angles
+
+
+@pytest.fixture
+def own(film) -> Recording:
+    """The film with its own poses, in the world."""
+    return Recording.open(RecordingPaths(video=film))
+
+
+@pytest.fixture
+def in_camera(own) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation matrices and places of the film's poses in its camera."""
+    camera, pelvis = own.cameras[0].camera_from_world, own.shaped.joints[0]
+    motion = own.motion
+    turned = camera[:3, :3] @ rotation_matrices(motion.root_rotations)
+    places = (pelvis + motion.root_translations) @ camera[:3, :3].T + camera[:3, 3] - pelvis
+    body = rotation_matrices(motion.joint_rotations)
+    return np.concatenate([turned[:, None], body], axis=1), places
+
+
+def test_a_trackers_file_and_the_films_own_poses_are_one(film, own, in_camera, tmp_path):
+    matrices, places = in_camera
+    camera = own.cameras[0]
+    rows = {"pred_rotmat": matrices, "pred_trans": places[:, None], "frame": np.arange(24)}
+    rows |= {"img_focal": camera.focal_px[0], "img_center": np.array(camera.center_px)}
+    np.save(tmp_path / "hps_track_0.npy", rows)
+    poses, cameras = tmp_path / "hps_track_0.npy", str(film / "cameras.npz")
+    other = Recording.open(RecordingPaths(video=film, poses=poses, cameras=cameras))
+    for row in range(0, 24, 5):
+        joints = [r.shaped.with_pose(r.motion[row]).joints() for r in (own, other)]
+        np.testing.assert_allclose(joints[0], joints[1], atol=1e-9)
+
+
+def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp_path):
+    poses = axis_angles(in_camera[0]).reshape(-1, 72)
+    actor = {"pose": poses, "trans": in_camera[1], "frame_ids": np.arange(24)}
+    visitor = {key: value[:6] for key, value in actor.items()}
+    path = tmp_path / "wham_output.pkl"
+    path.write_bytes(pickle.dumps({1: visitor, 2: actor}))
+    paths = {"video": film, "poses": path}
+    longest = Recording.open(RecordingPaths(**paths))
+    assert len(longest.motion) == 24
+    assert any("2 people; 2 was taken" in note for note in longest.notes)
+    chosen = Recording.open(RecordingPaths(**paths, person="1"))
+    assert len(chosen.motion) == 6
+    assert not any("people" in note for note in chosen.notes)
+    with pytest.raises(BadInput, match="nobody called '7'"):
+        Recording.open(RecordingPaths(**paths, person="7"))
