@@ -11,6 +11,7 @@ import tyro
 
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
+from apps.first_look import first_look, hint
 from apps.ingest_arguments import VIEW_PORT, IngestArguments
 from apps.interrupt import asked_to_stop
 from apps.port import with_port
@@ -18,6 +19,7 @@ from apps.recording import Recording
 from apps.run_folder import RunFolder
 from apps.whole import write_text
 from capture.camera_device import camera_address
+from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
@@ -45,10 +47,12 @@ def ingest(given: IngestArguments, console: Console) -> int:
     given.check()
     run = given.run_folder()
     run.check(resume=given.resume, overwrite=given.overwrite)
-    recording = given.recording()
+    recording = _opened(given)
     console.say(_described(recording))
     for note in recording.notes:
         console.warn(note)
+    if not (given.resume and run.has_checkpoint()):
+        first_look(recording, console, force=given.force)
     with console.waiting("loading torch"):
         from apps.deliver import RunNote, deliver
         from apps.device import device_for
@@ -93,6 +97,17 @@ def ingest(given: IngestArguments, console: Console) -> int:
         if viewer is not None:
             viewer.close()
         run.tidy()
+
+
+def _opened(given: IngestArguments) -> Recording:
+    """What is to be learnt from; if it is refused, with what might mend it."""
+    try:
+        return given.recording()
+    except BadInput as error:
+        mend = hint(given.wanted())
+        if not mend:
+            raise
+        raise BadInput(f"{error} {mend}") from error
 
 
 def _described(recording: Recording) -> str:

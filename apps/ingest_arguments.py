@@ -87,6 +87,8 @@ class IngestArguments:
     """Which frames, START:STOP:STEP, counted from 0."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
+    force: Flag = False
+    """Begin even if poses and masks disagree so much that ia-check calls them unusable."""
     view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
     """Watch it learn on a page of this machine, http://127.0.0.1:PORT (8008 if PORT is left out):
     turn the avatar, see what the camera has not seen yet, pause, save a package now. Needs viser:
@@ -140,10 +142,10 @@ class IngestArguments:
             own = re.sub(r"\W+", "-", str(self.video)).strip("-")
         return RunFolder(path=self.out or Path("runs") / own)
 
-    def recording(self) -> Recording:
-        """Opens what the arguments name."""
+    def wanted(self) -> RecordingPaths:
+        """What is to be opened."""
         invert = True if self.mask_invert else False if self.no_mask_invert else None
-        wanted = RecordingPaths(
+        return RecordingPaths(
             video=self.video,
             poses=self.poses,
             masks=self.masks,
@@ -155,7 +157,10 @@ class IngestArguments:
             person=self.person,
             idle_s=self.idle_seconds,
         )
-        recording = Recording.open(wanted)
+
+    def recording(self) -> Recording:
+        """Opens what the arguments name."""
+        recording = Recording.open(self.wanted())
         size_px = self.size or learnable_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
         return recording.played() if self.realtime else recording

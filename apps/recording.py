@@ -82,8 +82,15 @@ class Recording:
     live: LiveParts | None = None
 
     @classmethod
-    def open(cls, wanted: RecordingPaths, *, size_px: int | None = None) -> "Recording":
+    def open(
+        cls, wanted: RecordingPaths, *, size_px: int | None = None, doubtful: bool = False
+    ) -> "Recording":
         """Finds, opens and checks the parts.
+
+        Args:
+            wanted: What the user named.
+            size_px: Longer side that training will see.
+            doubtful: Leaves out whether they fit together, for somebody who wants to find out.
 
         Raises:
             BadInput: If one is missing or unreadable, or they do not fit together.
@@ -114,8 +121,8 @@ class Recording:
             size_px=size_px,
             notes=tuple(_notes(body, motion, masks, cameras)),
         )
-        recording.observer()  # the parts are checked together, and no frame is read yet
-        recording.footprint_m()
+        if not doubtful:
+            recording.check()
         return recording
 
     @classmethod
@@ -149,6 +156,15 @@ class Recording:
         recording.observer()
         recording.footprint_m()
         return recording
+
+    def check(self) -> None:
+        """Whether the parts fit together; no frame is read.
+
+        Raises:
+            BadInput: If they do not.
+        """
+        self.observer()
+        self.footprint_m()
 
     def observations(self) -> Iterator[Observation | Dropped]:
         """The frames with pose, mask and camera, in order, lazily; every call starts anew."""

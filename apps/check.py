@@ -1,0 +1,191 @@
+"""ia-check: says in seconds what is wrong with a capture, and how to mend it."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from apps.console import Console
+from apps.examine import Examined, examine, share
+from apps.exit_codes import BAD_INPUT, DONE, exit_code
+from apps.ingest_arguments import parsed_frames
+from apps.mended import check_place, write_mended
+from apps.recording import RecordingPaths
+from apps.sheet import write_sheet
+from apps.whole import write_text
+from capture.camera_device import camera_address
+from capture.errors import BadInput
+from preprocess.doctor.diagnosis import USABLE
+
+Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckArguments:
+    """Says in seconds what is wrong with a capture, and how to mend it. Nothing is trained.
+
+    The body is drawn where poses and camera say, and held against the masks. Where they disagree,
+    the usual mistakes are undone one after another: poses late or early, of another frame rate,
+    OpenGL's axes, pictures turned for the tracker, world and camera mixed up, a wrong focal
+    length, left for right, EasyMocap's root, another size or unit, masks of the background.
+    The one that mends it is named, with the agreement it would bring (intersection over union,
+    0 to 1; 0.75 to 0.9 is what good poses reach, as clothes are wider than bodies).
+
+    Try it:
+
+        ia-check capture/
+
+        ia-check video.mp4 --poses poses.npz --fix mended/
+
+    Look at the sheet it draws: white is the mask, orange the body.
+
+    Exit codes: 0 good, or not so good but usable (with --fix: once mended); 2 unusable or
+    unreadable; 3 disk full; 130 Ctrl-C.
+    """
+
+    video: Positional[Path]
+    """Video file, folder of pictures, or capture folder."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """SMPL poses, as ia-ingest takes them."""
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Masks, as ia-ingest takes them."""
+    mask_invert: Flag = False
+    """The person is dark in the masks."""
+    no_mask_invert: Flag = False
+    """The person is bright in the masks."""
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Cameras, as ia-ingest takes them."""
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Your own SMPL body; else the embedded one."""
+    frames: str = "::"
+    """Which frames, START:STOP:STEP, counted from 0."""
+    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """Whose poses, where the file holds several people's; else the longest track."""
+    fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="")] = None
+    """Write the capture with the named cures applied to this folder."""
+    sheet: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
+    """Where the sheet of pictures goes; without it runs/NAME-check.png, after the video."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write what was found to this file."""
+
+    def wanted(self) -> RecordingPaths:
+        """What is to be opened.
+
+        Raises:
+            BadInput: If the arguments contradict each other.
+        """
+        if camera_address(self.video) is not None:
+            raise BadInput(f"{self.video} is a camera; a recording was expected.")
+        if self.mask_invert and self.no_mask_invert:
+            raise BadInput("--mask-invert and --no-mask-invert contradict each other; drop one.")
+        invert = True if self.mask_invert else False if self.no_mask_invert else None
+        return RecordingPaths(
+            video=self.video,
+            poses=self.poses,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parsed_frames(self.frames),
+            mask_invert=invert,
+            person=self.person,
+        )
+
+    def sheet_path(self) -> Path:
+        """Where the sheet goes."""
+        name = self.video.resolve()
+        own = name.name if name.is_dir() else name.stem
+        return self.sheet or Path("runs") / f"{own}-check.png"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    given = tyro.cli(CheckArguments, prog="ia-check", args=arguments)
+    return exit_code("ia-check", lambda: check(given, Console()))
+
+
+def check(given: CheckArguments, console: Console) -> int:
+    """Does what the arguments say.
+
+    Raises:
+        BadInput: If there is nothing that can be examined, or nothing to mend where --fix asks.
+        OSError: If something cannot be written.
+    """
+    wanted = given.wanted()
+    if given.fix is not None:
+        check_place(given.fix)
+    try:
+        with console.waiting("looking at poses, masks and cameras"):
+            examined = examine(wanted)
+    except BadInput as error:
+        if given.json is not None:
+            write_text(given.json, json.dumps(unreadable(str(error)), indent=1))
+        raise
+    if given.json is not None:
+        write_text(given.json, json.dumps(as_json(examined), indent=1))
+    _say(examined, console)
+    if write_sheet(given.sheet_path(), examined):
+        console.made("look at it", given.sheet_path())
+    if given.fix is not None:
+        write_mended(examined, given.fix)
+        console.made("mended", given.fix)
+        return DONE if examined.after >= USABLE else BAD_INPUT
+    if examined.causes:
+        console.say(f"Mend it:  ia-check {given.video} … --fix OUT")
+    return BAD_INPUT if examined.verdict == "unusable" else DONE
+
+
+def as_json(examined: Examined) -> dict[str, Any]:
+    """What was found; agreements are null where there are no masks."""
+    diagnosis = examined.diagnosis
+    cures = diagnosis.cures if diagnosis else ()
+    tried = diagnosis.tried if diagnosis else ()
+    return {
+        "format": 1,
+        "verdict": examined.verdict,
+        "cause": examined.causes[0] if examined.causes else None,
+        "iou": {"now": share(examined.now), "after_fix": share(examined.after)},
+        "tried": [
+            {"cause": guess.cure.cause, "iou": share(guess.iou), "words": guess.cure.words}
+            for guess in tried
+        ],
+        "cures": [{"cause": cure.cause, "words": cure.words} for cure in cures],
+        "odd": list(examined.odd),
+        "refused": examined.refused,
+    }
+
+
+def unreadable(why: str) -> dict[str, Any]:
+    """The same for what could not even be opened."""
+    return {
+        "format": 1, "verdict": "unusable", "cause": None,
+        "iou": {"now": None, "after_fix": None}, "tried": [], "cures": [], "odd": [],
+        "refused": why,
+    }  # fmt: skip
+
+
+def _say(examined: Examined, console: Console) -> None:
+    for note in examined.recording.notes:
+        console.warn(note)
+    for sentence in examined.odd:
+        console.warn(sentence)
+    if examined.refused is not None:
+        console.say(f"ia-ingest would refuse it: {examined.refused}")
+    if examined.diagnosis is None:
+        console.say("There are no masks, so nobody can say whether the poses fit the pictures.")
+        return
+    console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1).")
+    for cure in examined.diagnosis.cures:
+        console.say(f"It looks as if {cure.words} ({cure.cause}).")
+    if examined.causes:
+        console.say(f"Undone, they would agree by {examined.after:.2f}.")
+    elif examined.verdict != "good":
+        console.say("None of the usual mistakes explains it.")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""A capture examined: what is odd in its numbers, how body and masks agree, what would mend it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from apps.recording import Recording, RecordingPaths
+from capture.errors import BadInput
+from preprocess.doctor.claim import Claim
+from preprocess.doctor.diagnosis import GOOD, USABLE, Diagnosis, diagnose, mean
+from preprocess.doctor.evidence import Evidence, gather
+from preprocess.doctor.mistakes import shifted
+from preprocess.doctor.soundness import unsound
+from preprocess.observe import check_cameras, check_masks
+from preprocess.silhouette import SkinPoints
+
+FEW = 8
+"""Frames that are looked at before a run begins."""
+NEAR = (1, 2)
+"""Offsets of the poses, in frames, that are tried even where all seems well."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Examined:
+    """What the doctor found.
+
+    Attributes:
+        recording: The capture.
+        claim: Its poses and cameras as they are.
+        evidence: Masks of some frames; None where there are no masks to hold a body against.
+        diagnosis: What was tried; None without masks.
+        refused: Why a run would not even begin, if it would not.
+        odd: Sentences about what is strange in the numbers.
+        agreed: Mean agreement as a run would read the files; None without masks.
+    """
+
+    recording: Recording
+    claim: Claim
+    evidence: Evidence | None
+    diagnosis: Diagnosis | None
+    refused: str | None
+    odd: tuple[str, ...]
+    agreed: float | None
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Names of the mistakes found, the one that matters most first."""
+        cures = self.diagnosis.cures if self.diagnosis else ()
+        return tuple(dict.fromkeys(cure.cause for cure in cures))
+
+    @property
+    def verdict(self) -> str:
+        """`good`, `warn`, or `unusable`."""
+        if self.refused is not None or (self.agreed is not None and self.agreed < USABLE):
+            return "unusable"
+        well = self.agreed is not None and self.agreed >= GOOD and not self.causes
+        return "good" if well and not self.odd else "warn"
+
+    @property
+    def now(self) -> float:
+        """Agreement of the files as they are stored; NaN without masks."""
+        return self.diagnosis.now if self.diagnosis else float("nan")
+
+    @property
+    def after(self) -> float:
+        """Agreement with all cures; NaN without masks."""
+        return self.diagnosis.after if self.diagnosis else float("nan")
+
+
+def examine(wanted: RecordingPaths) -> Examined:
+    """Opens a capture and looks at it; nothing is trained and hardly a frame is decoded.
+
+    Raises:
+        BadInput: If a part is missing or unreadable, so that there is nothing to examine.
+    """
+    return examined(*_opened(wanted))
+
+
+def examined(recording: Recording, undecided: str | None = None) -> Examined:
+    """The same for a capture that is open already.
+
+    Args:
+        recording: The capture.
+        undecided: Why nobody knows which side of the masks is the person, if so.
+
+    Raises:
+        BadInput: If a part is unreadable, so that there is nothing to examine.
+    """
+    claim, refused = _claim(recording), undecided
+    try:
+        recording.check()
+    except BadInput as error:
+        refused = refused or str(error)
+    masked = recording.masks is not None or recording.source.has_alpha
+    evidence = _evidence(recording) if masked else None
+    count = recording.source.frame_count or len(recording.motion)
+    selection = recording.source.selection
+    frames = [selection.start + selection.step * number for number in range(count)]
+    diagnosis = agreed = None
+    if evidence is not None:
+        diagnosis = diagnose(claim, evidence, count)
+        agreed = mean(evidence.scores(replace(claim, inverted=False)))
+    odd = unsound(claim, frames, evidence, recording.source.size_px[1])
+    return Examined(
+        recording=recording, claim=claim, evidence=evidence, diagnosis=diagnosis,
+        refused=refused, odd=tuple(odd), agreed=agreed,
+    )  # fmt: skip
+
+
+def looks_well(recording: Recording) -> bool:
+    """A glance at a few masks, in a few hundredths of a second: whether there is nothing to say.
+
+    Poses that are a frame or two late are noticed, too.
+    """
+    if recording.live is not None or recording.masks is None or recording.source.has_alpha:
+        return True  # what is not there cannot be looked at; pictures are not decoded for it
+    try:
+        evidence = _evidence(recording, FEW)
+    except BadInput:  # nobody in these few; whoever reads all of them will say so
+        return True
+    claim = replace(_claim(recording), inverted=False)
+    now = mean(evidence.scores(claim))
+    shifts = [mean(evidence.scores(shifted(k).undo(claim))) for n in NEAR for k in (n, -n)]
+    return now >= GOOD and now >= max(shifts)
+
+
+def _evidence(recording: Recording, count: int | None = None) -> Evidence:
+    mask_row = check_masks(recording.masks, recording.source)
+    camera_row = check_cameras(recording.cameras, recording.source)
+    more = {} if count is None else {"count": count}
+    skin = SkinPoints.of(recording.shaped)
+    return gather(recording.source, recording.masks, mask_row, camera_row, skin, **more)
+
+
+def _claim(recording: Recording) -> Claim:
+    """As the files say; masks that are turned while they are read were claimed the other way."""
+    claim = Claim.of(recording.motion, recording.cameras, recording.source)
+    turned = recording.masks is not None and recording.masks.inverted
+    return replace(claim, inverted=turned)
+
+
+def _opened(wanted: RecordingPaths) -> tuple[Recording, str | None]:
+    """The capture, and why a run would refuse its masks if it cannot tell which side is whom."""
+    try:
+        return Recording.open(wanted, doubtful=True), None
+    except BadInput as error:
+        if wanted.mask_invert is not None:
+            raise
+        recording = Recording.open(replace(wanted, mask_invert=False), doubtful=True)
+        return recording, str(error)
+
+
+def share(value: float | None) -> float | None:
+    """A number for JSON, which knows no NaN."""
+    return None if value is None or not np.isfinite(value) else round(float(value), 4)

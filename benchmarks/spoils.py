@@ -1,0 +1,297 @@
+"""The usual mistakes, made on purpose in a copy of a capture folder.
+
+They are written forwards, in files, and share no code with the doctor, which undoes them.
+"""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from preprocess.body import Body
+from preprocess.pose import Motion
+from preprocess.pose_file import read_motion, write_motion
+from preprocess.shape import betas_for
+
+Spoil = Callable[[Path], None]
+"""Makes one mistake in a capture folder."""
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A capture folder to be spoilt, and what the doctor should say of it."""
+
+    film: str
+    spoils: tuple[tuple[str, Spoil], ...]
+
+    @property
+    def causes(self) -> frozenset[str]:
+        return frozenset(cause for cause, _ in self.spoils)
+
+    def make(self, films: Path, folder: Path) -> Path:
+        """A spoilt copy; pictures and masks are linked where they stay as they are."""
+        shutil.copytree(films / self.film, folder, copy_function=_link)
+        for _, spoil in self.spoils:
+            spoil(folder)
+        return folder
+
+
+def _link(source: str, target: str) -> None:
+    Path(target).hardlink_to(source)
+
+
+def _poses(folder: Path, change: Callable[[Motion], Motion]) -> None:
+    path = folder / "poses.npz"
+    motion = change(read_motion(path))
+    path.unlink()
+    write_motion(path, motion)
+
+
+def _cameras(folder: Path, **changed: Any) -> None:
+    path = folder / "cameras.npz"
+    with np.load(path) as archive:
+        arrays: dict[str, Any] = {key: archive[key] for key in archive.files}
+    path.unlink()
+    np.savez(path, **{**arrays, **changed})
+
+
+def _extrinsic(folder: Path) -> np.ndarray:
+    with np.load(folder / "cameras.npz") as archive:
+        return archive["extrinsic"]
+
+
+def _pelvis(motion: Motion) -> np.ndarray:
+    body = Body.load()
+    return body.with_shape(betas_for(body, motion)).joints[0]
+
+
+def _moved(motion: Motion, rotation: np.ndarray, shift: np.ndarray) -> Motion:
+    """The motion in another world, x' = R x + b."""
+    pelvis = _pelvis(motion)
+    roots = Rotation.from_matrix(rotation) * Rotation.from_rotvec(motion.root_rotations)
+    places = (pelvis + motion.root_translations) @ rotation.T + shift - pelvis
+    return replace(motion, root_rotations=roots.as_rotvec(), root_translations=places)
+
+
+def in_camera_space(folder: Path) -> None:
+    """No mistake yet: the same capture, told in the camera's own frame, as trackers do."""
+    extrinsic = _extrinsic(folder)
+    _poses(folder, lambda m: _moved(m, extrinsic[:3, :3], extrinsic[:3, 3]))
+    _cameras(folder, extrinsic=np.eye(4))
+
+
+def late(frames: int) -> Spoil:
+    def spoil(folder: Path) -> None:
+        def change(motion: Motion) -> Motion:
+            numbers = np.arange(len(motion)) + frames
+            return replace(motion, frames=numbers, times_s=None)
+
+        _poses(folder, change)
+
+    return spoil
+
+
+def cut(frames: int) -> Spoil:
+    """The first rows are missing, and nothing tells the frames' numbers."""
+
+    def spoil(folder: Path) -> None:
+        _poses(folder, lambda m: _rows(m, np.arange(frames, len(m))))
+
+    return spoil
+
+
+def resampled(rate: float) -> Spoil:
+    """Rows of a copy of the video that had so many times its frame rate; none has a number."""
+
+    def spoil(folder: Path) -> None:
+        _poses(
+            folder, lambda m: _rows(m, np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int))
+        )
+
+    return spoil
+
+
+def slow_clock(factor: float) -> Spoil:
+    """Times reckoned with a wrong frame rate."""
+
+    def spoil(folder: Path) -> None:
+        def change(motion: Motion) -> Motion:
+            assert motion.times_s is not None
+            return replace(motion, frames=None, times_s=motion.times_s * factor)
+
+        _poses(folder, change)
+
+    return spoil
+
+
+def _rows(motion: Motion, rows: np.ndarray) -> Motion:
+    return replace(
+        motion,
+        root_rotations=motion.root_rotations[rows],
+        root_translations=motion.root_translations[rows],
+        joint_rotations=motion.joint_rotations[rows],
+        valid=motion.valid[rows],
+        frames=None,
+        times_s=None,
+    )
+
+
+def opengl_poses(folder: Path) -> None:
+    """Poses in the space of an OpenGL camera, and no word of it."""
+    in_camera_space(folder)
+    _poses(folder, lambda m: _moved(m, OPENGL, np.zeros(3)))
+
+
+def opengl_cameras(folder: Path) -> None:
+    """nerfstudio's matrix as it stands there: world-from-camera, y up, z back."""
+    pose = np.linalg.inv(_extrinsic(folder))
+    pose[:3, :3] = pose[:3, :3] @ OPENGL
+    _cameras(folder, extrinsic=pose)
+
+
+def opengl_roots(folder: Path) -> None:
+    """Root rotations of an OpenGL camera beside places of an OpenCV one."""
+    in_camera_space(folder)
+    turned = Rotation.from_matrix(OPENGL)
+
+    def change(m: Motion) -> Motion:
+        roots = turned * Rotation.from_rotvec(m.root_rotations)
+        return replace(m, root_rotations=roots.as_rotvec())
+
+    _poses(folder, change)
+
+
+def y_up_places(folder: Path) -> None:
+    """The places' y with the wrong sign, the rotations as they should be."""
+    in_camera_space(folder)
+    _poses(
+        folder,
+        lambda m: replace(m, root_translations=m.root_translations * np.array([1.0, -1.0, 1.0])),
+    )
+
+
+def turned_pictures(degrees: float) -> Spoil:
+    """The tracker saw the pictures turned."""
+
+    def spoil(folder: Path) -> None:
+        in_camera_space(folder)
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        _poses(folder, lambda m: _moved(m, turn, np.zeros(3)))
+
+    return spoil
+
+
+def z_up(folder: Path) -> None:
+    """Poses in a world with z up (AMASS), cameras in one with y up."""
+    turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    _poses(folder, lambda m: _moved(m, turn, np.zeros(3)))
+
+
+def camera_space_twice(folder: Path) -> None:
+    """Poses in the camera's frame beside a camera that stands somewhere."""
+    extrinsic = _extrinsic(folder)
+    _poses(folder, lambda m: _moved(m, extrinsic[:3, :3], extrinsic[:3, 3]))
+
+
+def world_from_camera(folder: Path) -> None:
+    _cameras(folder, extrinsic=np.linalg.inv(_extrinsic(folder)))
+
+
+def camera_forgotten(folder: Path) -> None:
+    """Poses in the world, and nothing says where the camera stood."""
+    _cameras(folder, extrinsic=np.eye(4))
+
+
+def focal(factor: float) -> Spoil:
+    def spoil(folder: Path) -> None:
+        with np.load(folder / "cameras.npz") as archive:
+            intrinsic = archive["intrinsic"].copy()
+        intrinsic[[0, 1], [0, 1]] *= factor
+        _cameras(folder, intrinsic=intrinsic)
+
+    return spoil
+
+
+def exchanged(folder: Path) -> None:
+    """Left joints' rotations under the right ones' numbers."""
+    _poses(folder, lambda m: replace(m, joint_rotations=m.joint_rotations[:, OTHER_SIDE]))
+
+
+def mirrored_limbs(folder: Path) -> None:
+    _poses(folder, _mirrored)
+
+
+def mirrored_pictures(folder: Path) -> None:
+    """The tracker saw a selfie camera's preview."""
+    in_camera_space(folder)
+
+    def change(motion: Motion) -> Motion:
+        rotations, signs = motion.root_rotations, np.array([1.0, -1.0, -1.0])
+        places = (_pelvis(motion) + motion.root_translations) * np.array([-1.0, 1.0, 1.0])
+        return replace(
+            _mirrored(motion),
+            root_rotations=rotations * signs,
+            root_translations=places - _pelvis(motion),
+        )
+
+    _poses(folder, change)
+
+
+OTHER_SIDE = (1, 0, 2, 4, 3, 5, 7, 6, 8, 10, 9, 11, 13, 12, 14, 16, 15, 18, 17, 20, 19, 22, 21)
+"""Row of the other side's joint, for joints 1 … 23."""
+
+
+def _mirrored(motion: Motion) -> Motion:
+    limbs = motion.joint_rotations[:, OTHER_SIDE] * np.array([1.0, -1.0, -1.0])
+    return replace(motion, joint_rotations=limbs)
+
+
+def about_the_origin(folder: Path) -> None:
+    """EasyMocap's convention: x -> R x + Th."""
+    in_camera_space(folder)
+
+    def change(motion: Motion) -> Motion:
+        pelvis = _pelvis(motion)
+        turned = Rotation.from_rotvec(motion.root_rotations).apply(pelvis)
+        return replace(motion, root_translations=pelvis + motion.root_translations - turned)
+
+    _poses(folder, change)
+
+
+def other_size(factor: float) -> Spoil:
+    """Places that a tracker reckoned for a body of another size."""
+
+    def spoil(folder: Path) -> None:
+        in_camera_space(folder)
+
+        def change(m: Motion) -> Motion:
+            pelvis = _pelvis(m)
+            return replace(m, root_translations=(pelvis + m.root_translations) * factor - pelvis)
+
+        _poses(folder, change)
+
+    return spoil
+
+
+def in_units(factor: float) -> Spoil:
+    """Places in millimetres (1000) or centimetres (100)."""
+
+    def spoil(folder: Path) -> None:
+        in_camera_space(folder)
+        _poses(folder, lambda m: replace(m, root_translations=m.root_translations * factor))
+
+    return spoil
+
+
+def inverted_masks(folder: Path) -> None:
+    for path in sorted((folder / "masks").iterdir()):
+        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert mask is not None
+        path.unlink()
+        cv2.imwrite(str(path), 255 - mask)

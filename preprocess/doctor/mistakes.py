@@ -1,0 +1,345 @@
+"""The usual mistakes in a capture, each as the change that would undo it."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from preprocess.doctor.claim import Claim
+from preprocess.kinematics import rotation_matrices
+from preprocess.pose import Motion
+from preprocess.skeleton import JOINT_NAMES
+
+CAUSES = (
+    "mask_polarity", "world_frame", "opengl_axes", "root_rotation", "frame_offset", "frame_rate",
+    "left_right", "root_origin", "focal", "body_scale",
+)  # fmt: skip
+"""By these names mistakes are called, in commands and files."""
+
+OFFSETS = (1, 2, 3, 4, 5, 7, 9, 12, 15, 18, 21, 25, 30, 35, 40, 50, 60)
+"""Frames by which poses may be late or early, at first look."""
+RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
+"""Frames a second that are mistaken for one another."""
+UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+OPENGL = np.diag([1.0, -1.0, -1.0])
+FLIPS = {"y has": (1.0, -1.0, 1.0), "z has": (1.0, 1.0, -1.0), "y and z have": (1.0, -1.0, -1.0)}
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+SWAPPED = [
+    JOINT_NAMES.index(
+        name.replace("left", "?").replace("right", "left").replace("?", "right")
+    ) - 1
+    for name in JOINT_NAMES[1:]
+]  # fmt: skip
+"""Row of each joint's other side among the 23 joint rotations."""
+
+Rotation3 = Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cure:
+    """One mistake, undone.
+
+    Attributes:
+        cause: The mistake, one of `CAUSES`.
+        words: What was wrong, for people: ends the sentence "It looks as if …".
+        undo: From the claim to what it should have been.
+        factor: Of a fitted cure, the number that was fitted.
+    """
+
+    cause: str
+    words: str
+    undo: Callable[[Claim], Claim]
+    factor: float | None = None
+
+
+def cures(claim: Claim, pelvis: Float[np.ndarray, "3"], frames: int) -> Iterator[Cure]:
+    """Every discrete mistake that the doctor knows; focal lengths and sizes are fitted instead.
+
+    Args:
+        claim: What the files say.
+        pelvis: Rest place of the pelvis, J0, which the root turns about.
+        frames: How many frames there are.
+    """
+    yield Cure(
+        cause="mask_polarity",
+        words="the masks are 1 where the person is not",
+        undo=lambda c: replace(c, inverted=not c.inverted),
+    )
+    yield from _wrong_world(claim)
+    yield from _wrong_axes(claim)
+    yield from _wrong_rotation()
+    yield from (shifted(k) for near in OFFSETS if near < frames // 2 for k in (near, -near))
+    yield from _wrong_rate(claim, frames)
+    yield from _wrong_side()
+    yield from _wrong_origin(pelvis)
+    yield from _wrong_units()
+
+
+def shifted(frames: int) -> Cure:
+    """Poses that come too late (positive) or too early by some frames."""
+    late = "late" if frames > 0 else "early"
+    return Cure(
+        cause="frame_offset",
+        words=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late}",
+        undo=lambda c: replace(c, places=c.places - frames),
+    )
+
+
+def refocused(factor: float) -> Cure:
+    """Focal lengths that are too short (factor above 1) or too long."""
+
+    def undo(claim: Claim) -> Claim:
+        intrinsics = claim.intrinsics.copy()
+        intrinsics[:, [0, 1], [0, 1]] *= factor
+        return replace(claim, intrinsics=intrinsics)
+
+    wrong = "short" if factor > 1.0 else "long"
+    return Cure(
+        cause="focal",
+        words=f"the focal length is too {wrong}; {factor:.3f} times fits",
+        undo=undo,
+        factor=factor,
+    )
+
+
+def rescaled(factor: float, pelvis: Float[np.ndarray, "3"]) -> Cure:
+    """A person who is too small (factor above 1) or too large for where the poses put them.
+
+    Nothing but the ratio of size and distance is seen in pictures, and the body's size is its own:
+    so distances shrink by the factor. With one camera, or cameras in one place, they shrink
+    towards it; else the whole world does, cameras included.
+    """
+
+    def undo(claim: Claim) -> Claim:
+        eyes = _eyes(claim)
+        fixed = eyes.mean(axis=0) if np.ptp(eyes, axis=0).max() < 1e-3 else np.zeros(3)
+        pelves = pelvis + claim.motion.root_translations
+        moved = fixed + (pelves - fixed) / factor
+        extrinsics = claim.extrinsics.copy()
+        turned = extrinsics[:, :3, :3]
+        extrinsics[:, :3, 3] = -np.einsum("cab,cb->ca", turned, fixed + (eyes - fixed) / factor)
+        return replace(
+            claim,
+            motion=replace(claim.motion, root_translations=moved - pelvis),
+            extrinsics=extrinsics,
+        )
+
+    wrong = "small" if factor > 1.0 else "large"
+    words = f"the body is too {wrong} for its distance; {factor:.3f} times its size fits"
+    return Cure(cause="body_scale", words=words, undo=undo, factor=factor)
+
+
+def _wrong_units() -> Iterator[Cure]:
+    """Places that are not in metres."""
+    for factor, unit in UNITS.items():
+        yield Cure(
+            cause="body_scale",
+            words=f"the places of the poses are in {unit}, not in metres",
+            undo=lambda c, factor=factor: replace(
+                c,
+                motion=replace(c.motion, root_translations=c.motion.root_translations * factor),
+            ),
+        )
+
+
+def _wrong_world(claim: Claim) -> Iterator[Cure]:
+    """Poses and cameras that are told in different worlds."""
+    if not np.allclose(claim.extrinsics, np.eye(4), atol=1e-6):
+        yield Cure(
+            cause="world_frame",
+            words="the poses are in the camera's own frame, and its place is counted twice",
+            undo=lambda c: replace(c, extrinsics=np.broadcast_to(np.eye(4), c.extrinsics.shape)),
+        )
+        yield Cure(
+            cause="world_frame",
+            words="the cameras are told as world-from-camera, not as camera-from-world",
+            undo=lambda c: replace(c, extrinsics=np.linalg.inv(c.extrinsics)),
+        )
+        yield Cure(
+            cause="opengl_axes",
+            words="the cameras are told as world-from-camera with OpenGL's axes (y up, z back)",
+            undo=lambda c: replace(c, extrinsics=_rigid(OPENGL) @ np.linalg.inv(c.extrinsics)),
+        )
+
+
+def _wrong_axes(claim: Claim) -> Iterator[Cure]:
+    """OpenGL's axes where OpenCV's were expected, in all numbers or in some."""
+    yield Cure(
+        cause="opengl_axes",
+        words="camera space has OpenGL's axes (y up, z back), not OpenCV's (y down, z forward)",
+        undo=lambda c: replace(c, extrinsics=_rigid(OPENGL) @ c.extrinsics),
+    )
+    if not np.allclose(claim.extrinsics, np.eye(4), atol=1e-6):
+        yield Cure(
+            cause="opengl_axes",
+            words="the poses' world has y and z the other way round",
+            undo=lambda c: replace(c, extrinsics=c.extrinsics @ _rigid(OPENGL)),
+        )
+    yield Cure(
+        cause="opengl_axes",
+        words="the root's rotation has OpenGL's axes, its place OpenCV's",
+        undo=lambda c: _turned_in_place(c, OPENGL),
+    )
+    for signs, which in (
+        ((1, -1, 1), "y has"),
+        ((1, -1, -1), "y and z have"),
+        ((1, 1, -1), "z has"),
+    ):
+        flip = np.diag(np.array(signs, dtype=np.float64))
+        yield Cure(
+            cause="opengl_axes",
+            words=f"of the root's place {which} the wrong sign",
+            undo=lambda c, flip=flip: _placed(c, flip),
+        )
+
+
+def _wrong_rotation() -> Iterator[Cure]:
+    """Quarter turns: pictures that were turned for the tracker, and worlds with another axis up."""
+    for degrees in (90, 180, 270):
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        yield Cure(
+            cause="root_rotation",
+            words=f"the tracker saw the pictures turned by {360 - degrees}°",
+            undo=lambda c, turn=turn: replace(c, extrinsics=_rigid(turn) @ c.extrinsics),
+        )
+    for axis, degrees in [(a, d) for a in "xyz" for d in (90, 180, 270) if (a, d) != ("x", 180)]:
+        turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+        yield Cure(
+            cause="root_rotation",
+            words=f"the root is turned by {360 - degrees}° about the camera's {axis}",
+            undo=lambda c, turn=turn: _turned_in_place(c, turn),
+        )
+    for axis, degrees in (("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 180), ("y", 270)):
+        turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+        yield Cure(
+            cause="root_rotation",
+            words=f"the body at rest is turned by {360 - degrees}° about its {axis}",
+            undo=lambda c, turn=turn: _with_root(c, _roots(c.motion) @ turn),
+        )
+    for degrees in (90, 270):
+        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        yield Cure(
+            cause="root_rotation",
+            words="the poses' world has z up where the camera's has y, or the other way round",
+            undo=lambda c, turn=turn: replace(c, extrinsics=c.extrinsics @ _rigid(turn)),
+        )
+
+
+def _wrong_rate(claim: Claim, frames: int) -> Iterator[Cure]:
+    """Poses of a copy of the video with another number of frames a second."""
+    factors = {a / b for a in RATES for b in RATES if a != b}
+    rows = len(claim.places)
+    if rows != frames:
+        factors.add(frames / rows)
+    for factor in sorted(factors):
+        yield Cure(
+            cause="frame_rate",
+            words=f"the poses were made at {1.0 / factor:.3g} times the video's frame rate",
+            undo=lambda c, factor=factor: replace(c, places=c.places * factor),
+        )
+
+
+def _wrong_side() -> Iterator[Cure]:
+    """Left taken for right: in the joints' order, in the body, or in the picture."""
+    yield Cure(
+        cause="left_right",
+        words="the joints of the left and the right side are exchanged",
+        undo=lambda c: replace(
+            c, motion=replace(c.motion, joint_rotations=c.motion.joint_rotations[:, SWAPPED])
+        ),
+    )
+    yield Cure(
+        cause="left_right",
+        words="the limbs are mirrored",
+        undo=lambda c: replace(c, motion=_mirrored_limbs(c.motion)),
+    )
+    yield Cure(
+        cause="left_right",
+        words="the tracker saw the pictures mirrored",
+        undo=lambda c: _mirrored_picture(c),
+    )
+
+
+def _wrong_origin(pelvis: Float[np.ndarray, "3"]) -> Iterator[Cure]:
+    """EasyMocap turns bodies about the origin, SMPL about the pelvis: R x + t, and back."""
+
+    def undo(claim: Claim, sign: float) -> Claim:
+        moved = sign * (_roots(claim.motion) @ pelvis - pelvis)
+        there = claim.motion.root_translations + moved
+        return replace(claim, motion=replace(claim.motion, root_translations=there))
+
+    yield Cure(
+        cause="root_origin",
+        words="the root turns about the origin (EasyMocap, ZJU), not about the pelvis",
+        undo=lambda c: undo(c, 1.0),
+    )
+    yield Cure(
+        cause="root_origin",
+        words="the root's place was already changed from the origin's to the pelvis's",
+        undo=lambda c: undo(c, -1.0),
+    )
+
+
+def _rigid(rotation: Rotation3) -> Float[np.ndarray, "4 4"]:
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    return transform
+
+
+def _roots(motion: Motion) -> Float[np.ndarray, "poses 3 3"]:
+    return rotation_matrices(np.nan_to_num(motion.root_rotations))
+
+
+def _with_root(claim: Claim, roots: Float[np.ndarray, "poses 3 3"]) -> Claim:
+    vectors = Rotation.from_matrix(roots).as_rotvec()
+    return replace(claim, motion=replace(claim.motion, root_rotations=vectors))
+
+
+def _eyes(claim: Claim) -> Float[np.ndarray, "cameras 3"]:
+    """Where the cameras stand in the world."""
+    return -np.einsum("cba,cb->ca", claim.extrinsics[:, :3, :3], claim.extrinsics[:, :3, 3])
+
+
+def _camera_turns(claim: Claim) -> Float[np.ndarray, "poses 3 3"]:
+    """Rotation from the world into the camera of each row."""
+    if len(claim.extrinsics) == 1:
+        return np.broadcast_to(claim.extrinsics[:, :3, :3], (len(claim.places), 3, 3))
+    return claim.extrinsics[_camera_rows(claim), :3, :3]
+
+
+def _camera_rows(claim: Claim) -> np.ndarray:
+    places = np.nan_to_num(claim.places).round().astype(np.int64)
+    return places.clip(0, len(claim.extrinsics) - 1)
+
+
+def _turned_in_place(claim: Claim, turn: Rotation3) -> Claim:
+    """The root turned in the camera's axes, about the pelvis, which stays."""
+    cameras = _camera_turns(claim)
+    return _with_root(claim, np.swapaxes(cameras, 1, 2) @ turn @ cameras @ _roots(claim.motion))
+
+
+def _placed(claim: Claim, change: Rotation3) -> Claim:
+    """The root's place changed in the camera's axes; its rotation stays."""
+    rows = _camera_rows(claim) if len(claim.extrinsics) > 1 else np.zeros(len(claim.places), int)
+    turned, moved = claim.extrinsics[rows, :3, :3], claim.extrinsics[rows, :3, 3]
+    translations = claim.motion.root_translations
+    seen = np.einsum("cab,cb->ca", turned, translations) + moved
+    back = np.einsum("cba,cb->ca", turned, seen @ change.T - moved)
+    return replace(claim, motion=replace(claim.motion, root_translations=back))
+
+
+def _mirrored_limbs(motion: Motion) -> Motion:
+    """Each limb moves as the other side's did in a mirror."""
+    limbs = motion.joint_rotations[:, SWAPPED] * np.array([1.0, -1.0, -1.0])
+    return replace(motion, joint_rotations=limbs)
+
+
+def _mirrored_picture(claim: Claim) -> Claim:
+    """The person as a mirror shows them, left and right exchanged in the camera's axes."""
+    mirrored = _placed(claim, MIRROR)
+    cameras = _camera_turns(claim)
+    back = np.swapaxes(cameras, 1, 2)
+    roots = back @ MIRROR @ cameras @ _roots(claim.motion) @ MIRROR
+    return _with_root(replace(mirrored, motion=_mirrored_limbs(mirrored.motion)), roots)

@@ -1,0 +1,132 @@
+"""What can be said of poses and masks without drawing a body: gaps, jumps, ranges, views."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from preprocess.doctor.claim import Claim, step_of
+from preprocess.doctor.evidence import Evidence
+
+FAR_M = 50.0
+"""People are filmed from nearer than this."""
+JUMP_M, JUMP_RAD = 0.25, np.deg2rad(40.0)
+"""What nobody does from one frame to the next …"""
+JUMPS = 6.0
+"""… unless all frames are that far apart: a jump is so many times the usual step, too."""
+SECTORS = 12
+ENOUGH_SECTORS = 0.5
+SMALL_PX = 60
+LARGE_BETA = 6.0
+NAMED = 6
+
+
+def unsound(
+    claim: Claim, frames: list[int], evidence: Evidence | None, height_px: int
+) -> Iterator[str]:
+    """Sentences about what is odd, for people.
+
+    Args:
+        claim: Poses and cameras.
+        frames: Numbers of the wanted frames.
+        evidence: Masks of some frames, if there are any.
+        height_px: Of the pictures.
+    """
+    yield from _gaps(claim, frames)
+    yield from _ranges(claim)
+    yield from _jumps(claim)
+    seen = views(claim)
+    if seen < ENOUGH_SECTORS:
+        yield (
+            f"The camera sees the person from {seen:.0%} of the sides around them only; what it "
+            "does not see cannot be learnt. Turn round once."
+        )
+    if evidence is not None:
+        yield from _framing(evidence, height_px)
+
+
+def views(claim: Claim) -> float:
+    """Share of the directions around the body from which a camera sees it, in twelve sectors."""
+    valid = claim.motion.valid
+    roots = Rotation.from_rotvec(claim.motion.root_rotations[valid])
+    rows = np.zeros(len(claim.places), dtype=np.int64)
+    if len(claim.extrinsics) > 1:
+        rows = np.nan_to_num(claim.places).astype(np.int64).clip(0, len(claim.extrinsics) - 1)
+    turned, moved = claim.extrinsics[rows[valid], :3, :3], claim.extrinsics[rows[valid], :3, 3]
+    eyes = -np.einsum("cba,cb->ca", turned, moved)
+    seen = roots.inv().apply(eyes - claim.motion.root_translations[valid])
+    sector = np.floor((np.arctan2(seen[:, 0], seen[:, 2]) / (2.0 * np.pi) + 0.5) * SECTORS)
+    return len(np.unique(sector.clip(0, SECTORS - 1))) / SECTORS
+
+
+def _gaps(claim: Claim, frames: list[int]) -> Iterator[str]:
+    valid = claim.motion.valid
+    lost = int((~valid).sum())
+    if lost:
+        yield f"{lost} of {len(valid)} poses are NaN or marked as lost."
+    bare = [frame for frame in frames if claim.row_of(frame) is None]
+    if len(bare) > lost:
+        yield f"{len(bare)} of {len(frames)} frames have no pose{_named(bare)}."
+
+
+def _ranges(claim: Claim) -> Iterator[str]:
+    motion = claim.motion
+    places = motion.root_translations[motion.valid]
+    if len(places) and float(np.median(np.linalg.norm(places, axis=1))) > FAR_M:
+        yield (
+            f"The poses lie {np.median(np.linalg.norm(places, axis=1)):.0f} m from the origin; "
+            "are they in metres?"
+        )
+    angles = np.linalg.norm(motion.joint_rotations[motion.valid], axis=-1)
+    if angles.size and angles.max() > 1.5 * np.pi:
+        yield (
+            f"A joint is bent by {np.rad2deg(angles.max()):.0f}°; were axis-angles in radians "
+            "expected, and degrees given?"
+        )
+    if len(motion.betas) and np.abs(motion.betas).max() > LARGE_BETA:
+        yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
+
+
+def _jumps(claim: Claim) -> Iterator[str]:
+    """Steps that are far larger than the others."""
+    motion = claim.motion
+    if motion.valid.sum() < 3:
+        return
+    rows = np.flatnonzero(motion.valid)
+    rows = rows[np.argsort(claim.places[rows], kind="stable")]
+    near = np.diff(claim.places[rows]) <= 1.5 * step_of(claim.places)
+    moved = np.linalg.norm(np.diff(motion.root_translations[rows], axis=0), axis=1)
+    roots = Rotation.from_rotvec(motion.root_rotations[rows])
+    turned = (roots[:-1].inv() * roots[1:]).magnitude()
+    jumps = near & (_outliers(moved, JUMP_M) | _outliers(turned, JUMP_RAD))
+    if jumps.any():
+        after = [int(claim.places[row]) for row in rows[1:][jumps]]
+        yield f"The poses jump {len(after)} times{_named(after)}. Did the tracker change persons?"
+    still = near & (moved == 0.0) & (turned == 0.0)
+    if near.any() and still.sum() > 0.2 * near.sum():
+        yield f"{still.sum() / near.sum():.0%} of the poses are the same as the one before."
+
+
+def _outliers(steps: Float[np.ndarray, "steps"], least: float) -> Bool[np.ndarray, "steps"]:
+    return (steps > least) & (steps > JUMPS * np.median(steps))
+
+
+def _framing(evidence: Evidence, height_px: int) -> Iterator[str]:
+    """Whether the whole person is in the picture, and large enough."""
+    alphas = [witness.alpha > 0.5 for witness in evidence.witnesses]
+    touching = sum(a[0].any() or a[:, 0].any() or a[:, -1].any() or a[-1].any() for a in alphas)
+    if touching > 0.2 * len(alphas):
+        yield (
+            f"In {touching} of {len(alphas)} frames the person touches the picture's rim; what is "
+            "outside cannot be learnt."
+        )
+    heights = [np.ptp(np.flatnonzero(a.any(axis=1))) + 1 for a in alphas]
+    tall = float(np.median(heights)) / alphas[0].shape[0] * height_px
+    if tall < SMALL_PX:
+        yield f"The person is {tall:.0f} px high; little detail can be learnt from that."
+
+
+def _named(frames: list[int]) -> str:
+    shown = ", ".join(str(frame) for frame in frames[:NAMED])
+    return f" ({shown}{', …' if len(frames) > NAMED else ''})"

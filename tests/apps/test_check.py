@@ -1,0 +1,185 @@
+"""Tests for ia-check on films that were spoilt on purpose, and for what ia-ingest makes of it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from apps import check, ingest
+from apps.examine import looks_well
+from apps.recording import Recording, RecordingPaths
+from apps.studio.writer import ShootConfig, shoot
+from benchmarks import spoils
+from preprocess.pose_file import read_motion
+
+SPOILS = {
+    "frame_offset": spoils.late(4),
+    "frame_rate": spoils.resampled(0.5),
+    "opengl_axes": spoils.opengl_poses,
+    "root_rotation": spoils.turned_pictures(90),
+    "world_frame": spoils.camera_space_twice,
+    "focal": spoils.focal(0.7),
+    "left_right": spoils.exchanged,
+    "root_origin": spoils.about_the_origin,
+    "body_scale": spoils.in_units(1000.0),
+    "mask_polarity": spoils.inverted_masks,
+}
+
+
+@pytest.fixture(scope="module")
+def dancing(tmp_path_factory) -> Path:
+    """A capture folder: 40 frames of 96 px."""
+    folder = tmp_path_factory.mktemp("dancing") / "capture"
+    config = ShootConfig(frames=40, size=96, motion="dance", background="plain", turns=1.0)
+    shoot(folder, config)
+    return folder
+
+
+@pytest.fixture
+def spoilt(dancing, tmp_path):
+    """Makes a copy with a mistake in it."""
+
+    def make(*mistakes) -> Path:
+        shutil.copytree(dancing, tmp_path / "spoilt")
+        for mistake in mistakes:
+            mistake(tmp_path / "spoilt")
+        return tmp_path / "spoilt"
+
+    return make
+
+
+@pytest.fixture
+def call_check(capsys, tmp_path):
+    """Runs ia-check; returns its exit code, what it said, and its JSON."""
+
+    def call(*arguments):
+        wanted = tmp_path / "found.json"
+        words = [str(a) for a in arguments]
+        code = check.main([*words, "--json", str(wanted), "--sheet", str(tmp_path / "sheet.png")])
+        found = json.loads(wanted.read_text()) if wanted.exists() else {}
+        return code, " ".join(capsys.readouterr().err.split()), found
+
+    return call
+
+
+def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
+    code, said, found = call_check(dancing)
+    assert code == 0
+    assert found["verdict"] == "good"
+    assert found["cause"] is None
+    assert found["iou"]["now"] == found["iou"]["after_fix"] > 0.75
+    assert "good" in said
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    assert sheet.shape[1] > 3 * sheet.shape[0]
+
+
+def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
+    config = ShootConfig(frames=40, size=96, pose_noise_deg=2.0, pose_noise_cm=1.0, turns=1.0)
+    shoot(tmp_path / "noisy", config)
+    _, _, found = call_check(tmp_path / "noisy")
+    assert (found["verdict"], found["cause"]) == ("good", None)
+
+
+@pytest.mark.parametrize("cause", SPOILS)
+def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_check):
+    folder, out = spoilt(SPOILS[cause]), tmp_path / "mended"
+    code, _, found = call_check(folder, "--fix", out)
+    assert found["cause"] == cause
+    assert [cure["cause"] for cure in found["cures"]] == [cause]
+    assert found["iou"]["now"] + 0.05 < found["iou"]["after_fix"]
+    assert found["tried"][0]["cause"] == cause
+    assert code == 0
+    assert looks_well(Recording.open(RecordingPaths(video=out)))
+    if cause in ("frame_offset", "frame_rate"):
+        mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
+        assert mended.frames is not None
+        assert np.diff(mended.frames).max() == 1  # rows of half the rate are interpolated
+        off = mended.root_translations - true.root_translations[mended.frames]
+        assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
+
+
+def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
+    code, said, found = call_check(spoilt(spoils.opengl_poses, spoils.late(-5)))
+    assert code == 2
+    assert found["verdict"] == "unusable"
+    assert {cure["cause"] for cure in found["cures"]} == {"opengl_axes", "frame_offset"}
+    assert found["iou"]["after_fix"] > 0.75
+    assert "OpenGL" in said
+    assert "--fix" in said
+
+
+def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
+    _, _, found = call_check(spoilt(spoils.camera_forgotten))
+    assert found["cause"] == "world_frame"
+    assert found["iou"]["after_fix"] > 0.75
+
+
+def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check):
+    code, said, _ = call_check(dancing, "--fix", tmp_path / "mended")
+    assert code == 2
+    assert "No mistake" in said
+    assert not (tmp_path / "mended").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("keep")
+    code, said, _ = call_check(dancing, "--fix", tmp_path / "full")
+    assert code == 2
+    assert "--fix" in said
+
+
+def test_what_cannot_be_read_is_said_in_the_json_too(tmp_path, call_check):
+    code, said, found = call_check(tmp_path / "nothing", "--poses", tmp_path / "none.npz")
+    assert code == 2
+    assert found["verdict"] == "unusable"
+    assert found["refused"] in said
+
+
+def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
+    folder = spoilt()
+    motion = read_motion(folder / "poses.npz")
+    orient, moved = motion.root_rotations.copy(), motion.root_translations.copy()
+    orient[3] = np.nan
+    moved[20:22] += [0.9, 0.0, 0.0]
+    changed(folder / "poses.npz", global_orient=orient, transl=moved)
+    code, _, found = call_check(folder)
+    assert code == 0
+    assert found["verdict"] == "warn"
+    assert any("1 of 40 poses" in odd for odd in found["odd"])
+    assert any("jump 2 times (20, 22)" in odd for odd in found["odd"])
+
+
+def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, spoilt):
+    assert looks_well(Recording.open(RecordingPaths(video=dancing)))
+    assert not looks_well(Recording.open(RecordingPaths(video=spoilt(spoils.late(1)))))
+
+
+def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
+    folder = spoilt(spoils.focal(0.4))
+    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the focal length is too short" in said
+    assert "--force" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
+    folder = spoilt(spoils.resampled(0.5))
+    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "There are 20 poses, but 40 frames" in said
+    assert "0.5 times the video's frame rate" in said
+
+
+def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path):
+    outcome = call_ingest(spoilt(spoils.late(-9)), "--force", "--out", tmp_path / "run")
+    assert outcome.code == 0
+    assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
+
+
+def test_ingest_warns_of_late_poses_and_goes_on(spoilt, call_ingest, without_baking, tmp_path):
+    outcome = call_ingest(spoilt(spoils.late(2)), "--out", tmp_path / "run")
+    assert outcome.code == 0
+    assert "the poses come 2 frames too late" in " ".join(outcome.err.split())
