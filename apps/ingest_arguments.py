@@ -51,7 +51,9 @@ class IngestArguments:
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Whose poses, by the file's own number; without it whoever has most."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Masks, one a frame: a folder of pictures, or an .npz; 255 where the person is."""
+    """Masks, one a frame, 255 where the person is: a folder of pictures, a video, an .npz, or
+    COCO's run-length codes. Without any they are estimated from the pictures and the poses
+    (segmenter:grabcut); segmenter:NAME takes another that is installed."""
     mask_invert: Flag = False
     """The person is dark in the masks. Without either flag that is found out."""
     no_mask_invert: Flag = False

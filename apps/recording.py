@@ -23,6 +23,7 @@ from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
+from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.shape import betas_for
 
 
@@ -62,13 +63,14 @@ class Recording:
         paths: Where its parts lie.
         source: The frames.
         motion: The poses.
-        masks: The masks; None if the pictures have an alpha channel.
+        masks: The masks; None if the pictures have an alpha channel, or `segment` finds them.
         cameras: The cameras, of the frames' size.
         shaped: The person's body.
         size_px: Longer side that training sees; None for the frames' own.
         notes: What a user should know about how the parts were read.
         live: Poses and masks of a live source, which come while it runs; `motion` is what had come
             when it was opened.
+        segment: What estimates the masks, if nothing holds them.
     """
 
     paths: CapturePaths
@@ -80,6 +82,7 @@ class Recording:
     size_px: int | None
     notes: tuple[str, ...]
     live: LiveParts | None = None
+    segment: Segmenter | None = None
 
     @classmethod
     def open(
@@ -98,7 +101,11 @@ class Recording:
         camera = camera_address(wanted.video)
         if wanted.live or camera is not None:
             return cls._open_live(wanted, camera, size_px)
-        paths = find_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
+        named = segmenter_name(wanted.masks)
+        given_masks = wanted.masks if named is None else None
+        paths = find_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
+        if named is not None:
+            paths = replace(paths, masks=None)
         source = open_source(paths.video, frames=wanted.frames)
         body = Body.load(wanted.body)
         motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
@@ -111,6 +118,7 @@ class Recording:
             cameras = default_cameras(motion, source.size_px)
         shaped = body.with_shape(betas_for(body, motion))
         motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
+        estimated = named or (OURS if masks is None and not source.has_alpha else None)
         recording = cls(
             paths=paths,
             source=source,
@@ -119,7 +127,8 @@ class Recording:
             cameras=cameras,
             shaped=shaped,
             size_px=size_px,
-            notes=tuple(_notes(body, motion, masks, cameras)),
+            notes=tuple(_notes(body, motion, masks, cameras, segment=estimated)),
+            segment=None if estimated is None else make_segmenter(estimated, shaped),
         )
         if not doubtful:
             recording.check()
@@ -174,7 +183,19 @@ class Recording:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
             return self.live.observer(self.source, self.cameras, self.size_px)
-        return observer(self.source, self.motion, self.masks, self.cameras, size_px=self.size_px)
+        return observer(
+            self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
+            segment=self.segment,
+        )  # fmt: skip
+
+    def told_of_masks(self) -> dict[str, str | float | None]:
+        """Where the masks come from, and how well estimated ones agree with the posed body."""
+        if self.segment is not None:
+            agreement = getattr(self.segment, "agreement", None)
+            name = getattr(self.segment, "name", type(self.segment).__name__)
+            return {"masks": f"estimated by {name}", "mask_agreement": agreement}
+        source = "alpha channel" if self.masks is None else self.masks.path.name
+        return {"masks": source, "mask_agreement": None}
 
     def played(self) -> "Recording":
         """The same, its frames coming at their own times."""
@@ -201,11 +222,23 @@ class Recording:
         return depth / (max(camera.focal_px) * shrinking)
 
 
-def _notes(body: Body, motion: Motion, masks: Masks | None, cameras: CameraTrack) -> Iterator[str]:
+def _notes(
+    body: Body,
+    motion: Motion,
+    masks: Masks | None,
+    cameras: CameraTrack,
+    *,
+    segment: str | None = None,
+) -> Iterator[str]:
     if motion.note is not None:
         yield motion.note
     if cameras.note is not None:
         yield cameras.note
+    if segment is not None:
+        yield (
+            f"Masks are estimated from the pictures and the poses (segmenter:{segment}); a "
+            "segmenter's own masks (--masks) are sharper around hair and hands."
+        )
     if masks is not None and masks.inverted:
         yield f"The masks in {masks.path} show the background; they were turned."
     if motion.model != body.family:

@@ -8,6 +8,9 @@ from capture.errors import BadInput
 POSES = ["poses.npz", "poses.pkl", "hmr4d_results.pt", "wham_output.pkl", "vibe_output.pkl"]
 """Names under which poses lie in a capture folder."""
 
+MASKS = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
+"""Names under which masks lie in a capture folder."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CapturePaths:
@@ -68,7 +71,7 @@ def find_capture(
     return CapturePaths(
         video=video,
         poses=poses,
-        masks=masks or _first(places, ["masks", "masks.npz", "masks.npy"]),
+        masks=masks or _first(places, MASKS),
         cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
     )
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-MAX_CELLS = 1 << 26
+MAX_CELLS = 1 << 25
 """Arrays that would grow beyond this many numbers although the file holds fewer are refused."""
 
 MAX_NESTING = 8
@@ -271,7 +271,7 @@ def _bytes_of(raw: Any) -> bytes | bytearray:
 def _tensor(
     storage: Any, offset: int, size: tuple[int, ...], stride: tuple[int, ...]
 ) -> Shaped[np.ndarray, "..."]:
-    """A strided view of a storage, copied; it may not reach beyond its numbers."""
+    """A strided view of a storage that cannot be written; it may not reach beyond its numbers."""
     if not isinstance(storage, Storage) or storage.content is None:
         raise ValueError("a tensor without its numbers")
     numbers = storage.content
@@ -286,7 +286,7 @@ def _tensor(
     if not cells:
         return np.zeros(size, numbers.dtype)
     steps = [step * numbers.itemsize for step in stride]
-    return np.lib.stride_tricks.as_strided(numbers[offset:], size, steps).copy()
+    return np.lib.stride_tricks.as_strided(numbers[offset:], size, steps, writeable=False)
 
 
 def _dense(state: Any, nesting: int) -> Shaped[np.ndarray, "rows columns"]:

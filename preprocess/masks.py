@@ -10,7 +10,13 @@ from PIL import Image
 
 from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
+from capture.source import VIDEO_SUFFIXES
+from preprocess.mask_files import coded_masks, video_of_masks
 from preprocess.npz import read_npz
+from preprocess.poses.content import read_content
+
+CODED = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
+"""Endings of files that may hold run-length codes."""
 
 SAMPLED = 9
 """How many masks are looked at to find out which side is the person."""
@@ -74,7 +80,7 @@ class Masks:
 
 
 def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
-    """Opens a folder of pictures or .npy files, or one .npz or .npy of (N, H, W).
+    """Opens a folder of pictures or .npy files, a video, arrays (N, H, W), or run-length codes.
 
     Args:
         path: The folder or the file.
@@ -110,19 +116,37 @@ def _folder_of_masks(path: Path) -> tuple[int, Reader]:
 
 
 def _file_of_masks(path: Path) -> tuple[int, Reader]:
-    if path.suffix == ".npz":
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        count, read = video_of_masks(path)
+        return count, lambda row: _as_alpha(read(row), path)
+    if path.suffix in CODED and not (path.suffix == ".npy" and _is_plain(path)):
+        coded = coded_masks(read_content(path), path)
+        if coded is None:
+            raise BadInput(f"{path} holds no masks: no run-length codes, one or more a frame.")
+        count, decode = coded
+        return count, lambda row: _as_alpha(decode(row), path)
+    if path.suffix == ".npy":
+        stack = _load(path)
+    elif path.suffix == ".npz":
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
-    elif path.suffix == ".npy":
-        stack = _load(path)
     else:
         raise BadInput(
-            f"{path} holds no masks that can be read; expected a folder of pictures, an .npz or an "
-            ".npy (masks as a video are not read yet)."
+            f"{path} holds no masks that can be read; expected a folder of pictures, a video, an "
+            ".npz or .npy (N, height, width), or COCO's run-length codes (.json, .npy, .pkl)."
         )
     if stack is None or stack.ndim != 3 or not stack.size:
         raise BadInput(f"{path} holds no array of masks (N, height, width).")
     return len(stack), lambda row: _as_alpha(stack[row], path)
+
+
+def _is_plain(path: Path) -> bool:
+    """Whether an .npy holds anything but objects; a damaged one is left to who reads it."""
+    try:
+        _load(path)
+    except BadInput as cause:
+        return "bject" not in str(cause)
+    return True
 
 
 def _load(path: Path) -> Shaped[np.ndarray, "..."]:

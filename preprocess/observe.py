@@ -16,6 +16,7 @@ from preprocess.masks import Masks, same_shape
 from preprocess.observation import Observation
 from preprocess.pairing import row_by_order
 from preprocess.pose import BodyPose, Motion
+from preprocess.segmenter import Segmenter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +39,11 @@ def observe(
     cameras: CameraTrack,
     *,
     size_px: int | None = None,
+    segment: Segmenter | None = None,
 ) -> Iterator[Observation | Dropped]:
     """Observations of the wanted frames in order, lazily; `observer` says the rest."""
-    return map(observer(source, motion, masks, cameras, size_px=size_px), source.frames())
+    observed = observer(source, motion, masks, cameras, size_px=size_px, segment=segment)
+    return map(observed, source.frames())
 
 
 def observer(
@@ -50,21 +53,24 @@ def observer(
     cameras: CameraTrack,
     *,
     size_px: int | None = None,
+    segment: Segmenter | None = None,
 ) -> Callable[[Frame], Observation | Dropped]:
     """What makes an observation of a frame, after everything was checked.
 
     Args:
         source: Where the frames come from.
         motion: Poses; matched by their frame numbers, by their times, or by order.
-        masks: One mask a frame; None if the pictures have an alpha channel.
+        masks: One mask a frame; None if the pictures have an alpha channel, or `segment` finds it.
         cameras: Cameras of the frames' size.
         size_px: Longer side of the observations; pictures are never enlarged.
+        segment: What finds the person where there is neither a mask nor an alpha channel.
 
     Raises:
         BadInput: At once, if the parts do not fit together.
     """
     row_of = check_motion(motion, source)
-    mask_row = check_masks(masks, source)
+    made = masks is None and segment is not None and not source.has_alpha
+    mask_row = (lambda index: index) if made else check_masks(masks, source)
     camera_row = check_cameras(cameras, source)
 
     def pose_of(frame: Frame) -> BodyPose | str:
@@ -79,7 +85,13 @@ def observer(
         return masks.alpha(mask_row(frame.index), size_px)
 
     target_px = shrunk(source.size_px, size_px)
-    return joiner(pose_of, alpha_of, lambda index: cameras[camera_row(index)], target_px)
+    return joiner(
+        pose_of,
+        alpha_of,
+        lambda index: cameras[camera_row(index)],
+        target_px,
+        segment=segment if made else None,
+    )
 
 
 def joiner(
@@ -87,6 +99,8 @@ def joiner(
     alpha_of: Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "height width"]],
     camera_of: Callable[[int], Camera],
     target_px: tuple[int, int],
+    *,
+    segment: Segmenter | None = None,
 ) -> Callable[[Frame], Observation | Dropped]:
     """What joins a frame with its pose, mask and camera, each found by a function of its own.
 
@@ -95,6 +109,7 @@ def joiner(
         alpha_of: Its mask at a size; raises BadInput if it has none.
         camera_of: The camera of a frame's number, of the frames' size.
         target_px: Width and height of the observations.
+        segment: What finds the mask in place of `alpha_of`, once the frame was scaled.
     """
 
     def joined(frame: Frame) -> Observation | Dropped:
@@ -103,18 +118,18 @@ def joiner(
         pose = pose_of(frame)
         if isinstance(pose, str):
             return Dropped(index=frame.index, reason=pose)
+        camera = camera_of(frame.index).resized(target_px)
         try:
-            alpha = alpha_of(frame, target_px)
+            if segment is None:
+                alpha, scaled = alpha_of(frame, target_px), _resized(frame, target_px)
+            else:
+                scaled = _resized(frame, target_px)
+                alpha = segment(scaled, pose, camera)
         except BadInput as cause:
             return Dropped(index=frame.index, reason=f"mask unusable: {cause}")
         if not (alpha > 0.5).any():
             return Dropped(index=frame.index, reason="mask empty")
-        return Observation(
-            frame=_resized(frame, target_px),
-            alpha=alpha,
-            pose=pose,
-            camera=camera_of(frame.index).resized(target_px),
-        )
+        return Observation(frame=scaled, alpha=alpha, pose=pose, camera=camera)
 
     return joined
 
@@ -159,8 +174,8 @@ def check_masks(masks: Masks | None, source: Source) -> Callable[[int], int]:
         if source.has_alpha:
             return lambda index: index
         raise BadInput(
-            f"No masks were found for {source.path}, and making masks from the video is not built "
-            "yet. Give --masks: a folder with one 8-bit picture a frame, 255 where the person is."
+            f"No masks were found for {source.path}. Give --masks: a folder with one 8-bit picture "
+            "a frame, 255 where the person is, or segmenter:grabcut to have them estimated."
         )
     if not same_shape(masks.size_px, source.size_px):
         raise BadInput(

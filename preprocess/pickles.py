@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from capture.errors import BadInput
-from preprocess.inert import Array, Encoded, Inert, Mapping, array_of, dtype_of
+from preprocess.inert import Array, Encoded, Inert, Mapping, SparseColumns, array_of, dtype_of
 from preprocess.unpickle import FetchStorage, HoldsCode, unpickled
 
 MAX_BYTES = 1 << 30
@@ -92,7 +92,7 @@ class _Plain:
     """Turns inert records into plain things, each record once, with a limit on all of them."""
 
     def __init__(self) -> None:
-        self._items = 0
+        self._items, self._made_bytes = 0, 0
         self._known: dict[int, Any] = {}
         self._kept: list[Any] = []
         """Records that were made on the way: their ids must not be used again."""
@@ -126,7 +126,7 @@ class _Plain:
             case Array() if dtype_of(thing.state[2]).hasobject:
                 return self._objects(thing, depth)
             case Inert():
-                return array_of(thing)
+                return self._array(thing)
         raise ValueError(f"a {type(thing).__name__}")
 
     def _key(self, key: Any, depth: int) -> Any:
@@ -141,6 +141,15 @@ class _Plain:
         parts = [self.of(part, depth) for part in raw]
         self._count(len(parts))
         return parts[0] if shape == () and len(parts) == 1 else parts
+
+    def _array(self, thing: Inert) -> Shaped[np.ndarray, "..."]:
+        """The array of a record; what had to be made of little is counted."""
+        array = array_of(thing)
+        if isinstance(thing, SparseColumns):
+            self._made_bytes += array.nbytes
+            if self._made_bytes > MAX_BYTES:
+                raise ValueError(f"arrays that grow beyond {MAX_BYTES >> 20} MiB")
+        return array
 
     def _count(self, more: int) -> None:
         self._items += more

@@ -37,6 +37,11 @@ ADAPTERS: dict[str, Callable[[Any, bool], People | None]] = {
 }
 """Trackers by name, in the order in which they are asked whether a file is theirs."""
 
+REFUSED = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError,
+)  # fmt: skip
+"""What adapters raise for a file that is nearly theirs: they read it as if it were whole."""
+
 
 def read_poses(
     path: Path, *, default_model: str = "body24", person: str | None = None, driving: bool = False
@@ -82,7 +87,7 @@ def _recognised(
     for tool, tracks in ADAPTERS.items():
         try:
             people = tracks(content, driving)
-        except (ValueError, KeyError, IndexError, TypeError, OverflowError) as cause:
+        except REFUSED as cause:
             raise BadInput(
                 f"{path} looks like a file of {tool}, but what it holds cannot be used: "
                 f"{type(cause).__name__} {cause}. Is it complete?"

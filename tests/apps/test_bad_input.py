@@ -122,11 +122,8 @@ def test_empty_masks(refused, capture):
     refused(capture, words=["masks", "empty"])
 
 
-def test_no_masks(refused, capture):
-    for path in masks_of(capture):
-        path.unlink()
-    (capture / "masks").rmdir()
-    refused(capture, words=["--masks", "not built"])
+def test_a_segmenter_that_nobody_installed(refused, capture):
+    refused(capture, "--masks", "segmenter:sam", words=["no such segmenter", "grabcut"])
 
 
 def test_a_camera_of_another_aspect_ratio(refused, capture, changed):

@@ -1,6 +1,7 @@
 """A video with poses as a stranger's tracker wrote them."""
 
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -58,3 +59,22 @@ def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp
     assert not any("people" in note for note in chosen.notes)
     with pytest.raises(BadInput, match="nobody called '7'"):
         Recording.open(RecordingPaths(**paths, person="7"))
+
+
+def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("video.mp4", "poses.npz", "cameras.npz"):
+        shutil.copy(film / name, bare / name)
+    recording = Recording.open(RecordingPaths(video=bare))
+    assert any("estimated" in note and "segmenter:grabcut" in note for note in recording.notes)
+    true = Recording.open(RecordingPaths(video=film))
+    assert true.told_of_masks() == {"masks": "masks", "mask_agreement": None}
+    alike = [
+        np.minimum(a.alpha, b.alpha).sum() / np.maximum(a.alpha, b.alpha).sum()
+        for a, b in zip(recording.observations(), true.observations(), strict=True)
+    ]
+    assert np.mean(alike) > 0.85  # of 64 px; larger pictures reach 0.95 and more
+    told = recording.told_of_masks()
+    assert told["masks"] == "estimated by GrabCut"
+    assert 0.6 < told["mask_agreement"] < 1.0

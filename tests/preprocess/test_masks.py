@@ -1,5 +1,8 @@
 """Masks in every container and polarity."""
 
+import json
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,6 +10,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from capture.errors import BadInput
+from capture.quiet import silence_opencv
+from preprocess.mask_files import decoded
 from preprocess.masks import open_masks, same_shape
 
 SIZE = (30, 40)
@@ -148,7 +153,8 @@ def test_shapes_agree_after_any_shrinking(width, height, longer):
     [
         ("masks.npz", b"junk", "readable"),
         ("masks.npy", b"junk", "readable"),
-        ("masks.mp4", b"junk", "not read yet"),
+        ("masks.mp4", b"junk", "no video that can be opened"),
+        ("masks.txt", b"junk", "no masks that can be read"),
         ("masks/0.png", b"junk", "cannot|can be decoded"),
         ("masks/0.npy", b"junk", "readable"),
         ("masks/notes.txt", b"junk", "no masks"),
@@ -160,6 +166,101 @@ def test_what_holds_no_masks_is_refused(tmp_path, name, content, message):
     path.write_bytes(content)
     with pytest.raises(BadInput, match=message):
         open_masks(tmp_path / name.split("/")[0])
+
+
+def text_of(mask: np.ndarray) -> bytes:
+    """COCO's text of a mask's run lengths, as its maskApi writes it."""
+    flat = mask.T.ravel() > 0
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flat]).astype(int))).tolist()
+    lengths = np.diff([0, *ends, flat.size]).tolist()
+    text = bytearray()
+    for place, length in enumerate(lengths):
+        value = length - lengths[place - 2] if place > 2 else length
+        more = True
+        while more:
+            group, value = value & 0x1F, value >> 5
+            more = value != (-1 if group & 0x10 else 0)
+            text.append((group | 0x20 if more else group) + 48)
+    return bytes(text)
+
+
+def test_run_lengths_are_those_of_the_standards_own_example():
+    """From the specification of COCO's maskApi: columns first, beginning with zeros."""
+    assert decoded({"size": [3, 4], "counts": [1, 2, 5, 4]}).tolist() == [
+        [0, 0, 0, 1], [1, 0, 0, 1], [1, 0, 1, 1]
+    ]  # fmt: skip
+    assert decoded({"size": [2, 2], "counts": "04"}).tolist() == [[1, 1], [1, 1]]
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
+def test_coded_masks_of_any_shape_go_round(height, width, seed):
+    rng = np.random.default_rng(seed)
+    mask = np.repeat(rng.random((height, width)) < rng.random(), rng.integers(1, 9), axis=0)
+    code = {"size": list(mask.shape), "counts": text_of(mask)}
+    np.testing.assert_array_equal(decoded(code), mask)
+
+
+@pytest.mark.parametrize("container", ["list", "names", "coco", "npy", "several"])
+def test_coded_masks_are_read_from_whatever_holds_them(tmp_path, container):
+    hard = [(person(i) > 200).astype(np.uint8) for i in range(12)]
+    codes = [{"size": [40, 30], "counts": text_of(mask).decode()} for mask in hard]
+    names = [f"mask_{i}.png" for i in range(12)]
+    path = tmp_path / ("masks.npy" if container == "npy" else "masks.json")
+    if container == "npy":
+        told = [{**code, "counts": code["counts"].encode()} for code in codes]
+        np.save(path, np.array(told, dtype=object))
+    elif container == "coco":
+        images = [{"id": i + 100, "file_name": names[i]} for i in reversed(range(12))]
+        listed = [
+            {"image_id": i + 100, "segmentation": codes[i]} for i in (3, 1, 2, 0, *range(4, 12))
+        ]
+        path.write_text(json.dumps({"images": images, "annotations": listed}))
+    elif container == "names":
+        path.write_text(json.dumps(dict(sorted(zip(names, codes, strict=True)))))
+    elif container == "several":
+        empty = {"size": [40, 30], "counts": [1200]}
+        path.write_text(json.dumps([[empty, code] if i else [] for i, code in enumerate(codes)]))
+    else:
+        path.write_text(json.dumps(codes))
+    masks = open_masks(path)
+    assert masks.count == 12
+    for row in (11, 0, 5):
+        expected = hard[row] if row or container != "several" else np.zeros((40, 30))
+        np.testing.assert_array_equal(masks.alpha(row, SIZE), expected)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        {"size": [3, 4], "counts": [5]},
+        {"size": [1 << 20, 1 << 20], "counts": [1 << 40]},
+        {"size": [3, 4], "counts": "o" * 40},
+        {"size": [3, 4], "counts": [-1, 13]},
+    ],
+)
+def test_codes_that_do_not_fill_their_picture_are_refused(tmp_path, code):
+    path = tmp_path / "masks.json"
+    path.write_text(json.dumps([code, code]))
+    with pytest.raises(BadInput, match="run-length code"):
+        open_masks(path)
+
+
+def test_a_video_of_masks_is_read_in_any_order(tmp_path):
+    silence_opencv()
+    path = tmp_path / "masks.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (60, 80))
+    large = [np.kron(person(i), np.ones((2, 2), np.uint8)) for i in range(12)]
+    for mask in large:
+        writer.write(np.dstack([mask] * 3))
+    writer.release()
+    masks = open_masks(path)
+    assert masks.count == 12
+    assert masks.size_px == (60, 80)
+    for row in (0, 7, 3, 3, 11):
+        alpha = masks.alpha(row, (60, 80))
+        assert np.abs(alpha - large[row] / 255.0).mean() < 0.02
+        assert alpha.min() == 0.0
+        assert alpha.max() == 1.0
 
 
 def test_arrays_that_are_no_masks_are_refused(tmp_path, write):

@@ -164,9 +164,9 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
     assert "64x48 px, its picture 48x64" in reasons[6]
 
 
-def test_without_masks_there_is_nothing_to_do_yet(parts):
+def test_without_masks_and_a_segmenter_there_is_nothing_to_do(parts):
     source, _, cameras = parts()
-    with pytest.raises(BadInput, match=r"not built yet.*--masks"):
+    with pytest.raises(BadInput, match=r"No masks were found.*--masks.*segmenter:grabcut"):
         observe(source, moving(COUNT), None, cameras)
 
 

@@ -1,0 +1,156 @@
+"""Masks in one file for all frames: a video, arrays, or COCO's run-length codes."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt8
+
+from capture.errors import BadInput
+from capture.images import natural_key
+from capture.quiet import silence_opencv
+from capture.selection import Selection
+from capture.video import VideoFile
+
+MAX_PIXELS = 1 << 28
+"""Of one run-length coded mask."""
+
+BLACK, WHITE = 16.0, 239.0
+"""Compressed videos ring around edges: what is darker is 0, what is brighter 1."""
+
+Read = Callable[[int], Shaped[np.ndarray, "height width"]]
+
+
+def video_of_masks(path: Path) -> tuple[int, Read]:
+    """How many frames a video has, and what reads the brightness of one.
+
+    Raises:
+        BadInput: If it cannot be opened.
+    """
+    source = VideoFile(path, Selection())
+    film = _Film(path)
+    return source.frames_in_file, film.read
+
+
+class _Film:
+    """Frames of a video by number; cheap in ascending order, which is how they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._capture: cv2.VideoCapture | None = None
+        self._at = -1
+        self._last: Float32[np.ndarray, "height width"] | None = None
+
+    def read(self, row: int) -> Float32[np.ndarray, "height width"]:
+        """The mask in one frame.
+
+        Raises:
+            BadInput: If it cannot be decoded.
+        """
+        if row == self._at and self._last is not None:
+            return self._last
+        if self._capture is None or row <= self._at:
+            silence_opencv()
+            self._capture, self._at = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), -1
+        while self._at < row:
+            if not self._capture.grab():
+                raise BadInput(f"Frame {row} of the masks {self._path} cannot be decoded.")
+            self._at += 1
+        ok, picture = self._capture.retrieve()
+        if not ok:
+            raise BadInput(f"Frame {row} of the masks {self._path} cannot be decoded.")
+        grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        self._last = np.clip((grey - np.float32(BLACK)) / np.float32(WHITE - BLACK), 0.0, 1.0)
+        return self._last
+
+
+def coded_masks(content: Any, path: Path) -> tuple[int, Read] | None:
+    """How many run-length coded masks there are, and what decodes one; None if there are none.
+
+    A list with one a frame (TRAM's masks.npy; an empty entry is an empty mask), a dictionary of
+    them by file names, or a COCO file with `images` and `annotations`. Several in a frame are one.
+    """
+    frames = _by_frame(content)
+    if not frames or not any(frames):
+        return None
+    first = next(codes for codes in frames if codes)[0]
+
+    def read(row: int) -> UInt8[np.ndarray, "height width"]:
+        codes = frames[row] or [{**first, "counts": None}]
+        try:
+            return np.bitwise_or.reduce([decoded(code) for code in codes])
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError) as cause:
+            raise BadInput(f"Mask {row} in {path} is no run-length code ({cause}).") from cause
+
+    return len(frames), read
+
+
+def _by_frame(content: Any) -> list[list[dict[str, Any]]] | None:
+    if isinstance(content, dict) and {"images", "annotations"} <= content.keys():
+        images = sorted(content["images"], key=lambda image: natural_key(Path(image["file_name"])))
+        found: dict[Any, list[Any]] = {image["id"]: [] for image in images}
+        for one in content["annotations"]:
+            found.setdefault(one["image_id"], []).append(one["segmentation"])
+        return [_codes(codes) for codes in found.values()]
+    if isinstance(content, dict) and not _is_code(content):
+        names = sorted(content, key=lambda name: natural_key(Path(str(name))))
+        listed = [content[name] for name in names]
+    elif isinstance(content, list):
+        listed = content
+    else:
+        return None
+    if not all(_is_code(one) or one is None or isinstance(one, list) for one in listed):
+        return None
+    return [_codes(one) for one in listed]
+
+
+def _codes(one: Any) -> list[dict[str, Any]]:
+    listed = [one] if _is_code(one) else (one or [])
+    return [code for code in listed if _is_code(code)]
+
+
+def _is_code(thing: Any) -> bool:
+    return isinstance(thing, dict) and {"size", "counts"} <= thing.keys()
+
+
+def decoded(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
+    """A mask of COCO's run-length code: lengths of runs of 0 and 1, down the columns.
+
+    `counts` is a list, or the text in which each length is written in groups of five bits, the
+    lowest first, from the third on as the difference to the one before the last (COCO's maskApi).
+    None is an empty mask.
+
+    Raises:
+        ValueError: If the runs do not fill the picture.
+    """
+    height, width = (int(side) for side in code["size"])
+    if not 0 < height * width <= MAX_PIXELS:
+        raise ValueError(f"a size of {height}x{width}")
+    counts = [height * width] if code["counts"] is None else code["counts"]
+    if isinstance(counts, str | bytes):
+        counts = _lengths(counts.encode("latin1") if isinstance(counts, str) else counts)
+    lengths = np.asarray(counts, dtype=np.int64).reshape(-1)
+    if (lengths < 0).any() or lengths.sum() != height * width:
+        raise ValueError(f"runs that do not fill {height}x{width} pixels")
+    ones = np.repeat(np.arange(len(lengths)) % 2, lengths)
+    return ones.reshape(width, height).T.astype(np.uint8)
+
+
+def _lengths(text: bytes) -> list[int]:
+    lengths: list[int] = []
+    value = shift = 0
+    for byte in text:
+        group = byte - 48
+        value |= (group & 0x1F) << shift
+        shift += 5
+        if shift > 60:
+            raise ValueError("a run that is too long")
+        if group & 0x20:
+            continue
+        if group & 0x10:
+            value -= 1 << shift
+        lengths.append(value + lengths[-2] if len(lengths) > 2 else value)
+        value = shift = 0
+    return lengths

@@ -1,0 +1,55 @@
+"""The outline of a posed body in a picture, triangle by triangle."""
+
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from capture.camera import Camera
+from preprocess.body import ShapedBody
+from preprocess.pose import BodyPose
+
+NEAR_M = 0.05
+"""Bodies that come nearer to the camera than this are not drawn."""
+
+FRACTION_BITS = 4
+"""Corners are drawn to a sixteenth of a pixel."""
+
+
+@final
+class Outline:
+    """Draws one person's body as a filled shape.
+
+    OpenCV fills many polygons at once by the even-odd rule; so each call gets the triangles of one
+    limb that look towards the camera, or away from it: these do not lie over each other.
+    """
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Sorts the triangles by limbs."""
+        self._shaped = shaped
+        faces = shaped.body.faces
+        limb = shaped.body.weights[faces].sum(axis=1).argmax(axis=1)
+        self._limbs = [faces[limb == joint] for joint in range(24) if (limb == joint).any()]
+
+    def drawn(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
+        """The pixels that the body covers; none if it comes too near or behind the camera."""
+        width, height = camera.size_px
+        picture = np.zeros((height, width), dtype=np.uint8)
+        vertices = self._shaped.with_pose(pose).vertices()
+        depth = vertices @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        if depth.min() < NEAR_M:
+            return picture > 0
+        pixels = (camera.project(vertices) - 0.5) * (1 << FRACTION_BITS)
+        corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
+        for faces in self._limbs:
+            triangles = corners[faces].astype(np.int64)
+            a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+            towards = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
+            for side in (towards, ~towards):
+                filled = np.zeros_like(picture)
+                polygons = list(triangles[side].astype(np.int32))
+                if polygons:
+                    cv2.fillPoly(filled, polygons, 1, cv2.LINE_8, FRACTION_BITS)
+                picture |= filled
+        return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0

@@ -1,0 +1,178 @@
+"""Masks that nobody gave, found around the posed body."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from capture.frame import Frame
+from preprocess import segmenter
+from preprocess.grabcut import GrabCut
+from preprocess.kinematics import rotation_matrices
+from preprocess.outline import Outline
+from preprocess.pose import BodyPose
+from preprocess.segmenter import make_segmenter, segmenter_name
+
+SIZE = (160, 200)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    """2.8 m before a standing person."""
+    upright = np.diag([1.0, -1.0, -1.0, 1.0])
+    upright[:3, 3] = [0.0, 1.0, 2.8]
+    matrix = np.array([[250.0, 0, 80], [0, 250, 100], [0, 0, 1]])
+    return Camera.from_intrinsic(matrix, SIZE, upright)
+
+
+def standing(shaped, yaw: float = 0.0) -> BodyPose:
+    joints = np.zeros((23, 3))
+    joints[[0, 1], 2] = 0.2, -0.2
+    joints[[15, 16], 2] = -0.8, 0.8
+    height = -shaped.vertices[:, 1].min()
+    return BodyPose(
+        root_rotation=np.array([0.0, yaw, 0.0]),
+        root_translation=np.array([0.0, height, 0.0]),
+        joint_rotations=joints,
+    )
+
+
+@pytest.fixture
+def film(shaped, camera, rng):
+    """A person in a blue suit, wider than the body, before a wall of many colours."""
+    outline = Outline(shaped)
+    wall = cv2.resize(rng.integers(40, 220, (25, 20, 3), dtype=np.uint8), SIZE)
+    wall[..., 2] //= 2
+    cloth = rng.integers(0, 40, (*SIZE[::-1], 3), dtype=np.uint8) + np.uint8([20, 30, 190])
+
+    def film(yaw: float, index: int = 0) -> tuple[Frame, BodyPose, np.ndarray]:
+        pose = standing(shaped, yaw)
+        body = outline.drawn(pose, camera).astype(np.uint8)
+        true = cv2.dilate(body, np.ones((5, 5), np.uint8)) > 0
+        rgb = np.where(true[..., None], cloth, wall).astype(np.uint8)
+        noise = rng.normal(0.0, 3.0, rgb.shape)
+        rgb = np.clip(rgb + noise, 0, 255).astype(np.uint8)
+        return Frame(index=index, time_s=index / 30, rgb=rgb), pose, true
+
+    return film
+
+
+def agreement(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.minimum(a, b).sum() / np.maximum(a, b).sum())
+
+
+def test_the_outline_covers_what_points_of_the_skin_cover(shaped, camera):
+    pose = standing(shaped, 0.4)
+    drawn = Outline(shaped).drawn(pose, camera)
+    at = np.floor(camera.project(shaped.with_pose(pose).vertices())).astype(int)
+    assert drawn[at[:, 1], at[:, 0]].mean() > 0.99
+    points = np.zeros(drawn.shape, np.uint8)
+    points[at[:, 1], at[:, 0]] = 1
+    closed = cv2.morphologyEx(points, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    assert agreement(drawn, closed) > 0.93  # skin between the points is covered, nothing else
+
+
+def test_nothing_is_drawn_of_a_body_behind_the_camera(shaped, camera):
+    away = np.eye(4)
+    away[2, 3] = -5.0
+    assert (
+        not Outline(shaped).drawn(standing(shaped), replace(camera, camera_from_world=away)).any()
+    )
+
+
+def test_clothes_that_are_wider_than_the_body_are_found(shaped, camera, film):
+    find = GrabCut(shaped)
+    frame, pose, true = film(0.0)
+    body = Outline(shaped).drawn(pose, camera)
+    assert agreement(body, true) < 0.85
+    assert agreement(find(frame, pose, camera), true) > 0.95
+    assert find.found == 1
+    assert 0.6 < find.agreement < 0.95
+
+
+def test_what_was_seen_behind_the_person_helps_where_poses_are_off(shaped, camera, film):
+    def shifted(pose: BodyPose) -> BodyPose:
+        return replace(pose, root_translation=pose.root_translation + np.array([0.03, 0.0, 0.0]))
+
+    find = GrabCut(shaped)
+    for index, yaw in enumerate(np.linspace(0.0, 6.0, 10)):
+        frame, pose, true = film(float(yaw), index)
+        last = agreement(find(frame, shifted(pose), camera), true)
+        alone = agreement(GrabCut(shaped)(frame, shifted(pose), camera), true)
+    assert last > 0.93
+    assert last > alone - 0.01
+
+
+def test_a_camera_that_moves_forgets_what_lay_behind(shaped, camera, film):
+    find = GrabCut(shaped)
+    for index, yaw in enumerate((0.0, 1.0, 2.0)):
+        frame, pose, _ = film(yaw, index)
+        find(frame, pose, camera)
+    assert find._behind is not None
+    turned = camera.camera_from_world.copy()
+    turned[:3] = rotation_matrices(np.array([0.0, 0.02, 0.0])) @ turned[:3]
+    moved = replace(camera, camera_from_world=turned)
+    find._remember_only_if_still(moved)
+    assert find._behind is None
+
+
+def test_the_same_frames_give_the_same_masks(shaped, camera, film):
+    frame, pose, _ = film(0.7)
+    masks = [GrabCut(shaped)(frame, pose, camera) for _ in range(2)]
+    np.testing.assert_array_equal(*masks)
+
+
+def test_large_pictures_are_cut_small_and_come_back_large(shaped, camera, film):
+    frame, pose, true = film(0.3)
+    large = replace(frame, rgb=cv2.resize(frame.rgb, (480, 600), interpolation=cv2.INTER_NEAREST))
+    mask = GrabCut(shaped)(large, pose, camera.resized((480, 600)))
+    assert mask.shape == (600, 480)
+    assert agreement(cv2.resize(mask, SIZE, interpolation=cv2.INTER_AREA), true) > 0.93
+
+
+def test_a_person_who_is_not_there_gives_no_mask(shaped, camera, film):
+    frame, pose, _ = film(0.0)
+    aside = replace(pose, root_translation=pose.root_translation + np.array([9.0, 0.0, 0.0]))
+    with pytest.raises(BadInput, match="not in the picture"):
+        GrabCut(shaped)(frame, aside, camera)
+
+
+# --- the seat for others -----------------------------------------------------------------------
+
+
+def test_a_segmenter_is_named_by_its_prefix():
+    assert segmenter_name("segmenter:grabcut") == "grabcut"
+    assert segmenter_name("masks/") is None
+    assert segmenter_name(None) is None
+
+
+class Point:
+    """An installed package's entry point."""
+
+    def __init__(self, name, load):
+        self.name, self.load = name, load
+
+
+def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):
+    made = []
+
+    def load():
+        return lambda body: made.append(body) or (lambda frame, pose, camera: frame)
+
+    monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
+    assert make_segmenter("rembg", shaped)(1, None, None) == 1
+    assert made == [shaped]
+    with pytest.raises(BadInput, match="installed are grabcut, rembg"):
+        make_segmenter("sam", shaped)
+
+
+def test_a_segmenter_that_cannot_be_loaded_is_named(monkeypatch, shaped):
+    def load():
+        raise ImportError("no module named rembg")
+
+    monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
+    with pytest.raises(BadInput, match=r"'rembg' could not be loaded: no module named rembg"):
+        make_segmenter("rembg", shaped)
