@@ -40,9 +40,15 @@ STRAYED_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
+JUDGED_AFTER_STEPS, JUDGED_BY = 300, 3
+"""A pose is judged once its frame has been learnt from for so many steps, by so many pulls."""
+EXACT = 1.3
+"""Mean evidence, the frame's and all frames' halves, below which a pose counts as exact and stays
+as it is for good. Were it asked for ever, chance would move it, what it moves would blur the field,
+and a blurred field moves the next: at 540 px that ran away after three thousand steps."""
 SETTLED_AFTER_STEPS = 3000
-"""Steps after which a frame's pose stays as it is: what the field shows of it by then is as much
-its own memory of that pose as evidence, and in a run of ten minutes poses would drift."""
+"""Steps after which any pose stays as it is: what the field shows of it by then is as much its own
+memory of that pose as evidence."""
 FARTHEST = 0.35
 """A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
 
@@ -93,6 +99,8 @@ class PoseTable:
         self._below = _subtrees(rig)
         self._moving, self._evidence = 1.0, CHANCE
         self._since = np.zeros(capacity, dtype=np.int64)
+        self._judged, self._settled = np.zeros((2, capacity), dtype=bool)
+        self._asked, self._told = np.zeros((2, capacity))
         self._open = torch.ones(capacity, dtype=torch.bool, device=device)
 
     def put(
@@ -107,6 +115,8 @@ class PoseTable:
         self._given[slot] = pose
         self._since[slot] = step
         self._open[slot] = True
+        self._settled[slot] = False
+        self._asked[slot] = self._told[slot] = 0.0
         self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
@@ -132,9 +142,14 @@ class PoseTable:
         )
 
     def settle(self, step: int) -> bool:
-        """Leaves alone the poses that were refined for long enough; whether any others are left."""
+        """Leaves alone poses that proved exact, or were refined long enough; whether any are left."""
         held = np.array([pose is not None for pose in self._given])
-        young = held & (step - self._since < SETTLED_AFTER_STEPS)
+        age = step - self._since
+        self._judged = age >= JUDGED_AFTER_STEPS
+        told = self._told / self._asked.clip(min=1)
+        exact = (self._asked >= JUDGED_BY) & (0.5 * (told + self._evidence) < EXACT)
+        self._settled |= exact | (age >= SETTLED_AFTER_STEPS)
+        young = held & ~self._settled
         self._open.copy_(torch.from_numpy(young))
         self._rays *= self._open
         return bool(young.any())
@@ -171,6 +186,9 @@ class PoseTable:
         step = pose_step(self.gradients(slot), loss, self.corrections[slot], self._evidence)
         self._rays[slot] = 0
         self._evidence += (1.0 - MEMORY) * (step.evidence - self._evidence)
+        if self._judged[slot]:
+            self._asked[slot] += 1.0
+            self._told[slot] += step.evidence
         moves = bool(step.change.any())
         self._moving += (1.0 - MEMORY) * (moves - self._moving)
         if not moves:

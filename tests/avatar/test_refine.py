@@ -17,7 +17,7 @@ from avatar.kernels.backend import CellTables, Samples
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES
-from avatar.refine import SETTLED_AFTER_STEPS, PoseTable
+from avatar.refine import JUDGED_AFTER_STEPS, JUDGED_BY, SETTLED_AFTER_STEPS, PoseTable
 from avatar.render import cell_tables
 from avatar.step import cosine
 from avatar.trainer import Trainer
@@ -232,6 +232,27 @@ def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator
     assert corrected(SETTLED_AFTER_STEPS - 1) == {0, 1}
     assert corrected(SETTLED_AFTER_STEPS) == {1}
     assert corrected(SETTLED_AFTER_STEPS + 1000) == set()
+
+
+def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, generator):
+    """Chance is not believed again later; the frame whose rays all pull one way stays open."""
+    table, pose = PoseTable(rig, 2, CPU), pose_of(bent_pose)
+    table.put(0, pose)
+    table.put(1, pose)
+    loss, later = torch.full((300,), 0.1), JUDGED_AFTER_STEPS
+
+    def pulled(step, slot, bias):
+        table.settle(step)
+        wrenches = torch.randn(300, 24, 6, generator=generator) + bias
+        table.feel(torch.full((300,), slot), wrenches, loss)
+        return table.correct_one(rate=1.0) is not None
+
+    for step in range(60):  # too early to judge; it takes that long until all together agree
+        pulled(step, 0, 0.0)
+    for step in range(later, later + JUDGED_BY):
+        pulled(step, 0, 0.0)
+    assert not pulled(later + JUDGED_BY, 0, 3.0)
+    assert any(pulled(later + JUDGED_BY + k, 1, 3.0) for k in range(5))
 
 
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
