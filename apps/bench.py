@@ -52,7 +52,11 @@ class Benchmark:
 
 
 def benchmark(
-    player: Player, shots: Sequence[tuple[BodyPose, Camera]], *, load_ms: float
+    player: Player,
+    shots: Sequence[tuple[BodyPose, Camera]],
+    *,
+    load_ms: float,
+    tier: str = "hq",
 ) -> Benchmark:
     """Draws every shot, after a few to warm up."""
     shots = list(shots) * -(-FEWEST // len(shots))
@@ -65,7 +69,7 @@ def benchmark(
         covered += float(np.count_nonzero(picture[..., 3])) / picture[..., 3].size
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return Benchmark(
-        tier="hq",
+        tier=tier,
         size=max(shots[0][1].size_px),
         frames=len(shots),
         pixels_covered=covered / len(shots),

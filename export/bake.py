@@ -3,16 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8, Int32, UInt8, UInt16
+from jaxtyping import Bool, Int32, UInt8, UInt16
 
 from avatar.rig import Rig
-from export.compiled import grown, interpolated, mark_reached
+from export.bake_skin import skin_of
+from export.compiled import grown, mark_reached
 from export.errors import ExportRefused
 from export.hull import Hull, find_hull
 from export.lattice import FAINTEST, FieldAt, Lattice, read_field
 from export.tables import (
     BRICK,
-    GRADIENT_LIMIT,
     NODES,
     SURFEL_BITS,
     THICKNESS_STEP_M,
@@ -23,8 +23,6 @@ from export.tables import (
 )
 from preprocess.kinematics import body_from_rest
 
-GRADIENT_STEP_M = 0.01
-"""Half the distance over which the skinning weights are differentiated."""
 FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.012
@@ -50,7 +48,7 @@ class BakeConfig:
     """
 
     voxel_m: float = 0.004
-    surfel_spacing_m: float = 0.005
+    surfel_spacing_m: float = 0.007
     hull_density: float = 20.0
 
     @classmethod
@@ -104,9 +102,11 @@ def tables_of(lattice: Lattice, rig: Rig, config: BakeConfig) -> Tables:
     hull = _hull_that_fits(lattice, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
     pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
+    reached = _within_reach(lattice, hull)
     return Tables(
-        surfels=_surfels(hull, rig),
-        bricks=_bricks(lattice, hull),
+        surfels=_surfels(hull),
+        bricks=_bricks(lattice, reached),
+        skin=skin_of(rig, hull),
         pelvis=pelvis.astype(np.float32),
         reach_m=_reach(rig),
     )
@@ -142,22 +142,19 @@ def _reach(rig: Rig) -> float:
     return float(along.max() + 0.35)
 
 
-def _surfels(hull: Hull, rig: Rig) -> Surfels:
+def _surfels(hull: Hull) -> Surfels:
     low = hull.positions.min(axis=0)
     extent_m = float((hull.positions.max(axis=0) - low).max())
     codes = np.round((hull.positions - low) / extent_m * 65535.0).astype(np.uint16)
     order = np.argsort(_morton(codes), kind="stable")
-    codes, points = codes[order], hull.positions[order]
     thickness = np.round(hull.thickness[order] / THICKNESS_STEP_M)
     return Surfels(
         low=low,
         extent_m=extent_m,
         spacing_m=hull.spacing_m,
-        position_codes=codes,
+        position_codes=codes[order],
         normal_codes=np.round(hull.normals[order] * 127.0).astype(np.int8),
         thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
-        weight_codes=np.ascontiguousarray(weight_codes(_weights(rig, points)).T),
-        gradient_codes=_gradient_codes(rig, points),
     )
 
 
@@ -171,37 +168,11 @@ def _morton(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "points"
     return order
 
 
-def weight_codes(weights: Float[np.ndarray, "points 24"]) -> UInt8[np.ndarray, "points 24"]:
-    """Weights × 255 rounded so that each row sums to 255 (largest remainders up)."""
-    scaled = weights / weights.sum(axis=1, keepdims=True) * 255.0
-    codes = np.floor(scaled).astype(np.int64)
-    missing = 255 - codes.sum(axis=1, keepdims=True)
-    rank = np.argsort(np.argsort(codes - scaled, axis=1, kind="stable"), axis=1)
-    return (codes + (rank < missing)).astype(np.uint8)
-
-
-def _weights(rig: Rig, points: Float32[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
-    """`rig.weights_at`, quickly."""
-    nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
-    return interpolated(rig.weights, rig.box_low, nodes / (rig.box_high - rig.box_low), points)
-
-
-def _gradient_codes(
-    rig: Rig, points: Float32[np.ndarray, "points 3"]
-) -> Int8[np.ndarray, "points 3 24"]:
-    codes = np.zeros((len(points), 3, 24), dtype=np.int8)
-    for axis, step in enumerate(np.eye(3, dtype=np.float32) * np.float32(GRADIENT_STEP_M)):
-        difference = _weights(rig, points + step) - _weights(rig, points - step)
-        scaled = difference / (2 * GRADIENT_STEP_M) / GRADIENT_LIMIT * 127.0
-        codes[:, axis] = np.clip(np.round(scaled), -127, 127).astype(np.int8)
-    return codes
-
-
-def _bricks(lattice: Lattice, hull: Hull) -> Bricks:
+def _bricks(lattice: Lattice, reached: Bool[np.ndarray, "x y z"]) -> Bricks:
     """The visible part of the lattice near the hull, cut into bricks."""
     counts = np.array(lattice.density.shape) // BRICK
     codes = density_codes(lattice.density)
-    codes[~_within_reach(lattice, hull)] = 0
+    codes[~reached] = 0
     visible = grown(codes > 0)
     blocks = np.lib.stride_tricks.sliding_window_view(visible, (NODES,) * 3)
     used = blocks[::BRICK, ::BRICK, ::BRICK].any(axis=(3, 4, 5))

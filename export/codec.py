@@ -3,14 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Int32, Shaped, UInt8, UInt16
 
 from capture.errors import BadInput
-from export.tables import BRICK, NODES, SURFEL_BITS, Bricks, Surfels, Tables
+from export.tables import BRICK, FULL_WEIGHT, NODES, SURFEL_BITS, Bricks, Skin, Surfels, Tables
 
 MOST_BRICKS = 1 << 16
 MOST_BLOCKS = 1 << 20
-"""Larger tables are refused before anything is allocated; a 2-m person at 4 mm has 5,000 bricks."""
+MOST_SKIN_NODES = 1 << 17
+"""Larger tables are refused before anything is allocated; a 2-m person at 4 mm has 5,000 bricks
+and 15,000 nodes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -23,6 +25,9 @@ class Layout:
         bricks: How many there are, without the empty one.
         brick_counts: Blocks of the lattice along x, y, z.
         brick_low, voxel_m: As in `Bricks`.
+        skin_nodes: How many nodes of the skin are stored.
+        skin_counts: Nodes of its grid along x, y, z.
+        skin_low, skin_step_m: As in `Skin`.
         pelvis, reach_m: As in `Tables`.
     """
 
@@ -34,14 +39,19 @@ class Layout:
     brick_counts: tuple[int, int, int]
     brick_low: tuple[float, float, float]
     voxel_m: float
+    skin_nodes: int
+    skin_counts: tuple[int, int, int]
+    skin_low: tuple[float, float, float]
+    skin_step_m: tuple[float, float, float]
     pelvis: tuple[float, float, float]
     reach_m: float
 
     @classmethod
     def of(cls, tables: Tables) -> "Layout":
         """The layout of some tables."""
-        surfels, bricks = tables.surfels, tables.bricks
+        surfels, bricks, skin = tables.surfels, tables.bricks, tables.skin
         x, y, z = bricks.index.shape
+        i, j, k = skin.index.shape
         return cls(
             surfels=len(surfels),
             surfel_low=_triple(surfels.low),
@@ -51,39 +61,49 @@ class Layout:
             brick_counts=(x, y, z),
             brick_low=_triple(bricks.low),
             voxel_m=bricks.voxel_m,
+            skin_nodes=skin.weight_codes.shape[1] - 1,
+            skin_counts=(i, j, k),
+            skin_low=_triple(skin.low),
+            skin_step_m=_triple(skin.step_m),
             pelvis=_triple(tables.pelvis),
             reach_m=tables.reach_m,
         )
 
     def check(self) -> None:
         """Raises BadInput if a table would be larger than the player can use."""
-        counts = self.brick_counts
         sound = (
             0 < self.surfels < 1 << SURFEL_BITS
             and 0 <= self.bricks <= MOST_BRICKS
-            and min(counts) > 0
-            and max(counts) <= MOST_BLOCKS
-            and counts[0] * counts[1] * counts[2] <= MOST_BLOCKS
+            and 0 < self.skin_nodes <= MOST_SKIN_NODES
+            and _fit(self.brick_counts)
+            and _fit(self.skin_counts)
         )
         if not sound:
             raise BadInput(
-                f"The package claims {self.surfels} surfels and {self.bricks} bricks on "
-                f"{counts} blocks; at most {1 << SURFEL_BITS}, {MOST_BRICKS} and {MOST_BLOCKS} "
-                "can be. The file is damaged or no avatar."
+                f"The package claims {self.surfels} surfels, {self.bricks} bricks on "
+                f"{self.brick_counts} blocks and {self.skin_nodes} nodes of "
+                f"{self.skin_counts}; at most {1 << SURFEL_BITS}, {MOST_BRICKS}, {MOST_BLOCKS}, "
+                f"{MOST_SKIN_NODES} and {MOST_BLOCKS} can be. The file is damaged or no avatar."
             )
 
     def streams(self) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Element type and shape of every stream."""
         x, y, z = self.brick_counts
+        i, j, k = self.skin_counts
         return {
             "blocks": ("u1", ((x * y * z + 7) // 8,)),
             "voxels": ("u1", (4, self.bricks, BRICK, BRICK, BRICK)),
             "positions": ("<u2", (3, self.surfels)),
             "normals": ("i1", (3, self.surfels)),
             "thickness": ("u1", (self.surfels,)),
-            "weights": ("u1", (24, self.surfels)),
-            "gradients": ("i1", (72, self.surfels)),
+            "skin_nodes": ("u1", ((i * j * k + 7) // 8,)),
+            "skin_weights": ("<u2", (24, self.skin_nodes)),
         }
+
+
+def _fit(counts: tuple[int, int, int]) -> bool:
+    x, y, z = counts
+    return min(counts) > 0 and max(counts) <= MOST_BLOCKS and x * y * z <= MOST_BLOCKS
 
 
 def _triple(vector: Shaped[np.ndarray, "3"]) -> tuple[float, float, float]:
@@ -101,8 +121,8 @@ def encode(tables: Tables) -> dict[str, bytes]:
         "positions": _differences(surfels.position_codes.T, axes=(-1,)),
         "normals": surfels.normal_codes.T,
         "thickness": surfels.thickness_codes,
-        "weights": surfels.weight_codes,
-        "gradients": surfels.gradient_codes.reshape(-1, 72).T,
+        "skin_nodes": np.packbits(tables.skin.index.ravel() > 0),
+        "skin_weights": tables.skin.weight_codes[:, 1:],
     }
     layout = Layout.of(tables).streams()
     return {name: array.astype(layout[name][0]).tobytes() for name, array in arrays.items()}
@@ -112,7 +132,7 @@ def decode(streams: dict[str, bytes], layout: Layout) -> Tables:
     """The inverse of `encode`. Sizes were checked where the streams were read.
 
     Raises:
-        BadInput: If the blocks do not count as many bricks as there are.
+        BadInput: If the blocks do not count as many bricks as there are, or the nodes as weights.
     """
     arrays = {
         name: np.frombuffer(streams[name], dtype=dtype).reshape(shape)
@@ -126,10 +146,9 @@ def decode(streams: dict[str, bytes], layout: Layout) -> Tables:
             position_codes=_sums(arrays["positions"], axes=(-1,)).T,
             normal_codes=arrays["normals"].T,
             thickness_codes=arrays["thickness"],
-            weight_codes=arrays["weights"],
-            gradient_codes=np.ascontiguousarray(arrays["gradients"].T).reshape(-1, 3, 24),
         ),
         bricks=_bricks(arrays["blocks"], arrays["voxels"], layout),
+        skin=_skin(arrays["skin_nodes"], arrays["skin_weights"], layout),
         pelvis=np.array(layout.pelvis, dtype=np.float32),
         reach_m=layout.reach_m,
     )
@@ -169,14 +188,7 @@ def _with_green(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *
 def _bricks(
     blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 8 8 8"], layout: Layout
 ) -> Bricks:
-    counts = np.array(layout.brick_counts)
-    used = np.unpackbits(blocks)[: counts.prod()].astype(np.int32)
-    if used.sum() != layout.bricks:
-        raise BadInput(
-            f"The package marks {used.sum()} blocks as used but holds {layout.bricks} bricks. "
-            "The file is damaged."
-        )
-    index = (np.cumsum(used, dtype=np.int32) * used).reshape(counts)
+    index = _numbered(blocks, layout.brick_counts, layout.bricks)
     voxels = _with_green(_sums(voxels, axes=(-3, -2, -1)))
     core = np.pad(np.moveaxis(voxels, 0, -1), [(1, 0), *[(0, 0)] * 4])
     whole = np.zeros((len(core), NODES, NODES, NODES, 4), dtype=np.uint8)
@@ -189,3 +201,30 @@ def _bricks(
         whole[(slice(1, None), *target)] = core[neighbour][(slice(None), *source)]
     low = np.array(layout.brick_low, dtype=np.float32)
     return Bricks(low=low, voxel_m=layout.voxel_m, index=index, voxels=whole)
+
+
+def _skin(
+    nodes: UInt8[np.ndarray, "bytes"], weights: UInt16[np.ndarray, "24 nodes"], layout: Layout
+) -> Skin:
+    codes = np.zeros((24, layout.skin_nodes + 1), dtype=np.uint16)
+    codes[0, 0] = FULL_WEIGHT
+    codes[:, 1:] = weights
+    return Skin(
+        low=np.array(layout.skin_low, dtype=np.float32),
+        step_m=np.array(layout.skin_step_m, dtype=np.float32),
+        index=_numbered(nodes, layout.skin_counts, layout.skin_nodes),
+        weight_codes=codes,
+    )
+
+
+def _numbered(
+    bits: UInt8[np.ndarray, "bytes"], counts: tuple[int, int, int], expected: int
+) -> Int32[np.ndarray, "x y z"]:
+    """Which places are used, numbered from 1 in C order; 0 for the others."""
+    used = np.unpackbits(bits)[: int(np.prod(counts))].astype(np.int32)
+    if used.sum() != expected:
+        raise BadInput(
+            f"The package marks {used.sum()} places of a grid {counts} as used but holds "
+            f"{expected}. The file is damaged."
+        )
+    return (np.cumsum(used, dtype=np.int32) * used).reshape(counts)

@@ -3,12 +3,13 @@
 import numpy as np
 import onnx
 
+from export.initialisers import initialisers
 from export.nodes import Graph, Value
 from export.raster import holes_filled, keys_behind, nearest_keys, pose_hull, splat
 from export.rules import DrawingRules
 from export.scene import Scene, View
-from export.shading import Layer, shade
-from export.tables import Tables, initialisers
+from export.shading import Before, Layer, shade
+from export.tables import Tables
 
 
 def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
@@ -39,7 +40,7 @@ def _picture(scene: Scene) -> list[Value]:
     hull = pose_hull(scene)
     splats = splat(scene, hull)
     keys = holes_filled(scene, nearest_keys(scene, splats))
-    first = shade(scene, hull, keys, graph.filled(pixels, np.True_))
+    first = shade(scene, hull, keys, graph.filled(pixels, np.True_), None)
     empty = graph.filled(pixels, np.float32(0))
     picture = [empty.scattered(first.pixel, channel) for channel in [*first.color, first.alpha]]
     if rules.layers == 1:
@@ -49,7 +50,8 @@ def _picture(scene: Scene) -> list[Value]:
     limit = graph.filled(pixels, np.float32(1e6))
     limit = limit.scattered(first.pixel, first.depth + rules.gap_m)
     limit = graph.where(wanted, limit, 1e6)
-    second = shade(scene, hull, keys_behind(scene, splats, limit), wanted)
+    before = Before(key=keys, end=empty.scattered(first.pixel, first.end))
+    second = shade(scene, hull, keys_behind(scene, splats, limit), wanted, before)
     return _with_layer_behind(picture, second, passed)
 
 

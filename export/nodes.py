@@ -109,6 +109,10 @@ class Value:
         """Exponential."""
         return self._with("Exp")
 
+    def exp2(self) -> "Value":
+        """Two to the power of it."""
+        return self.graph.node("Pow", self.graph.value(2.0, self.dtype), self)
+
     def sqrt(self) -> "Value":
         """Square root."""
         return self._with("Sqrt")
@@ -268,13 +272,38 @@ class Graph:
         body: Callable[[Value, list[Value]], Sequence[Value]],
     ) -> list[Value]:
         """`for i in range(count): states = body(i, states)`; the body may use any outer value."""
+
+        def turned(turn: Value, held: list[Value]) -> tuple[None, list[Value]]:
+            return None, list(body(turn, held))
+
+        return self._loop(count, states, turned)
+
+    def loop_while(
+        self,
+        most: int,
+        states: Sequence[Value],
+        body: Callable[[Value, list[Value]], tuple[Value | None, list[Value]]],
+    ) -> list[Value]:
+        """`for i in range(most): go, states = body(i, states)` until it is told not to go on.
+
+        The states' lengths may change from turn to turn.
+        """
+        return self._loop(self.constant(np.int64(most)), states, body)
+
+    def _loop(
+        self,
+        count: Value,
+        states: Sequence[Value],
+        body: Callable[[Value, list[Value]], tuple[Value | None, list[Value]]],
+    ) -> list[Value]:
         self._count += 1
         prefix = f"loop_{self._count}"
         before, self._nodes = self._nodes, []
         go = Value(self, f"{prefix}_go", np.dtype(np.bool_))
         turn = Value(self, f"{prefix}_turn", np.dtype(np.int64))
         held = [Value(self, f"{prefix}_state_{i}", s.dtype) for i, s in enumerate(states)]
-        results = [self.node("Identity", go), *body(turn, held)]
+        more, after = body(turn, held)
+        results = [self.node("Identity", go if more is None else more), *after]
         inner = helper.make_graph(
             self._nodes,
             prefix,

@@ -171,6 +171,15 @@ def read_package(path: Path, *, tier: str = "hq") -> AvatarPackage:
         ) from error
 
 
+def read_tiers(path: Path) -> tuple[str, ...]:
+    """The names of a package's tiers, "hq" first.
+
+    Raises:
+        BadInput: As `read_package`.
+    """
+    return tuple(read_package(path).manifest.tiers)
+
+
 class _Archive:
     """A zip that is not trusted."""
 

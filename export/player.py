@@ -10,9 +10,9 @@ from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.errors import BadInput
+from export.initialisers import initialisers
 from export.manifest import Manifest
 from export.package import AvatarPackage, read_package
-from export.tables import initialisers
 from preprocess.kinematics import body_from_rest, world_from_body
 from preprocess.pose import BodyPose
 

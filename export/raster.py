@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Matrix, Vector, dot, moved
+from export.columns import Matrix, Vector, adjugate, applied, dot
 from export.nodes import Value
+from export.posing import Posed, carried, determinant, pose_nodes, sound
 from export.scene import Scene
 from export.tables import DEPTH_STEPS, SURFEL_BITS
 
@@ -18,17 +19,23 @@ class Hull:
     """The hull in one pose: values of the graph, one entry a surfel.
 
     Attributes:
+        posed: What carried it.
         surfel: Surfel numbers.
         canonical, normal: Canonical positions and normals.
-        camera_from_canonical: Blended 3×4 matrices.
         camera: Positions in the camera's frame.
+        inverse: Inverse of the derivative of that, 3×3.
+        from_eye: `inverse` times `camera`: the ray from the eye, seen in canonical space.
+        sound: Whether the derivative can be inverted.
     """
 
+    posed: Posed
     surfel: Value
     canonical: Vector
     normal: Vector
-    camera_from_canonical: Matrix
     camera: Vector
+    inverse: Matrix
+    from_eye: Vector
+    sound: Value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,18 +54,23 @@ class Splats:
 
 
 def pose_hull(scene: Scene) -> Hull:
-    """Linear blend skinning of every surfel, straight into the camera's frame."""
-    columns = scene.columns
-    skin = columns["skin"].cast(np.float32)
-    blended = (scene.view.bones.transposed(1, 0) * (1.0 / 255.0)).matmul(skin)
-    matrix = [[blended.row(4 * i + j) for j in range(4)] for i in range(3)]
+    """Carries every surfel into the camera's frame, and inverts the map about it."""
+    columns, posed = scene.columns, pose_nodes(scene)
     canonical = [columns[f"position_{letter}"] for letter in "xyz"]
+    camera, derivative = carried(scene, posed, canonical)
+    cofactors = adjugate(derivative)
+    volume = determinant(derivative, cofactors)
+    scale = volume.reciprocal()
+    inverse = [[entry * scale for entry in row] for row in cofactors]
     return Hull(
+        posed=posed,
         surfel=columns["surfel"],
         canonical=canonical,
         normal=[columns[f"normal_{letter}"] for letter in "xyz"],
-        camera_from_canonical=matrix,
-        camera=moved(matrix, canonical),
+        camera=camera,
+        inverse=inverse,
+        from_eye=applied(inverse, camera),
+        sound=sound(scene, volume),
     )
 
 
@@ -69,10 +81,10 @@ def splat(scene: Scene, hull: Hull) -> Splats:
     inverse = depth.maximum(rules.nearest_m).reciprocal()
     u = view.focal[0] * x * inverse + view.center[0]
     v = view.focal[1] * y * inverse + view.center[1]
-    facing = dot([dot(row, hull.normal) for row in hull.camera_from_canonical], hull.camera)
+    facing = dot(hull.normal, hull.from_eye)
     width, height = view.width.cast(np.float32), view.height.cast(np.float32)
     margin = float(rules.largest_footprint_px)
-    seen = (depth > rules.nearest_m) & (facing < depth * rules.behind)
+    seen = hull.sound & (depth > rules.nearest_m) & (facing < depth * rules.behind)
     seen = seen & (u > -margin) & (v > -margin)
     seen = graph.nonzero(seen & (u < width + margin) & (v < height + margin))
     key = depth_code(scene, depth) * (1 << SURFEL_BITS) + hull.surfel

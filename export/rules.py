@@ -9,7 +9,13 @@ class DrawingRules:
 
     Attributes:
         layers: Depth layers, 1 or 2.
-        samples: Samples along a ray and layer unless the player asks for another number.
+        samples: Samples along `span_m` of a ray, unless the player asks for another number.
+        span_m: Metres; samples lie `span_m / samples` apart, and closer where a ray ends.
+        block: Samples between two corrections of a ray's canonical path.
+        steady: So many blocks have steps of that length, of the second layer one; each further
+            block has twice the steps of the one before it.
+        longest_correction_m: No correction is longer than this.
+        ended: A ray ends where less than this share of the light is left.
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
         footprint_spacings: A footprint's size in surfel spacings at the nearest surfel's depth.
         behind: Cosine up to which a surfel that faces away still covers what is behind it.
@@ -19,10 +25,13 @@ class DrawingRules:
         grazing: How much longer a segment is where the ray grazes the hull (× sin²).
         steepest: Least cosine between ray and normal that lengthens a segment.
         longest_m: Longest segment, metres.
-        stretch: Where the volume of the local map is outside of [1/stretch, stretch], its
-            gradient terms are left out.
+        stretch: Where the derivative's determinant is outside of (1/stretch, stretch), surfels are
+            not drawn and paths not corrected.
         hole_m: A pixel that opposite neighbours overtop by this much is a hole, and filled.
-        gap_m: The second layer begins at least this far behind the first.
+        gap_m: Surfels of the second layer lie at least this far behind the first's.
+        same_m, same_share: Where the two layers' surfels are no farther apart in canonical space
+            than this, and so many times as far as in the camera's, they belong to one sheet: the
+            second ray begins where the first one ends.
         facing: Least cosine with which a surfel of the second layer faces the camera.
         transmitted: Least transmittance of the first layer that the second is drawn for.
         nearest_m: Nearer surfels are not drawn.
@@ -30,6 +39,11 @@ class DrawingRules:
 
     layers: int = 2
     samples: int = 8
+    span_m: float = 0.05
+    block: int = 3
+    steady: int = 3
+    longest_correction_m: float = 0.01
+    ended: float = 0.01
     largest_footprint_px: int = 16
     footprint_spacings: float = 1.4
     behind: float = 0.35
@@ -39,9 +53,11 @@ class DrawingRules:
     grazing: float = 1.5
     steepest: float = 0.1
     longest_m: float = 0.15
-    stretch: float = 4.0
+    stretch: float = 10.0
     hole_m: float = 0.025
-    gap_m: float = 0.03
+    gap_m: float = 0.01
+    same_m: float = 0.01
+    same_share: float = 1.25
     facing: float = 0.2
     transmitted: float = 0.02
     nearest_m: float = 0.1

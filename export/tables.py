@@ -1,17 +1,18 @@
-"""What a bake leaves: hull surfels and sparse bricks, as the small integers that are stored."""
+"""What a bake leaves: hull surfels, sparse bricks and a skin, as the small integers stored."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int8, Int32, Shaped, UInt8, UInt16
+from jaxtyping import Float, Float32, Int8, Int32, UInt8, UInt16
 
 BRICK = 8
 """Voxels along a brick's edge; each brick also holds the first layer of its next neighbours."""
 NODES = BRICK + 1
 LOG_DENSITY = (float(np.log(0.5)), float(np.log(3000.0)))
 """Range of the 8-bit log-density, density in 1/m; code 0 means empty."""
-GRADIENT_LIMIT = 25.0
-"""Largest gradient of a skinning weight, 1/m."""
+JOINTS = 24
+FULL_WEIGHT = 65535
+"""Code of the skinning weight 1."""
 THICKNESS_STEP_M = 0.0005
 SURFEL_BITS = 17
 """A z-buffer key is 14 bits of depth over 17 bits of surfel number."""
@@ -29,8 +30,6 @@ class Surfels:
         position_codes: Sorted along a Morton curve.
         normal_codes: Outward unit normals × 127.
         thickness_codes: How deep one sees into the hull along the normal, in half millimetres.
-        weight_codes: Skinning weights × 255; each surfel's codes sum to 255.
-        gradient_codes: Gradients of the skinning weights along x, y, z × 127 / GRADIENT_LIMIT.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -39,8 +38,6 @@ class Surfels:
     position_codes: UInt16[np.ndarray, "surfels 3"]
     normal_codes: Int8[np.ndarray, "surfels 3"]
     thickness_codes: UInt8[np.ndarray, "surfels"]
-    weight_codes: UInt8[np.ndarray, "24 surfels"]
-    gradient_codes: Int8[np.ndarray, "surfels 3 24"]
 
     def __len__(self) -> int:
         """How many there are."""
@@ -61,16 +58,6 @@ class Surfels:
     def thickness(self) -> Float32[np.ndarray, "surfels"]:
         """Metres along the normal."""
         return self.thickness_codes.astype(np.float32) * np.float32(THICKNESS_STEP_M)
-
-    @property
-    def weights(self) -> Float32[np.ndarray, "surfels 24"]:
-        """Skinning weights; rows sum to 1."""
-        return self.weight_codes.T.astype(np.float32) / np.float32(255.0)
-
-    @property
-    def weight_gradients(self) -> Float32[np.ndarray, "surfels 3 24"]:
-        """Gradients of the skinning weights, 1/m."""
-        return self.gradient_codes.astype(np.float32) * np.float32(GRADIENT_LIMIT / 127.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,18 +80,44 @@ class Bricks:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Skin:
+    """Skinning weights on the nodes of a grid, stored only where something can be seen.
+
+    Node (i, j, k) lies at `low + step_m · (i, j, k)`; between nodes weights are trilinear.
+
+    Attributes:
+        low: Corner of the grid, canonical metres.
+        step_m: Distance between nodes along x, y, z.
+        index: Which column of the codes belongs to each node, numbered in C order; 0 for none.
+        weight_codes: Weights × `FULL_WEIGHT`. Column 0 is the root's alone.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    step_m: Float32[np.ndarray, "3"]
+    index: Int32[np.ndarray, "x y z"]
+    weight_codes: UInt16[np.ndarray, "24 columns"]
+
+    @property
+    def weights(self) -> Float32[np.ndarray, "columns 24"]:
+        """Skinning weights; rows sum to 1 within 0.01 %."""
+        return self.weight_codes.T.astype(np.float32) / np.float32(FULL_WEIGHT)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Tables:
     """Everything that a tier of the player draws.
 
     Attributes:
         surfels: The hull.
         bricks: What is inside.
+        skin: What moves it.
         pelvis: Rest pelvis in canonical space, metres: the middle of the depth window.
         reach_m: No surfel gets farther from the pelvis than this in any pose.
     """
 
     surfels: Surfels
     bricks: Bricks
+    skin: Skin
     pelvis: Float32[np.ndarray, "3"]
     reach_m: float
 
@@ -114,22 +127,3 @@ def density_codes(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*b
     low, high = LOG_DENSITY
     logs = np.log(np.maximum(density, 1e-9))
     return np.clip(np.round((logs - low) / (high - low) * 255.0), 0, 255).astype(np.uint8)
-
-
-def initialisers(tables: Tables) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """The tables as the graph reads them: one-dimensional columns, two channels to an integer."""
-    surfels, bricks = tables.surfels, tables.bricks
-    voxels = bricks.voxels.reshape(-1, 4).astype(np.int32)
-    columns = {
-        "voxel_red_blue": voxels[:, 0] | voxels[:, 2] << 16,
-        "voxel_green_density": voxels[:, 1] | voxels[:, 3] << 16,
-        "brick_offset": bricks.index.ravel() * np.int32(NODES**3),
-        "skin": np.ascontiguousarray(surfels.weight_codes),
-        "skin_gradient": surfels.gradient_codes.reshape(-1, 72),
-        "thickness": surfels.thickness,
-        "surfel": np.arange(len(surfels), dtype=np.int32),
-    }
-    for axis, letter in enumerate("xyz"):
-        columns[f"position_{letter}"] = np.ascontiguousarray(surfels.positions[:, axis])
-        columns[f"normal_{letter}"] = np.ascontiguousarray(surfels.normals[:, axis])
-    return columns

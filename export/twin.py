@@ -7,10 +7,12 @@ shares no code with the graph.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 
 from export.rules import DrawingRules
-from export.tables import BRICK, DEPTH_STEPS, LOG_DENSITY, NODES, SURFEL_BITS, Bricks, Tables
+from export.skin import finer_nodes
+from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
+from export.twin_march import PosedNodes, Rays, carried, march
 
 FAR = 2**31 - 1
 
@@ -23,7 +25,7 @@ class Shot:
         bones: Camera-from-canonical matrices.
         focal, center: Pixels.
         size_px: Width and height.
-        samples: Along each ray and layer.
+        samples: Along the rules' `span_m` of each ray.
     """
 
     bones: Float32[np.ndarray, "24 3 4"]
@@ -35,39 +37,78 @@ class Shot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Posed:
-    """The hull in the camera's frame."""
+    """The skin in the camera's frame, and the hull with the inverse of its derivative there."""
 
-    matrices: Float32[np.ndarray, "surfels 3 4"]
+    nodes: PosedNodes
     camera: Float32[np.ndarray, "surfels 3"]
+    inverse: Float32[np.ndarray, "surfels 3 3"]
+    sound: Bool[np.ndarray, "surfels"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Before:
+    """What the first layer saw at the second's pixels: its surfels, and where its rays ended."""
+
+    surfel: Int64[np.ndarray, "pixels"]
+    end: Float32[np.ndarray, "pixels"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Seen:
+    """A layer: pictures of its pixels, depths at which rays enter the hull, ends along them."""
+
+    colors: Float32[np.ndarray, "pixels 4"]
+    depth: Float32[np.ndarray, "pixels"]
+    end: Float32[np.ndarray, "pixels"]
 
 
 def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied colour and alpha in [0, 1]."""
-    surfels, (width, height) = tables.surfels, shot.size_px
-    flat = surfels.weights @ shot.bones.reshape(24, 12)
-    matrices = flat.reshape(-1, 3, 4)
-    moved = np.einsum("nij,nj->ni", matrices[:, :, :3], surfels.positions) + matrices[:, :, 3]
-    posed = _Posed(matrices=matrices, camera=moved)
-
+    width, height = shot.size_px
+    posed = _pose(tables, rules, shot)
     pixel, key, deep_enough = _footprints(tables, rules, shot, posed)
     buffer = np.full(width * height, FAR, dtype=np.int64)
     np.minimum.at(buffer, pixel, key)
     filled = _without_holes(buffer.reshape(height, width), tables, rules).ravel()
     picture = np.zeros((width * height, 4), dtype=np.float32)
     covered = np.flatnonzero(filled < FAR)
-    picture[covered], begin = _shade(tables, rules, shot, posed, covered, filled[covered])
+    first = _shade(tables, rules, shot, posed, covered, filled[covered], None)
+    picture[covered] = first.colors
     if rules.layers == 2:
         passed = 1.0 - picture[:, 3]
         limit = np.full(width * height, 1e6, dtype=np.float32)
-        limit[covered] = begin + np.float32(rules.gap_m)
+        limit[covered] = first.depth + np.float32(rules.gap_m)
         limit[passed <= rules.transmitted] = 1e6
         behind = deep_enough > limit[pixel]
         buffer = np.full(width * height, FAR, dtype=np.int64)
         np.minimum.at(buffer, pixel[behind], key[behind])
         again = np.flatnonzero(buffer < FAR)
-        second, _ = _shade(tables, rules, shot, posed, again, buffer[again])
-        picture[again] += second * passed[again, None]
+        place = np.searchsorted(covered, again)
+        before = _Before(surfel=_surfel(filled[again]), end=first.end[place])
+        second = _shade(tables, rules, shot, posed, again, buffer[again], before)
+        picture[again] += second.colors * passed[again, None]
     return picture.reshape(height, width, 4)
+
+
+def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
+    nodes = finer_nodes(tables.skin)
+    blended = (nodes.weights.T @ shot.bones.reshape(24, 12)).reshape(-1, 3, 4)
+    node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
+    there = PosedNodes(nodes, node_camera)
+    camera, derivative = carried(there, tables.surfels.positions)
+    volume = np.linalg.det(derivative)
+    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
+    inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
+    return _Posed(
+        nodes=there,
+        camera=camera,
+        inverse=inverse.astype(np.float32),
+        sound=sound,
+    )
+
+
+def _surfel(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
+    return key & ((1 << SURFEL_BITS) - 1)
 
 
 def _footprints(
@@ -77,10 +118,10 @@ def _footprints(
     (width, height), depth = shot.size_px, posed.camera[:, 2]
     safe = np.maximum(depth, np.float32(rules.nearest_m))[:, None]
     place = posed.camera[:, :2] / safe * shot.focal + shot.center
-    normals = np.einsum("nij,nj->ni", posed.matrices[:, :, :3], tables.surfels.normals)
-    facing = np.einsum("ni,ni->n", normals, posed.camera)
+    from_eye = np.einsum("nij,nj->ni", posed.inverse, posed.camera)
+    facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
     margin = rules.largest_footprint_px
-    seen = (depth > rules.nearest_m) & (facing < depth * rules.behind)
+    seen = posed.sound & (depth > rules.nearest_m) & (facing < depth * rules.behind)
     seen &= (place > -margin).all(axis=1) & (place < np.array(shot.size_px) + margin).all(axis=1)
     surfel = np.flatnonzero(seen)
     if len(surfel) == 0:
@@ -125,91 +166,40 @@ def _shade(
     posed: _Posed,
     pixel: Int64[np.ndarray, "pixels"],
     key: Int64[np.ndarray, "pixels"],
-) -> tuple[Float32[np.ndarray, "pixels 4"], Float32[np.ndarray, "pixels"]]:
-    """Premultiplied colour and alpha of covered pixels, and the depth where their rays begin."""
-    surfels, surfel = tables.surfels, key & ((1 << SURFEL_BITS) - 1)
+    before: _Before | None,
+) -> _Seen:
+    """What covered pixels see."""
+    surfels, surfel = tables.surfels, _surfel(key)
     row, column = np.divmod(pixel, shot.size_px[0])
     plane = (np.stack([column, row], axis=1) + 0.5 - shot.center) / shot.focal
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    inverse = np.linalg.inv(_derivative(tables, rules, shot, posed, surfel))
+    inverse = posed.inverse[surfel]
     direction = np.einsum("nij,nj->ni", inverse, ray)
-    to_surfel = np.einsum("nij,nj->ni", inverse, posed.camera[surfel])
+    from_eye = np.einsum("nij,nj->ni", inverse, posed.camera[surfel])
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
 
     falling = (normal * direction).sum(axis=1)
     along = (posed.camera[surfel] * ray).sum(axis=1)
     shallow = np.float32(-0.5 * rules.steepest)
-    hit = (normal * to_surfel).sum(axis=1) / np.minimum(falling, shallow)
-    begin = np.where(falling < shallow, hit, along)
-    begin = np.clip(begin, along - rules.slack_m, along + rules.slack_m)
+    hit = (normal * from_eye).sum(axis=1) / np.minimum(falling, shallow)
+    enter = np.where(falling < shallow, hit, along)
+    enter = np.clip(enter, along - rules.slack_m, along + rules.slack_m)
     cosine = np.maximum(-falling, rules.steepest)
     lead = np.minimum(rules.lead_m / cosine, rules.most_lead_m)
-    begin = begin - lead
+    begin = enter - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
     length = thickness * (1.0 + rules.grazing * sine) / cosine
-    length = np.minimum(length + lead, rules.longest_m)
-
-    picture = np.zeros((len(pixel), 4), dtype=np.float32)
-    step = length / shot.samples
-    for turn in range(shot.samples):
-        distance = (begin + step * (turn + 0.5))[:, None]
-        points = surfels.positions[surfel] - to_surfel + distance * direction
-        rgb, density = read(tables.bricks, points)
-        weight = (1.0 - picture[:, 3]) * -np.expm1(-density * step)
-        picture[:, :3] += rgb * weight[:, None]
-        picture[:, 3] += weight
-    return picture, begin * ray[:, 2]
-
-
-def _derivative(
-    tables: Tables,
-    rules: DrawingRules,
-    shot: Shot,
-    posed: _Posed,
-    surfel: Int64[np.ndarray, "pixels"],
-) -> Float32[np.ndarray, "pixels 3 3"]:
-    """Derivative of linear blend skinning at surfels; of the blended matrix alone at bad folds."""
-    blended = posed.matrices[surfel][:, :, :3]
-    canonical = tables.surfels.positions[surfel]
-    by_bone = np.einsum("kij,nj->nki", shot.bones[:, :, :3], canonical) + shot.bones[:, :, 3]
-    offset = by_bone - posed.camera[surfel][:, None]
-    gradient = tables.surfels.weight_gradients[surfel]
-    full = blended + np.einsum("nki,nak->nia", offset, gradient)
-    volume = np.linalg.det(full)
-    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
-    return np.where(sound[:, None, None], full, blended)
-
-
-def read(
-    bricks: Bricks, points: Float32[np.ndarray, "points 3"]
-) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points"]]:
-    """Colour in [0, 1] and density (1/m) at canonical points, interpolated in tetrahedra.
-
-    A cell is cut into six tetrahedra along its diagonal. Walking from the lower to the upper
-    corner along the axes in the order of their fractions passes the four corners of the one that
-    holds the point; log-density is interpolated, and below half a code there is nothing.
-    """
-    last = np.array(bricks.index.shape) * BRICK - 1e-3
-    place = np.clip((points - bricks.low) / bricks.voxel_m, 0.0, last).astype(np.float32)
-    voxel = np.floor(place).astype(np.int64)
-    part = place - voxel
-    order = np.argsort(-part, axis=1, kind="stable")
-    sorted_part = np.take_along_axis(part, order, axis=1)
-    bounds = np.concatenate(
-        [np.ones((len(part), 1)), sorted_part, np.zeros((len(part), 1))], axis=1
-    )
-    brick = bricks.index[tuple((voxel // BRICK).T)]
-    corner = (voxel % BRICK).astype(np.int32)
-    assert corner.max(initial=0) < NODES - 1
-    codes = np.zeros((len(points), 4), dtype=np.float32)
-    for turn in range(4):
-        share = (bounds[:, turn] - bounds[:, turn + 1])[:, None]
-        codes += bricks.voxels[(brick, *corner.T)] * share
-        if turn < 3:
-            corner[np.arange(len(points)), order[:, turn]] += 1
-    low, high = LOG_DENSITY
-    density = np.exp(codes[:, 3] / 255.0 * (high - low) + low)
-    density = np.where(codes[:, 3] > 0.5, density, 0.0)
-    return (codes[:, :3] / 255.0).astype(np.float32), density.astype(np.float32)
+    end = begin + np.minimum(length + lead, rules.longest_m)
+    if before is not None:
+        apart = np.linalg.norm(surfels.positions[surfel] - surfels.positions[before.surfel], axis=1)
+        in_camera = np.linalg.norm(posed.camera[surfel] - posed.camera[before.surfel], axis=1)
+        one_sheet = apart < in_camera * rules.same_share + rules.same_m
+        later = np.minimum(np.maximum(begin, before.end), end)
+        begin = np.where(one_sheet, later, begin)
+    start = surfels.positions[surfel] - from_eye + begin[:, None] * direction
+    steady = rules.steady if before is None else 1
+    rays = Rays(ray, begin, end, start, direction)
+    colors = march(tables.bricks, rules, posed.nodes, rays, shot.samples, steady)
+    return _Seen(colors=colors, depth=enter * ray[:, 2], end=end)

@@ -11,9 +11,9 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
+from export.initialisers import initialisers
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage, read_package
-from export.tables import initialisers
 from export.web.runtime import MODULE, runtime_files
 from preprocess.pose import BodyPose
 

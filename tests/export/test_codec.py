@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture.errors import BadInput
-from export.bake import weight_codes
+from export.bake_skin import weight_codes
 from export.codec import Layout, decode, encode
-from export.tables import LOG_DENSITY, Bricks, Surfels, Tables, density_codes
+from export.tables import FULL_WEIGHT, LOG_DENSITY, Bricks, Skin, Surfels, Tables, density_codes
 
 
 def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: float) -> Tables:
@@ -32,14 +32,29 @@ def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: 
             position_codes=rng.integers(0, 65536, (surfels, 3), dtype=np.uint16),
             normal_codes=rng.integers(-127, 128, (surfels, 3), dtype=np.int8),
             thickness_codes=rng.integers(0, 256, surfels, dtype=np.uint8),
-            weight_codes=rng.integers(0, 256, (24, surfels), dtype=np.uint8),
-            gradient_codes=rng.integers(-127, 128, (surfels, 3, 24), dtype=np.int8),
         ),
         bricks=Bricks(
             low=rng.normal(size=3).astype(np.float32), voxel_m=0.004, index=index, voxels=voxels
         ),
+        skin=random_skin(rng, counts, share),
         pelvis=rng.normal(size=3).astype(np.float32),
         reach_m=1.5,
+    )
+
+
+def random_skin(rng, counts, share) -> Skin:
+    stored = rng.random(counts) < share
+    stored[0, 0, 0] = True
+    index = np.zeros(counts, np.int32)
+    index[stored] = np.arange(1, stored.sum() + 1)
+    codes = rng.integers(0, FULL_WEIGHT + 1, (24, stored.sum() + 1), dtype=np.uint16)
+    codes[:, 0] = 0
+    codes[0, 0] = FULL_WEIGHT
+    return Skin(
+        low=rng.normal(size=3).astype(np.float32),
+        step_m=rng.uniform(0.01, 0.03, 3).astype(np.float32),
+        index=index,
+        weight_codes=codes,
     )
 
 
@@ -67,11 +82,12 @@ def test_tables_come_back_from_their_streams_bit_by_bit(seed, surfels, counts, s
     assert_same(tables, decode(streams, layout))
 
 
-def test_blocks_that_do_not_match_the_bricks_are_refused():
+@pytest.mark.parametrize("stream", ["blocks", "skin_nodes"])
+def test_places_that_do_not_match_what_is_there_are_refused(stream):
     tables = random_tables(0, 5, (2, 2, 2), 0.5)
     streams = encode(tables)
-    streams["blocks"] = bytes([255])
-    with pytest.raises(BadInput, match="blocks"):
+    streams[stream] = bytes([255])
+    with pytest.raises(BadInput, match="places"):
         decode(streams, Layout.of(tables))
 
 
@@ -79,10 +95,11 @@ def test_blocks_that_do_not_match_the_bricks_are_refused():
     st.lists(st.floats(0, 1), min_size=24, max_size=24).filter(lambda w: sum(w) > 1e-3),
 )
 def test_weight_codes_sum_to_one_and_stay_close(weights):
-    weights = np.array([weights])
+    weights = np.array([weights], dtype=np.float32) / np.float32(sum(weights))
     codes = weight_codes(weights).astype(int)
-    assert codes.sum() == 255
-    assert np.abs(codes / 255 - weights / weights.sum()).max() < 1 / 255
+    assert codes.sum() == FULL_WEIGHT
+    assert codes.min() >= 0
+    assert np.abs(codes / FULL_WEIGHT - weights).max() < 24 / FULL_WEIGHT
 
 
 def test_density_codes_are_logarithmic_and_zero_is_empty():

@@ -63,6 +63,25 @@ def test_a_loop_does_its_body_as_often_as_it_is_told(turns):
     np.testing.assert_allclose(result, expected, rtol=1e-6)
 
 
+def test_a_loop_whose_states_shrink_ends_when_nothing_is_left():
+    graph = Graph()
+    x = graph.input("x", np.float32, [6])
+    place = graph.node("Range", *(graph.constant(np.int64(n)) for n in (0, 6, 1)), dtype=np.int64)
+
+    def halved(turn, states):
+        steps, place, left = states
+        ended = graph.nonzero(left < 1.0)
+        steps = steps.scattered(place.take(ended), left.take(ended) * 0.0 + turn.cast(np.float32))
+        more = graph.nonzero(left > 1.0)
+        some = graph.node("Size", more, dtype=np.int64) > 0
+        return some, [steps, place.take(more), left.take(more) * 0.5]
+
+    steps = graph.loop_while(50, [x * 0.0 - 1.0, place, x], halved)[0]
+    numbers = np.array([0.5, 3.0, 100.0, 0.9, 1.5, 5e3], dtype=np.float32)
+    expected = np.maximum(np.ceil(np.log2(numbers)), 0.0)
+    np.testing.assert_array_equal(run(graph, steps, x=numbers), expected)
+
+
 def test_equal_constants_are_stored_once():
     graph = Graph()
     x = graph.input("x", np.float32, [1])

@@ -2,6 +2,7 @@ import json
 import os
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_the_manifest_says_what_the_package_is(exported):
     with zipfile.ZipFile(exported.path) as archive:
         content = json.loads(archive.read("manifest.json"))
         assert set(archive.namelist()) - {"manifest.json"} == set(content["sha256"])
-    assert content["format"] == 1
+    assert content["format"] == 2
     assert len(content["joints"]) == len(content["rest_joints"]) == 24
     assert "metres" in content["units"]
     assert content["metrics"] == {"psnr": 30.0}
@@ -85,10 +86,10 @@ def test_metrics_without_a_value_are_null(exported):
 
 def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
     def change(name, content):
-        return content[:-1] + b"x" if name == "hq/weights.bin" else content
+        return content[:-1] + b"x" if name == "hq/skin_weights.bin" else content
 
     path = rewritten(exported.path, tmp_path / "x.iavatar", change)
-    with pytest.raises(BadInput, match=r"altered: hq/weights\.bin"):
+    with pytest.raises(BadInput, match=r"altered: hq/skin_weights\.bin"):
         read_package(path)
 
 
@@ -134,7 +135,14 @@ def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "change", [{"surfels": 10**9}, {"brick_counts": [10**6, 10**6, 10**6]}, {"bricks": -1}]
+    "change",
+    [
+        {"surfels": 10**9},
+        {"brick_counts": [10**6, 10**6, 10**6]},
+        {"bricks": -1},
+        {"skin_nodes": 10**7},
+        {"skin_counts": [10**6, 10**6, 1]},
+    ],
 )
 def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported, tmp_path, change):
     with zipfile.ZipFile(exported.path) as archive:
@@ -148,7 +156,7 @@ def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 2}, "format 2"),
+        ({"format": 1}, "format 1"),
         ({"rest_joints": [[0.0]]}, "damaged"),
         ({"rest_joints": [[float("nan")] * 3] * 24}, "damaged"),
         ({"parents": [-1] + [23] * 23}, "damaged"),
@@ -241,3 +249,15 @@ def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
         write_package(package, path)
     assert path.read_bytes() == b"older"
     assert [p.name for p in tmp_path.iterdir()] == ["a.iavatar"]
+
+
+def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
+    text = (Path(__file__).parents[2] / "docs" / "package-format.md").read_text()
+    room: dict = {}
+    exec(text.split("```python\n")[1].split("```")[0], room)
+    manifest, bricks, weights, places = room["read"](exported.path)
+    tables = read_package(exported.path).tables["hq"]
+    assert manifest["format"] == 2
+    np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
+    np.testing.assert_allclose(weights, tables.skin.weights[1:], atol=1e-6)
+    np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
+from export.initialisers import initialisers
 from export.package import read_package
-from export.tables import initialisers
 from export.web import runtime, site
 from export.web.site import Clip, Look, pose_row
 

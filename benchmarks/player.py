@@ -1,0 +1,104 @@
+"""The player against what was asked of it: cost, likeness and size on avatars of the sample.
+
+    python -m benchmarks.player [--quick] [--json FILE] [--keep FOLDER]
+
+Films two actors, learns each for a minute as a user does, bakes what was learnt and plays it on one
+thread. Costs are CPU time, and their ratio to a small reference graph that runs in between; the
+volume renderer's pictures and the studio's are what the player is compared with. There are no
+thresholds here: whether a mark is reached is for the reader to see.
+"""
+
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from apps.exit_codes import exit_code
+from avatar import checkpoint
+from avatar.trainer import Trainer
+from benchmarks.baked import baked, package_marks
+from benchmarks.hardware import ROOT, Hardware
+from benchmarks.likeness import likeness_marks, shots_of
+from benchmarks.marks import Mark, table
+from benchmarks.pace import load_marks, pace_marks
+from benchmarks.stage import filmed
+from benchmarks.stopwatch import use_threads
+
+SIZE_PX = 540
+FRAMES = 120
+SECONDS = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Played:
+    """Measures the player and prints one table."""
+
+    quick: bool = False
+    """One actor and half of the pictures."""
+    json: Path | None = None
+    """File for the figures."""
+    keep: Path | None = None
+    """Folder for what is filmed and learnt; what lies there is used again."""
+
+
+def main() -> int:
+    """The benchmark; returns its exit code."""
+    job = tyro.cli(Played, prog="python -m benchmarks.player", description=__doc__)
+    return exit_code("benchmarks.player", lambda: measure(job))
+
+
+def measure(job: Played) -> int:
+    """Measures and prints."""
+    hardware = Hardware.here()
+    with tempfile.TemporaryDirectory() as temporary:
+        marks = list(measured(job, job.keep or Path(temporary)))
+    print("\n".join([*hardware.lines(), "", *table(marks)]))
+    if job.json is not None:
+        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
+        job.json.write_text(json.dumps(content, indent=1) + "\n")
+    return 0
+
+
+def measured(job: Played, folder: Path) -> Iterator[Mark]:
+    """All rows; each is also told on standard error as soon as it is known."""
+    subjects = (1,) if job.quick else (1, 2)
+    groups = [subject_marks(folder, subject, quick=job.quick) for subject in subjects]
+    for mark in itertools.chain.from_iterable(groups):
+        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        yield mark
+
+
+def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Mark]:
+    """One actor."""
+    name = f"subject {subject}"
+    suffix = "" if subject == 1 else f"_{subject}"
+    capture = filmed(folder / f"sample{SIZE_PX}{suffix}", SIZE_PX, subject=subject)
+    trainer = learnt(capture, folder / f"run{SIZE_PX}{suffix}")
+    use_threads(1)
+    shots = shots_of(capture, trainer.avatar, frames=FRAMES, every=2 if quick else 1)
+    package = folder / f"player{SIZE_PX}{suffix}.iavatar"
+    bake = baked(trainer, package, shots["held out"][:4])
+    yield from package_marks(name, package, bake)
+    yield from load_marks(name, package)
+    yield from pace_marks(name, package, [shot for some in shots.values() for shot in some])
+    yield from likeness_marks(name, package, shots)
+
+
+def learnt(capture: Path, run: Path) -> Trainer:
+    """The trainer that ia-ingest left in a folder, which it is asked to fill if there is none."""
+    if not (run / "checkpoint").exists():
+        command = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
+        command += ["--frames", f"0:{FRAMES}", "--seconds", str(SECONDS), "--overwrite"]
+        subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=True)
+    return checkpoint.load(run / "checkpoint", torch.device("cpu"))[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""The skin at half its step: nodes so close that posed positions may be taken as linear between."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32
+
+from export.tables import Skin
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinNodes:
+    """Nodes of a grid whose cells are half as long as the skin's.
+
+    Linear blend skinning, Σ w_j(x) B_j x, carries each node to its posed place. Trilinear between
+    eight of these, it is at most some tenths of a millimetre from what the skin itself says.
+
+    Attributes:
+        low: Corner of the grid, canonical metres.
+        step_m: Distance between nodes along x, y, z.
+        index: Which row belongs to each node, 0 for none. Rows are numbered in C order: where a
+            whole cell is there, the row of the next node along z is the next one. There is one row
+            more than nodes, so that there always is a next one.
+        positions: Canonical metres.
+        weights: Of the joints.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    step_m: Float32[np.ndarray, "3"]
+    index: Int32[np.ndarray, "x y z"]
+    positions: Float32[np.ndarray, "rows 3"]
+    weights: Float32[np.ndarray, "24 rows"]
+
+
+def finer_nodes(skin: Skin) -> SkinNodes:
+    """Every node of the halved grid that a cell with eight stored corners holds."""
+    inside = _inside(skin.index > 0)
+    place = np.argwhere(inside)
+    index = np.zeros(inside.shape, dtype=np.int32)
+    index[inside] = np.arange(1, len(place) + 1)
+    coarse, odd = place >> 1, place & 1
+    codes = np.ascontiguousarray(skin.weight_codes.T)
+    weights = np.zeros((24, len(place) + 2), dtype=np.float32)
+    weights[0, [0, -1]] = 1.0
+    for parity in np.ndindex(2, 2, 2):  # a node between others has the mean of its neighbours
+        chosen = np.flatnonzero((odd == parity).all(axis=1))
+        corners = [c for c in np.ndindex(2, 2, 2) if all(np.less_equal(c, parity))]
+        total = np.zeros((len(chosen), 24), dtype=np.uint32)
+        for corner in corners:
+            total += codes[skin.index[tuple((coarse[chosen] + corner).T)]]
+        sums = total.sum(axis=1, keepdims=True, dtype=np.float32)
+        weights[:, chosen + 1] = (total / np.maximum(sums, np.float32(1.0))).T
+    step_m = skin.step_m * np.float32(0.5)
+    positions = np.pad(place, [(1, 1), (0, 0)]) * step_m + skin.low
+    return SkinNodes(
+        low=skin.low,
+        step_m=step_m,
+        index=index,
+        positions=positions.astype(np.float32),
+        weights=weights,
+    )
+
+
+def _inside(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:
+    """Nodes of the halved grid that belong to a cell whose corners are all stored."""
+    nx, ny, nz = stored.shape
+    whole = np.ones((nx - 1, ny - 1, nz - 1), dtype=bool)
+    for i, j, k in np.ndindex(2, 2, 2):
+        whole &= stored[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k]
+    inside = np.zeros((2 * nx - 1, 2 * ny - 1, 2 * nz - 1), dtype=bool)
+    for i, j, k in np.ndindex(3, 3, 3):
+        inside[i : i + 2 * nx - 2 : 2, j : j + 2 * ny - 2 : 2, k : k + 2 * nz - 2 : 2] |= whole
+    return inside
