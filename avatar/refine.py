@@ -142,7 +142,7 @@ class PoseTable:
         )
 
     def settle(self, step: int) -> bool:
-        """Leaves alone poses that proved exact, or were refined long enough; whether any are left."""
+        """Leaves alone poses that proved exact or were refined enough; whether any are left."""
         held = np.array([pose is not None for pose in self._given])
         age = step - self._since
         self._judged = age >= JUDGED_AFTER_STEPS
