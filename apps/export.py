@@ -1,6 +1,7 @@
-"""ia-export: what a run has learnt so far, as a file that others can use."""
+"""ia-export: what a run has learnt so far, as a package or a mesh that others can use."""
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ SHARE = 0.8
 
 @dataclass(frozen=True, kw_only=True)
 class ExportArguments:
-    """Makes an avatar's package from a run's newest checkpoint, at any second of the run.
+    """Makes a file of a run's newest checkpoint, at any second of the run, or of a package.
 
     Try it, while ia-ingest is still learning or after it was killed:
 
@@ -39,17 +40,24 @@ class ExportArguments:
 
         ia-play now.iavatar --poses dance.npz
 
-    The run goes on undisturbed; nothing in its folder is touched unless --out names it.
+    For Blender, game engines and other programs, a mesh with skeleton, weights and a motion:
+
+        ia-export run/avatar.iavatar --to glb --poses dance.npz --out dance.glb
+
+    The run goes on undisturbed; nothing in its folder is touched unless --out names it. A mesh is
+    opaque and its silhouette hard: ia-play shows more of the avatar than any other program can.
 
     Exit codes: 0 done; 1 too blurred for a package so far; 2 bad input; 3 disk full; 130 Ctrl-C.
     """
 
     run: Positional[Path]
-    """Folder that ia-ingest wrote (--out), with a checkpoint/ in it."""
-    to: Literal["iavatar"] = "iavatar"
-    """Format: the package that ia-play plays."""
+    """Folder that ia-ingest wrote (--out), with a checkpoint/ in it; for meshes a package, too."""
+    to: Literal["iavatar", "glb", "ply"] = "iavatar"
+    """Format: the package that ia-play plays; glTF 2.0 binary; or a still, coloured mesh."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write; it appears whole or not at all."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """With --to glb: the motion that goes in, as ia-play reads it; without it, a turn."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,16 +74,38 @@ def export(given: ExportArguments, console: Console) -> int:
         OSError: If the disk is full.
         Stop: If the avatar is too blurred for a package.
     """
-    run = RunFolder(path=given.run)
+    if given.out.suffix != f".{given.to}":
+        raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
+    if not given.out.resolve().parent.is_dir():
+        raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
+    if given.poses is not None and given.to != "glb":
+        raise BadInput(f"--poses go into a .glb; a .{given.to} holds no motion. Leave them out.")
+    if given.to == "iavatar":
+        _package(given.run, given.out, console)
+    elif given.run.is_dir():
+        with tempfile.TemporaryDirectory() as folder:
+            package = Path(folder) / "avatar.iavatar"
+            _package(given.run, package, console)
+            _mesh(given, package, console)
+    else:
+        _mesh(given, given.run, console)
+    console.made("mesh" if given.to != "iavatar" else "package", given.out)
+    return DONE
+
+
+def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
+    from apps.mesh_file import write_mesh
+
+    write_mesh(package, given.out, console, poses=given.poses, name=given.out.stem)
+
+
+def _package(folder: Path, out: Path, console: Console) -> None:
+    run = RunFolder(path=folder)
     if not run.has_checkpoint():
         raise BadInput(
             f"There is no checkpoint in {run.checkpoint}; a folder that ia-ingest wrote was "
             "expected. It writes the first one five seconds after the first frame."
         )
-    if given.out.suffix != ".iavatar":
-        raise BadInput(f"--out is {given.out}; a name that ends in .iavatar was expected.")
-    if not given.out.resolve().parent.is_dir():
-        raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
     with console.waiting("loading the checkpoint"):
         import torch
 
@@ -84,14 +114,12 @@ def export(given: ExportArguments, console: Console) -> int:
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
     with console.waiting("baking the avatar and checking its player"):
-        taken = snapshot(trainer, given.out, views(trainer.avatar.rig), mark=None)
+        taken = snapshot(trainer, out, views(trainer.avatar.rig), mark=None)
     if taken.exported is None:
         raise Stop(taken.refused or "nothing was written.", NO_PACKAGE)
     for warning in taken.exported.warnings:
         console.warn(warning)
     console.say(f"As learnt from {trainer.frames_seen} frames in {trainer.wall_seconds:.1f} s.")
-    console.made("package", given.out)
-    return DONE
 
 
 def views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:

@@ -14,6 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from apps.console import Console
 from apps.exit_codes import BAD_INPUT, DONE, exit_code
 from apps.port import with_port
+from apps.rate import poses_a_second
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose, Motion
@@ -121,7 +122,7 @@ def _clip(given: PlayArguments, console: Console) -> int:
     blend = background(given.background)
     player = Player.load(given.avatar)
     shots = _shots(given, player, console)
-    fps = given.fps or _rate(shots.motion)
+    fps = given.fps or poses_a_second(shots.motion)
     with console.bar(f"drawing {out.name}", float(len(shots.rows))) as bar:
 
         def pictures() -> Iterator[np.ndarray]:
@@ -172,7 +173,7 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
         check_folder(given.out)
     player = Player.load(given.avatar)
     shots = _shots(given, player, console)
-    clip = clip_of(player, shots.motion, shots.rows, given.fps or _rate(shots.motion))
+    clip = clip_of(player, shots.motion, shots.rows, given.fps or poses_a_second(shots.motion))
     name = (
         given.avatar.resolve().parent.name if given.avatar.stem == "avatar" else given.avatar.stem
     )
@@ -268,14 +269,6 @@ def _fitted(camera: Camera, size: int | None) -> Camera:
     scale = (size or max(width, height)) / max(width, height)
     pinhole = replace(camera, distortion=())
     return pinhole.resized((max(1, round(width * scale)), max(1, round(height * scale))))
-
-
-def _rate(motion: Motion) -> float:
-    """Poses a second, by their times; else 30."""
-    if motion.times_s is None or len(motion) < 2:
-        return 30.0
-    step = float(np.median(np.diff(motion.times_s)))
-    return round(1.0 / step, 3) if 1.0 / 240.0 <= step <= 10.0 else 30.0
 
 
 if __name__ == "__main__":

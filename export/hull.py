@@ -50,7 +50,7 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
         spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
     """
     logs = np.log(np.clip(lattice.density / np.float32(level), 1.0 / CONTRAST, CONTRAST))
-    logs = _resampled(logs, spacing_m / lattice.voxel_m)
+    logs = resampled(logs, spacing_m / lattice.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
     inside = _largest_parts(logs > 0.0)
     nothing = np.float32(1e-3)
@@ -66,9 +66,7 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
     )
 
 
-def _resampled(
-    values: Float32[np.ndarray, "x y z"], step: float
-) -> Float32[np.ndarray, "x2 y2 z2"]:
+def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
     """Linear interpolation at every `step`-th node along each axis."""
     for axis in range(3):
         places = np.arange(0.0, values.shape[axis] - 1, step)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from apps import export
 from export.player import Player, verify
@@ -41,6 +42,7 @@ def test_the_whole_person_is_in_the_views(rig):
     [
         (lambda run, out: (out.parent, out), "checkpoint"),
         (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
+        (lambda run, out: (run / "avatar.iavatar", out), "checkpoint"),
         (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "no folder"),
     ],
 )
@@ -49,6 +51,43 @@ def test_what_cannot_be_done_is_said_and_nothing_is_written(
 ):
     folder, out = change(run, tmp_path / "a.iavatar")
     code, said = call_export(folder, "--out", out)
+    assert code == 2
+    assert told in said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
+    out = tmp_path / "a.glb"
+    poses = film / "truth" / "novel" / "poses.npz"
+    code, said = call_export(run, "--to", "glb", "--poses", poses, "--out", out)
+    assert code == 0, said.err
+    (mesh,) = trimesh.load(out).geometry.values()
+    low, high = mesh.bounds
+    assert 1.4 < high[1] - low[1] < 2.1  # a person's height
+    assert [file.name for file in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_a_package_becomes_a_still_mesh_in_colour(run, call_export, tmp_path):
+    code, said = call_export(run / "avatar.iavatar", "--to", "ply", "--out", tmp_path / "a.ply")
+    assert code == 0, said.err
+    mesh = trimesh.load(tmp_path / "a.ply")
+    assert len(mesh.faces) > 10_000
+    assert mesh.visual.kind == "vertex"
+    colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
+    assert colors.std(axis=0).max() > 20.0  # a shirt is no skin
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--to", "glb", "--out", "a.ply"], ".glb"),
+        (["--to", "ply", "--out", "a.ply", "--poses", "poses.npz"], "--poses"),
+        (["--to", "glb", "--out", "a.glb", "--poses", "nowhere.npz"], "nowhere.npz"),
+    ],
+)
+def test_meshes_that_cannot_be_are_refused(run, call_export, tmp_path, monkeypatch, words, told):
+    monkeypatch.chdir(tmp_path)
+    code, said = call_export(run / "avatar.iavatar", *words)
     assert code == 2
     assert told in said.err
     assert list(tmp_path.iterdir()) == []
