@@ -3,7 +3,7 @@
 import hashlib
 import json
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, final
@@ -14,12 +14,20 @@ from jaxtyping import Float, Float32, Shaped
 from export.initialisers import initialisers
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage, read_package
+from export.tables import BRICK, DEPTH_STEPS, LOG_DENSITY, SURFEL_BITS
 from export.web.runtime import MODULE, runtime_files
 from preprocess.pose import BodyPose
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
 NARROW = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
 """Element types that the page reads (arrays.js)."""
+CONSTANTS = {
+    "surfel_bits": SURFEL_BITS,
+    "depth_steps": DEPTH_STEPS,
+    "brick": BRICK,
+    "log_density": LOG_DENSITY,
+}
+"""What the page's shaders must know besides rules and layout."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,9 +142,11 @@ def _bytes(content: bytes) -> Shaped[np.ndarray, "bytes"]:
 
 
 def _tier(draft: _Draft, package: AvatarPackage, tier: str) -> dict[str, Any]:
-    tables = initialisers(package.tables[tier])
+    tables, note = initialisers(package.tables[tier]), package.manifest.tiers[tier]
     return {
-        "samples": package.manifest.tiers[tier].rules.samples,
+        "rules": asdict(note.rules),
+        "layout": asdict(note.layout),
+        "constants": CONSTANTS,
         "graph": draft.array(_bytes(package.graphs[tier])),
         "tables": [{"name": name, **draft.array(array)} for name, array in tables.items()],
     }

@@ -66,7 +66,7 @@ def test_every_array_comes_back_as_it_was(files, exported, clip):
 
 def test_the_page_asks_nobody_else_for_anything(files):
     own = {name: text for name, text in files.items() if not name.startswith(("data/", "runtime/"))}
-    assert {"index.html", "avatar.json", "worker.js"} <= own.keys()
+    assert {"index.html", "avatar.json", "graph_worker.js"} <= own.keys()
     for name, content in own.items():
         found = set(re.findall(r"(?:https?:)?//[\w.-]+\.\w+", content.decode()))
         assert found <= {"http://www.w3.org"}, name  # SVG's name, which nobody fetches

@@ -19,6 +19,7 @@ export async function start() {
   $("licence").textContent = avatar.licence;
   const state = { engine: "wasm", tier: "hq", sharpness: "auto", playing: false, speed: 1 };
   loading.expect(avatar, "hq");
+  state.engine = await player.best();
   await player.open(state);
   const orbit = new Orbit(avatar.look);
   const show = new Show($("picture"), player, orbit, state, (news) => tell(news, player, loading));
@@ -49,7 +50,7 @@ class Loading {
   hear({ arrived, preparing }) {
     this.bytes += arrived || 0;
     const [done, all] = [this.bytes, this.total].map((bytes) => (bytes / 1e6).toFixed(1));
-    $("status-bar").value = preparing ? 1 : this.bytes / this.total;
+    $("status-bar").value = preparing ? 1 : Math.min(1, this.bytes / this.total);
     $("status-text").textContent = preparing ? "Preparing …" : `Loading ${done} of ${all} MB`;
   }
 
@@ -107,7 +108,7 @@ function settings(player, state, show, loading) {
     }
   };
   choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, change("tier"));
-  choices($("engines"), known(ENGINES, Object.keys(player.engines)), state.engine, change("engine"));
+  choices($("engines"), known(ENGINES, player.graphics.hardware ? Object.keys(player.engines) : ["wasm"]), state.engine, change("engine"));
   choices($("themes"), THEMES, "system", (theme) => { document.documentElement.dataset.theme = theme; });
   backgrounds();
   $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; show.changed(); };

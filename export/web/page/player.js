@@ -1,7 +1,7 @@
 // The avatar, its motion and whoever draws it, without the page around them.
 
 import { load } from "./arrays.js";
-import { GraphEngine } from "./graph_engine.js";
+import { Engine, graphics } from "./engine.js";
 import { moved } from "./matrices.js";
 import { Orbit, windowOf } from "./orbit.js";
 import { Skeleton, bones } from "./skeleton.js";
@@ -11,7 +11,7 @@ const ALIKE = 0.999; // … on at least this share of the pixels
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
 export class Player {
-  /** heard: as of GraphEngine. */
+  /** heard: as of Engine. */
   static async load(heard) {
     const answer = await fetch(new URL("./avatar.json", import.meta.url));
     if (!answer.ok) throw new Error(`avatar.json could not be loaded (${answer.status}).`);
@@ -25,7 +25,9 @@ export class Player {
     this.count = poses.length / POSE;
     this.fps = avatar.motion.fps;
     this.skeleton = new Skeleton(avatar);
-    this.engines = { wasm: new GraphEngine(avatar, heard) };
+    this.graphics = graphics();
+    const kinds = this.graphics.there ? ["webgl", "wasm"] : ["wasm"];
+    this.engines = Object.fromEntries(kinds.map((kind) => [kind, new Engine(kind, avatar, heard)]));
   }
 
   pose(row) {
@@ -34,6 +36,17 @@ export class Player {
 
   open({ engine, tier }) {
     return this.engines[engine].open(tier);
+  }
+
+  /** The engine to begin with: a GPU that draws the golden frames as they should be, else the CPU. */
+  async best() {
+    if (!this.graphics.hardware) return "wasm";
+    try {
+      return (await this.verify("webgl")).every((each) => each.alike) ? "webgl" : "wasm";
+    } catch (error) {
+      console.warn("The GPU is not used:", error);
+      return "wasm";
+    }
   }
 
   /** A pose seen by a camera: {x, y, width, height, rgba, ms}, the part where the avatar is; or null. */

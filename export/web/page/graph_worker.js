@@ -1,24 +1,23 @@
 // Runs the package's own ONNX graph in WebAssembly, one thread, away from the page.
 
 import { InferenceSession, Tensor, env } from "./runtime/ort.mjs";
+import { answer, arrived, preparing } from "./answering.js";
 import { load } from "./arrays.js";
 
 const sessions = {};
 
 async function open({ tier, note, runtime }) {
-  if (sessions[tier]) return {};
-  const arrived = (bytes) => postMessage({ arrived: bytes });
+  if (sessions[tier]) return;
   const files = [runtime, note.graph, ...note.tables].map((entry) => load(entry, arrived));
   const [wasm, graph, ...tables] = await Promise.all(files);
   env.wasm.numThreads = 1;
   env.wasm.wasmBinary ??= wasm;
   env.logLevel = "error";
-  postMessage({ preparing: true });
+  preparing();
   sessions[tier] = await InferenceSession.create(graph, {
     executionProviders: ["wasm"],
     externalData: tables.map((data, i) => ({ path: note.tables[i].name, data: new Uint8Array(data.buffer) })),
   });
-  return {};
 }
 
 async function draw({ tier, bones, camera, width, height, samples }) {
@@ -32,11 +31,4 @@ async function draw({ tier, bones, camera, width, height, samples }) {
   return { rgba: rgba.data.buffer, ms: performance.now() - began };
 }
 
-onmessage = async ({ data: { number, kind, ...given } }) => {
-  try {
-    const answer = await (kind === "open" ? open(given) : draw(given));
-    postMessage({ number, ...answer }, answer.rgba ? [answer.rgba] : []);
-  } catch (error) {
-    postMessage({ number, failed: String((error && error.message) || error) });
-  }
-};
+answer({ open, draw });

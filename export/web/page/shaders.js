@@ -1,0 +1,344 @@
+// The player's drawing rules as shaders: what the ONNX graph does with the same tables.
+//
+// Its parts have the names of the graph's (export/posing.py, raster.py, shading.py, march.py and
+// lookup.py); the golden frames of every package hold both to the same pictures.
+
+export const WIDTH_BITS = 12; // tables lie in textures of 4096 columns
+
+/** Constants of a tier as GLSL. note: {rules, layout, constants} of avatar.json. */
+function constants({ rules, layout, constants: fixed }) {
+  const float = (value) => (Number.isInteger(value) ? `${value}.0` : `${value}`);
+  const vec3 = (values) => `vec3(${values.map(float).join(", ")})`;
+  const ivec3 = (values) => `ivec3(${values.join(", ")})`;
+  const perNode = layout.skin_step_m.map((step) => 2 / step); // nodes lie half a step apart
+  const { samples: _, ...others } = rules; // a uniform
+  const lines = Object.entries(others).map(([name, value]) =>
+    Number.isInteger(value) && WHOLE.has(name)
+      ? `const int ${name} = ${value};`
+      : `const float ${name} = ${float(value)};`);
+  return `
+    ${lines.join("\n    ")}
+    const ivec3 brick_counts = ${ivec3(layout.brick_counts)};
+    const vec3 brick_low = ${vec3(layout.brick_low)};
+    const float voxel_m = ${float(layout.voxel_m)};
+    const float spacing_m = ${float(layout.surfel_spacing_m)};
+    const ivec3 node_counts = ${ivec3(layout.skin_counts.map((count) => 2 * count - 1))};
+    const vec3 node_low = ${vec3(layout.skin_low)};
+    const vec3 nodes_per_m = ${vec3(perNode)};
+    const vec3 pelvis = ${vec3(layout.pelvis)};
+    const float reach_m = ${float(layout.reach_m)};
+    const int SURFEL_BITS = ${fixed.surfel_bits};
+    const int DEPTH_STEPS = ${fixed.depth_steps};
+    const int BRICK = ${fixed.brick};
+    const int NODES = ${fixed.brick + 1};
+    const vec2 LOG_DENSITY = vec2(${fixed.log_density.map(float).join(", ")});
+    const int FULL = 256;
+    const int FAR = 0x7fffffff;
+    const int SURFEL_MASK = (1 << SURFEL_BITS) - 1;`;
+}
+
+const WHOLE = new Set(["layers", "block", "steady", "largest_footprint_px"]);
+
+const COMMON = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp sampler2DArray;
+precision highp isampler2D;
+precision highp usampler2D;
+uniform vec4 bones[72];
+uniform vec4 lens; // focal lengths, centre
+uniform ivec2 size;
+uniform float samples;
+ivec2 at(int i) { return ivec2(i & ${(1 << WIDTH_BITS) - 1}, i >> ${WIDTH_BITS}); }
+`;
+
+const POSING = `
+uniform sampler2D node_camera;
+uniform isampler2D node;
+
+vec3 node_at(int row) { return texelFetch(node_camera, at(row), 0).xyz; }
+
+/** Where a canonical point is in the camera's frame; derivative has a column for each axis. */
+vec3 carried(vec3 point, out mat3 derivative) {
+  vec3 place = clamp((point - node_low) * nodes_per_m, vec3(0.0), vec3(node_counts - 1) - 1e-3);
+  vec3 below = floor(place);
+  vec3 f = place - below;
+  ivec3 b = ivec3(below);
+  int number = (b.x * node_counts.y + b.y) * node_counts.z + b.z;
+  int across = node_counts.z, far_across = node_counts.y * node_counts.z;
+  int r00 = texelFetch(node, at(number), 0).x, r01 = texelFetch(node, at(number + across), 0).x;
+  int r10 = texelFetch(node, at(number + far_across), 0).x;
+  int r11 = texelFetch(node, at(number + far_across + across), 0).x;
+  vec3 c000 = node_at(r00), c010 = node_at(r01), c100 = node_at(r10), c110 = node_at(r11);
+  vec3 z00 = node_at(r00 + 1) - c000, z01 = node_at(r01 + 1) - c010;
+  vec3 z10 = node_at(r10 + 1) - c100, z11 = node_at(r11 + 1) - c110;
+  vec3 on00 = c000 + f.z * z00, on01 = c010 + f.z * z01;
+  vec3 on10 = c100 + f.z * z10, on11 = c110 + f.z * z11;
+  vec3 y0 = on01 - on00, y1 = on11 - on10;
+  vec3 on0 = on00 + f.y * y0, on1 = on10 + f.y * y1;
+  derivative[0] = (on1 - on0) * nodes_per_m.x;
+  derivative[1] = mix(y0, y1, f.x) * nodes_per_m.y;
+  derivative[2] = mix(mix(z00, z01, f.y), mix(z10, z11, f.y), f.x) * nodes_per_m.z;
+  return on0 + f.x * (on1 - on0);
+}
+
+bool sound(float volume) { return volume > 1.0 / stretch && volume < stretch; }
+`;
+
+/** Linear blend skinning of every node of the skin. */
+const NODES = `
+uniform sampler2DArray node_weights;
+uniform sampler2D node_place;
+layout(location = 0) out vec4 camera;
+void main() {
+  ivec2 here = ivec2(gl_FragCoord.xy);
+  vec4 rows[3] = vec4[3](vec4(0.0), vec4(0.0), vec4(0.0));
+  for (int layer = 0; layer < 6; layer++) {
+    vec4 weights = texelFetch(node_weights, ivec3(here, layer), 0);
+    for (int k = 0; k < 4; k++) {
+      if (weights[k] == 0.0) continue;
+      int bone = 3 * (4 * layer + k);
+      for (int row = 0; row < 3; row++) rows[row] += weights[k] * bones[bone + row];
+    }
+  }
+  vec4 place = vec4(texelFetch(node_place, here, 0).xyz, 1.0);
+  camera = vec4(dot(rows[0], place), dot(rows[1], place), dot(rows[2], place), 1.0);
+}`;
+
+const SURFEL = `
+uniform sampler2D surfel_place; // and thickness
+uniform sampler2D surfel_normal;
+uniform float near; // where the depth window begins
+
+struct Seen { vec3 camera; vec2 uv; float facing; bool seen; };
+
+Seen project(int surfel) {
+  mat3 derivative;
+  Seen s;
+  s.camera = carried(texelFetch(surfel_place, at(surfel), 0).xyz, derivative);
+  float depth = s.camera.z;
+  s.uv = lens.xy * s.camera.xy / max(depth, nearest_m) + lens.zw;
+  vec3 from_eye = inverse(derivative) * s.camera;
+  s.facing = dot(texelFetch(surfel_normal, at(surfel), 0).xyz, from_eye);
+  float margin = float(largest_footprint_px);
+  s.seen = sound(determinant(derivative)) && depth > nearest_m && s.facing < depth * behind
+    && all(greaterThan(s.uv, vec2(-margin))) && all(lessThan(s.uv, vec2(size) + margin));
+  return s;
+}
+`;
+
+/** Of all surfels that are seen the nearest one's depth, into one pixel's depth buffer. */
+const NEAREST = `
+void main() {
+  Seen s = project(gl_VertexID);
+  gl_PointSize = 1.0;
+  float z = (s.camera.z - near) / (2.0 * reach_m);
+  gl_Position = s.seen ? vec4(0.0, 0.0, 2.0 * clamp(z, 0.0, 1.0) - 1.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+}`;
+
+/** Each surfel's footprint into the z-buffer. */
+const SPLAT = `
+uniform sampler2D nearest_depth;
+flat out int key;
+flat out float deep_enough;
+void main() {
+  Seen s = project(gl_VertexID);
+  float depth = s.camera.z;
+  float nearest = near + texelFetch(nearest_depth, ivec2(0), 0).x * 2.0 * reach_m;
+  float spacing_px = max(lens.x, lens.y) * spacing_m / nearest;
+  float side = clamp(floor(spacing_px * footprint_spacings + 0.999), 2.0, float(largest_footprint_px));
+  float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
+  key = (int(code) << SURFEL_BITS) | gl_VertexID;
+  deep_enough = s.facing < depth * -facing ? depth : 0.0;
+  // in the middle of the pixels that are meant, for GPUs round the places of points; and in a
+  // picture with a border, so that points beyond its edge are not cut off with their footprints
+  vec2 middle = floor(s.uv - 0.5 * (side - 1.0)) + 0.5 * side;
+  vec2 border = vec2(largest_footprint_px);
+  vec2 place = 2.0 * (middle + border) / (vec2(size) + 2.0 * border) - 1.0;
+  gl_PointSize = side;
+  gl_Position = s.seen ? vec4(place, 2.0 * (code + 0.5) / float(DEPTH_STEPS) - 1.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+}`;
+
+const SPLATTED = `
+flat in int key;
+flat in float deep_enough;
+layout(location = 0) out int nearest_key;
+#ifdef BEHIND
+uniform sampler2D first_extent;
+#endif
+void main() {
+#ifdef BEHIND
+  ivec2 here = ivec2(gl_FragCoord.xy) - largest_footprint_px;
+  if (any(lessThan(here, ivec2(0))) || any(greaterThanEqual(here, size))) discard;
+  if (!(deep_enough > texelFetch(first_extent, here, 0).x)) discard;
+#endif
+  nearest_key = key;
+}`;
+
+const LOOKUP = `
+uniform usampler2D voxels;
+uniform isampler2D brick_offset;
+
+ivec4 voxel_at(int place) { return ivec4(texelFetch(voxels, at(place), 0)); }
+
+/** Colour × 255 × 256 and density in 1/m: tetrahedral interpolation with whole weights. */
+vec4 read_bricks(vec3 lattice) {
+  vec3 inside = clamp(lattice, vec3(0.0), vec3(brick_counts * BRICK) - 1e-3);
+  ivec3 voxel = ivec3(floor(inside));
+  vec3 f = inside - vec3(voxel);
+  ivec3 brick = voxel / BRICK;
+  ivec3 local = voxel - brick * BRICK;
+  int base = texelFetch(brick_offset, at((brick.x * brick_counts.y + brick.y) * brick_counts.z + brick.z), 0).x
+    + (local.x * NODES + local.y) * NODES + local.z;
+  int sx = NODES * NODES, sy = NODES, sz = 1;
+  bool xy = f.x > f.y, xz = f.x > f.z, yz = f.y > f.z;
+  int first = xy ? (xz ? sx : sz) : (yz ? sy : sz);
+  int two = xy ? (yz ? sx + sy : sx + sz) : (xz ? sx + sy : sy + sz);
+  float largest = max(f.x, max(f.y, f.z)), smallest = min(f.x, min(f.y, f.z));
+  float middle = (f.x + f.y + f.z) - largest - smallest;
+  int a = int(largest * float(FULL) + 0.5), b = int(middle * float(FULL) + 0.5), c = int(smallest * float(FULL) + 0.5);
+  ivec4 sum = voxel_at(base) * (FULL - a) + voxel_at(base + first) * (a - b)
+    + voxel_at(base + two) * (b - c) + voxel_at(base + sx + sy + sz) * c;
+  float code = float(sum.a);
+  float density = exp(code * ((LOG_DENSITY.y - LOG_DENSITY.x) / (255.0 * float(FULL))) + LOG_DENSITY.x);
+  return vec4(vec3(sum.rgb), code > float(FULL) / 2.0 ? density : 0.0);
+}
+`;
+
+const MARCH = `
+/** Premultiplied colour and alpha along a piece of a ray. */
+vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction, int steady_blocks) {
+  float place = begin, light = 1.0;
+  vec3 color = vec3(0.0);
+  for (int turn = 0; turn < 64; turn++) {
+    float longest = span_m / samples * exp2(max(float(turn - (steady_blocks - 1)), 0.0));
+    float stride = min((end - place) / float(block), longest);
+    vec3 start = (point - brick_low) / voxel_m, slope = direction * (stride / voxel_m);
+    for (int k = 0; k < block; k++) {
+      vec4 found = read_bricks(start + (float(k) + 0.5) * slope);
+      float passed = exp(-found.a * stride);
+      color += found.rgb * (light * (1.0 - passed));
+      light *= passed;
+    }
+    float way = stride * float(block);
+    place += way;
+    point += direction * way;
+    if (!(light > ended && place < end - 1e-5)) break;
+    mat3 derivative;
+    vec3 off = place * ray - carried(point, derivative);
+    if (sound(determinant(derivative))) {
+      mat3 back = inverse(derivative);
+      vec3 shift = back * off;
+      point += shift * min(longest_correction_m / sqrt(dot(shift, shift) + 1e-20), 1.0);
+      direction = back * ray;
+    }
+  }
+  return vec4(color / (255.0 * float(FULL)), 1.0 - light);
+}
+`;
+
+const SHADE = `
+uniform isampler2D keys;
+
+int key_at(ivec2 pixel) {
+  bool outside = any(lessThan(pixel, ivec2(0))) || any(greaterThanEqual(pixel, size));
+  return outside ? FAR : texelFetch(keys, pixel + largest_footprint_px, 0).x;
+}
+
+vec3 ray_of(ivec2 pixel) { return normalize(vec3((vec2(pixel) + 0.5 - lens.zw) / lens.xy, 1.0)); }
+
+struct Entry { vec3 canonical, camera, from_eye, direction; float enter, begin, end; };
+
+/** Where a pixel's ray enters the hull, and from where to where it is followed. */
+Entry entry_of(int surfel, vec3 ray) {
+  Entry e;
+  mat3 derivative;
+  vec4 table = texelFetch(surfel_place, at(surfel), 0);
+  e.canonical = table.xyz;
+  e.camera = carried(e.canonical, derivative);
+  mat3 back = inverse(derivative);
+  e.from_eye = back * e.camera;
+  e.direction = back * ray;
+  vec3 normal = texelFetch(surfel_normal, at(surfel), 0).xyz;
+  float along = dot(e.camera, ray);
+  float falling = dot(normal, e.direction), shallow = -0.5 * steepest;
+  float hit = dot(normal, e.from_eye) / min(falling, shallow);
+  e.enter = clamp(falling < shallow ? hit : along, along - slack_m, along + slack_m);
+  float cosine = max(-falling, steepest);
+  float lead = min(lead_m / cosine, most_lead_m);
+  float sine = 1.0 - falling * falling / dot(e.direction, e.direction);
+  e.begin = e.enter - lead;
+  e.end = e.begin + min(table.w * (sine * grazing + 1.0) / cosine + lead, longest_m);
+  return e;
+}
+
+vec3 start_of(Entry e) { return e.canonical - e.from_eye + e.begin * e.direction; }
+`;
+
+const FIRST = `
+layout(location = 0) out vec4 color;
+layout(location = 1) out vec4 extent; // depth that the second layer must exceed, end, surfel
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  int key = key_at(pixel);
+  int across = max(key_at(pixel + ivec2(-1, 0)), key_at(pixel + ivec2(1, 0)));
+  int along = max(key_at(pixel + ivec2(0, -1)), key_at(pixel + ivec2(0, 1)));
+  int neighbours = min(across, along);
+  int steps = int(hole_m / (2.0 * reach_m) * float(DEPTH_STEPS));
+  if (key - (steps << SURFEL_BITS) > neighbours) key = neighbours;
+  color = vec4(0.0);
+  extent = vec4(1e6, 0.0, 0.0, 0.0);
+  if (key == FAR) return;
+  int surfel = key & SURFEL_MASK;
+  vec3 ray = ray_of(pixel);
+  Entry e = entry_of(surfel, ray);
+  color = march(ray, e.begin, e.end, start_of(e), e.direction, steady);
+  bool wanted = layers > 1 && 1.0 - color.a > transmitted;
+  extent = vec4(wanted ? e.enter * ray.z + gap_m : 1e6, e.end, float(surfel), 1.0);
+}`;
+
+const SECOND = `
+uniform sampler2D first_color;
+uniform sampler2D first_extent;
+layout(location = 0) out vec4 rgba;
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  vec4 color = texelFetch(first_color, pixel, 0);
+  int key = layers > 1 ? key_at(pixel) : FAR;
+  if (key != FAR) {
+    vec4 before = texelFetch(first_extent, pixel, 0);
+    vec3 ray = ray_of(pixel);
+    Entry e = entry_of(key & SURFEL_MASK, ray);
+    mat3 unused;
+    vec3 first = texelFetch(surfel_place, at(int(before.z)), 0).xyz;
+    bool one_sheet = distance(e.canonical, first) < distance(e.camera, carried(first, unused)) * same_share + same_m;
+    if (one_sheet) e.begin = min(max(e.begin, before.y), e.end);
+    color += (1.0 - color.a) * march(ray, e.begin, e.end, start_of(e), e.direction, 1);
+  }
+  rgba = clamp(vec4(color.rgb / max(color.a, 1e-6), color.a), 0.0, 1.0);
+}`;
+
+const WHOLE_SCREEN = `
+void main() {
+  vec2 corner = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+  gl_Position = vec4(corner, 0.0, 1.0);
+}`;
+
+const NOTHING = `layout(location = 0) out vec4 nothing;
+void main() { nothing = vec4(0.0); }`;
+
+/** Sources of the five passes, [vertex, fragment] each. */
+export function sources(note) {
+  const head = COMMON + constants(note);
+  const surfels = head + POSING + SURFEL;
+  const shading = head + POSING + SURFEL + LOOKUP + MARCH + SHADE;
+  return {
+    nodes: [head + WHOLE_SCREEN, head + NODES],
+    nearest: [surfels + NEAREST, head + NOTHING],
+    splat: [surfels + SPLAT, head + SPLATTED],
+    first: [head + WHOLE_SCREEN, shading + FIRST],
+    behind: [surfels + SPLAT, head.replace("es\n", "es\n#define BEHIND\n") + SPLATTED],
+    second: [head + WHOLE_SCREEN, shading + SECOND],
+  };
+}
