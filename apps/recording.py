@@ -13,8 +13,9 @@ from capture.growing import IDLE_S
 from capture.pace import Pace
 from capture.playback import Playback
 from capture.source import Source, open_live, open_source
+from capture.video import turned_by
 from preprocess.body import Body, ShapedBody
-from preprocess.camera_file import CameraTrack, default_cameras, read_cameras
+from preprocess.camera_file import CameraTrack, default_cameras, read_cameras, upright_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.live import LiveParts
 from preprocess.masks import Masks, open_masks
@@ -113,7 +114,7 @@ class Recording:
         if paths.masks is not None:
             masks = open_masks(paths.masks, invert=wanted.mask_invert)
         if paths.cameras is not None:
-            cameras = read_cameras(paths.cameras, source.size_px)
+            cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source))
         else:
             cameras = default_cameras(motion, source.size_px)
         shaped = body.with_shape(betas_for(body, motion))

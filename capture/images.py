@@ -137,13 +137,14 @@ class ImageFolder:
         """Nothing is held open."""
 
     def _look(self) -> tuple[tuple[int, int], bool]:
-        """Size of the first picture that can be read, and whether it has an alpha channel."""
+        """Size of the first picture that can be read, and whether its alpha channel cuts it out."""
         for path in self._images:
             try:
                 rgb, alpha = read_image(path)
             except BadInput:
                 continue
-            return (rgb.shape[1], rgb.shape[0]), alpha is not None
+            cut_out = alpha is not None and bool(alpha.min() < 255)  # opaque ones say nothing
+            return (rgb.shape[1], rgb.shape[0]), cut_out
         raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
 
     def _warn(self, message: str) -> None:

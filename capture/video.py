@@ -3,27 +3,28 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from capture.decoder import Shot, open_decoder
 from capture.errors import BadInput
 from capture.frame import Frame
-from capture.quiet import silence_opencv
+from capture.hdr import hdr_curve
 from capture.selection import Selection
+from capture.source import Source
 
 COUNTED = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
 
-PATIENCE = 16
-"""How many failures in a row are the end: one damaged packet is none."""
-
 
 class VideoFile:
-    """A recorded video (OpenCV's FFmpeg; rotation flags are applied).
+    """A recorded video, whose rotation flag is applied.
 
     A file that ends early or has gaps is read as far as it goes, with a warning. Known limit:
-    OpenCV does not tell which pictures FFmpeg has patched up from damaged data.
+    without PyAV nobody tells which pictures FFmpeg has patched up from damaged data.
+
+    Attributes:
+        quarter_turns: How often its stored pictures are turned by 90° against the clock.
     """
 
     has_alpha = False
@@ -42,14 +43,14 @@ class VideoFile:
         self.path = path
         self.selection = selection
         self.warnings: list[str] = []
-        capture = self._open()
-        ok, picture = capture.read()
-        if not ok:
+        self._decoder = open_decoder(path)
+        self.quarter_turns = self._decoder.quarter_turns
+        self._rate = self._decoder.rate
+        picture = next((shot.rgb() for shot in self._decoder.shots()), None)
+        if picture is None:
             raise BadInput(f"No frame of {path} could be decoded; the video is empty or damaged.")
         self.size_px = (int(picture.shape[1]), int(picture.shape[0]))
-        self._rate = capture.get(cv2.CAP_PROP_FPS)
-        claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        capture.release()
+        claimed = self._decoder.claimed
         self.frames_in_file = claimed if claimed > 0 else self.count_frames()
         self.frame_count: int | None = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)
@@ -59,53 +60,47 @@ class VideoFile:
                 f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "
                 f"for, which start at {selection.start}."
             )
+        self._warn_of_hdr()
 
     def frames(self) -> Iterator[Frame]:
         """The wanted frames in order; every call starts anew."""
         previous = None
-        for index, time_s, capture, after_gap in self._pictures():
+        for index, shot in self._numbered():
             if not self.selection.wants(index):
                 continue
-            ok, picture = capture.retrieve()
-            if not ok or picture.shape[1::-1] != self.size_px:
+            rgb = shot.rgb()
+            if rgb is None or rgb.shape[1::-1] != self.size_px:
                 self._warn(f"Frame {index} of {self.path.name} could not be decoded; left out.")
                 continue
-            rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            yield Frame(index=index, time_s=time_s, rgb=rgb, flags=_flags(rgb, previous, after_gap))
+            flags = _flags(rgb, previous, shot)
+            yield Frame(index=index, time_s=shot.time_s, rgb=rgb, flags=flags)
             previous = rgb
 
     def count_frames(self) -> int:
         """How many frames can be decoded, found by doing so."""
-        capture, count, failures = self._open(), 0, 0
-        while failures < PATIENCE:
-            failures = 0 if capture.grab() else failures + 1
-            count += not failures
-        capture.release()
-        return count
+        return sum(1 for _ in self._decoder.shots())
 
     def close(self) -> None:
         """Nothing is held open but by `frames()`, which lets it go itself."""
 
-    def _pictures(self) -> Iterator[tuple[int, float, cv2.VideoCapture, bool]]:
-        """Number and time of every picture while the decoder stands at it; if it follows a gap."""
-        capture, index, got, failures, even = self._open(), 0, 0, 0, True
-        time_s = 0.0
-        try:
-            while failures < PATIENCE and not self.selection.over(index):
-                if not capture.grab():
-                    failures += 1
-                    continue
-                time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-                place = time_s * self._rate
-                if failures and even:  # pictures may be lost here; an even rate tells how many
-                    index = max(index, round(place))
-                even = even and abs(place - index) < 0.3
-                yield index, time_s, capture, failures > 0
-                index, got, failures = index + 1, got + 1, 0
-        finally:
-            capture.release()
+    def _numbered(self) -> Iterator[tuple[int, Shot]]:
+        """Every picture with its number; where some are lost, an even rate tells how many."""
+        index, got, even, time_s, damaged = 0, 0, True, 0.0, 0
+        for shot in self._decoder.shots():
+            if self.selection.over(index):
+                return
+            time_s = shot.time_s
+            place = time_s * self._rate
+            if shot.after_gap and even:
+                index = max(index, round(place))
+            even = even and abs(place - index) < 0.3
+            damaged += shot.corrupt
+            yield index, shot
+            index, got = index + 1, got + 1
         if not self.selection.over(index):
             self._compare_with_claim(got, time_s)
+        if damaged:
+            self._warn(f"{self.path.name}: {damaged} of {got} frames are damaged; left out.")
 
     def _compare_with_claim(self, got: int, end_s: float) -> None:
         """Warns if the container promised more than came."""
@@ -119,26 +114,35 @@ class VideoFile:
             return
         self._warn(f"{self.path.name}: {came}; the file is truncated or damaged.")
 
-    def _open(self) -> cv2.VideoCapture:
-        silence_opencv()
-        capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        if not capture.isOpened():
-            raise BadInput(
-                f"{self.path} is no video that can be opened. A recording that was cut off before "
-                "it was finished has no index and cannot be read: copy it again from the camera."
-            )
-        return capture
+    def _warn_of_hdr(self) -> None:
+        """HDR without PyAV comes slowly, and its highlights are cut off."""
+        if not self._decoder.deep or self._decoder.knows_hdr:
+            return
+        tells = self.path.suffix.lower() in COUNTED
+        if tells and hdr_curve(self.path) is None:
+            return
+        kind = "an HDR video" if tells else "a 10-bit video, perhaps HDR"
+        self._warn(
+            f"{self.path.name} is {kind}: it is decoded slowly, and highlights are cut off. Film "
+            "with HDR off, or install PyAV: pip install 'instant-avatar-stream[video]'."
+        )
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
             self.warnings.append(message)
 
 
+def turned_by(source: Source) -> int:
+    """How often a source's stored pictures are turned by 90° against the clock; 0 if no video."""
+    return source.quarter_turns if isinstance(source, VideoFile) else 0
+
+
 def _flags(
     rgb: UInt8[np.ndarray, "height width 3"],
     previous: UInt8[np.ndarray, "height width 3"] | None,
-    after_gap: bool,
+    shot: Shot,
 ) -> frozenset[str]:
     """A picture after a gap was predicted from one that is lost."""
     same = previous is not None and np.array_equal(rgb, previous)
-    return frozenset({"repeated"} if same else ()) | frozenset({"corrupt"} if after_gap else ())
+    damaged = shot.after_gap or shot.corrupt
+    return frozenset({"repeated"} if same else ()) | frozenset({"corrupt"} if damaged else ())

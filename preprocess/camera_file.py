@@ -91,6 +91,33 @@ def read_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
     return CameraTrack(cameras=cameras, source=path.name, note=note)
 
 
+def upright_cameras(path: Path, size_px: tuple[int, int], quarter_turns: int) -> CameraTrack:
+    """The cameras of a video whose stored pictures are turned to stand upright.
+
+    Cameras that were made for the pictures as they are stored are turned with them; which they were
+    made for, their width and height tell.
+
+    Args:
+        path: See `read_cameras`.
+        size_px: Of the upright frames.
+        quarter_turns: How often stored pictures are turned by 90° against the clock.
+
+    Raises:
+        BadInput: As `read_cameras`.
+    """
+    try:
+        return read_cameras(path, size_px)
+    except BadInput:
+        if quarter_turns % 2 == 0:
+            raise
+        lying = read_cameras(path, (size_px[1], size_px[0]))
+    return CameraTrack(
+        cameras=tuple(camera.turned(quarter_turns) for camera in lying.cameras),
+        source=lying.source,
+        note=f"The cameras in {path.name} were turned with the video, by its rotation flag.",
+    )
+
+
 def default_cameras(motion: Motion, size_px: tuple[int, int]) -> CameraTrack:
     """One camera at the world's origin: the tracker's K or focal length, else a phone's."""
     intrinsic = tracker_intrinsic(motion, size_px)

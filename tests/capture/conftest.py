@@ -80,3 +80,23 @@ def turned_clockwise() -> Callable[[bytes], bytes]:
         return bytes(out)
 
     return turn
+
+
+@pytest.fixture
+def with_durations() -> Callable[[bytes, list[int]], bytes]:
+    """Gives each frame of an mp4 whose index comes last a duration of its own, in its ticks."""
+
+    def change(data: bytes, durations: list[int]) -> bytes:
+        at = data.find(b"stts") - 4
+        before = int.from_bytes(data[at : at + 4], "big")
+        entries = b"".join((1).to_bytes(4, "big") + d.to_bytes(4, "big") for d in durations)
+        count = len(durations).to_bytes(4, "big")
+        table = (16 + len(entries)).to_bytes(4, "big") + b"stts" + bytes(4) + count + entries
+        out = bytearray(data[:at] + table + data[at + before :])
+        for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+            place = out.find(kind) - 4
+            size = int.from_bytes(out[place : place + 4], "big") + len(table) - before
+            out[place : place + 4] = size.to_bytes(4, "big")
+        return bytes(out)
+
+    return change

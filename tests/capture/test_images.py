@@ -122,3 +122,24 @@ def test_hidden_files_are_no_pictures(write_images):
     folder = write_images(2)
     (folder / "._shot_0.png").write_bytes(b"a file of another system")
     assert [path.name for path in list_images(folder)] == ["shot_0.png", "shot_1.png"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["{}.png", "{:06d}.jpg", "frame_{:04d}.JPG", "IMG_{}.JPEG", "image-{}.webp", "f{}.bmp",
+     "color_{:03d}.tiff", "clip.{:04d}.png", "rgb {} (1).png"],
+)  # fmt: skip
+def test_pictures_of_any_common_name_come_in_the_order_of_their_numbers(tmp_path, name):
+    for index in (10, 2, 0, 9, 1, 11, 3, 8, 4, 7, 5, 6):
+        grey = np.full((16, 16, 3), 20 * index, np.uint8)
+        Image.fromarray(grey).save(tmp_path / name.format(index))
+    (tmp_path / "Thumbs.db").write_bytes(b"no picture")
+    (tmp_path / ("._" + name.format(0))).write_bytes(b"no picture either")
+    frames = list(open_source(tmp_path).frames())
+    assert [round(float(frame.rgb.mean()) / 20) for frame in frames] == list(range(12))
+
+
+def test_an_alpha_channel_that_cuts_nothing_out_is_none(tmp_path):
+    rgba = np.full((8, 6, 4), 255, np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "0.png")
+    assert not open_source(tmp_path).has_alpha

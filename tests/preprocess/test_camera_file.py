@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.errors import BadInput
-from preprocess.camera_file import default_cameras, read_cameras
+from preprocess.camera_file import default_cameras, read_cameras, upright_cameras
 
 SIZE = (640, 480)
 INTRINSIC = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
@@ -111,3 +111,26 @@ def test_without_cameras_the_trackers_matrix_counts_else_a_phones(motion):
     np.testing.assert_array_equal(tracked[0].intrinsic, INTRINSIC)
     assert tracked.source == "K of the poses"
     assert tracked.note is None
+
+
+def test_cameras_of_a_turned_video_turn_with_it(tmp_path):
+    intrinsic = np.array([[900.0, 0, 630], [0, 910, 350], [0, 0, 1]])
+    np.savez(tmp_path / "c.npz", intrinsic=intrinsic, width=1280, height=720)
+    lying = read_cameras(tmp_path / "c.npz", (1280, 720)).cameras[0]
+    track = upright_cameras(tmp_path / "c.npz", (720, 1280), 3)
+    point = np.array([0.2, -0.4, 3.0])
+    x, y = lying.project(point)
+    np.testing.assert_allclose(track.cameras[0].project(point), [720 - y, x])  # by the clock
+    assert "turned with the video" in track.note
+    upright = upright_cameras(tmp_path / "c.npz", (1280, 720), 0)
+    np.testing.assert_array_equal(upright.cameras[0].intrinsic, lying.intrinsic)
+    with pytest.raises(BadInput, match="720x1280"):
+        upright_cameras(tmp_path / "c.npz", (720, 1280), 2)
+
+
+def test_cameras_that_were_made_for_upright_pictures_stay(tmp_path):
+    intrinsic = np.array([[900.0, 0, 350], [0, 910, 630], [0, 0, 1]])
+    np.savez(tmp_path / "c.npz", intrinsic=intrinsic, width=720, height=1280)
+    track = upright_cameras(tmp_path / "c.npz", (720, 1280), 3)
+    np.testing.assert_array_equal(track.cameras[0].intrinsic, intrinsic)
+    assert track.note is None

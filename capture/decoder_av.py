@@ -1,0 +1,95 @@
+"""PyAV's decoder (extra `[video]`): it says which pictures are damaged, and turns HDR into SDR."""
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.decoder import PATIENCE, Shot, refusal
+from capture.hdr import CURVES, sdr_from_hdr
+
+
+def pyav() -> Any:
+    """The module, which is an extra: nothing is loaded where it is not used."""
+    return importlib.import_module("av")
+
+
+@final
+class AvDecoder:
+    """FFmpeg by PyAV; for 8 bits the same pixels as OpenCV's."""
+
+    knows_hdr = True
+
+    def __init__(self, path: Path) -> None:
+        """Opens the file once, to look at it, and decodes a picture.
+
+        Raises:
+            BadInput: If it cannot be opened, or holds no video.
+        """
+        self._path = path
+        av = pyav()
+        try:
+            with av.open(str(path)) as container:
+                stream = container.streams.video[0]
+                self.rate = float(stream.average_rate or 0.0)
+                lasts_s = (container.duration or 0) / pyav().time_base
+                self.claimed = int(stream.frames) or round(lasts_s * self.rate)
+                self.deep = stream.codec_context.pix_fmt in DEEP
+                first = next(self._frames(container, stream), None)
+        except (av.FFmpegError, IndexError, ValueError, OSError) as cause:
+            raise refusal(path) from cause
+        self.quarter_turns = 0 if first is None else int(first[0].rotation) // 90 % 4
+
+    def shots(self) -> Iterator[Shot]:
+        """The pictures in order; every call starts anew."""
+        with pyav().open(str(self._path)) as container:
+            stream = container.streams.video[0]
+            start = stream.start_time or 0
+            for frame, after_gap in self._frames(container, stream):
+                ticks = 0 if frame.pts is None else frame.pts - start
+
+                def rgb(frame: Any = frame) -> UInt8[np.ndarray, "height width 3"] | None:
+                    return _upright(frame)
+
+                yield Shot(
+                    time_s=float(ticks * stream.time_base),
+                    after_gap=after_gap,
+                    corrupt=bool(frame.is_corrupt),
+                    rgb=rgb,
+                )
+
+    def _frames(self, container: Any, stream: Any) -> Iterator[tuple[Any, bool]]:
+        """Frames, and whether something before each could not be decoded."""
+        stream.thread_type = "AUTO"
+        packets, failures = container.demux(stream), 0
+        while failures < PATIENCE:
+            try:
+                frames = next(packets).decode()
+            except StopIteration:
+                return
+            except pyav().FFmpegError:
+                failures += 1
+                continue
+            for frame in frames:
+                yield frame, failures > 0
+                failures = 0
+
+
+DEEP = frozenset(
+    {"yuv420p10le", "yuv422p10le", "yuv444p10le", "p010le", "yuv420p12le", "yuv422p12le"}
+)
+"""FFmpeg's names of pictures of more than 8 bits, as phones and cameras write them."""
+
+
+def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"] | None:
+    try:
+        if int(frame.color_trc) in CURVES:
+            rgb = sdr_from_hdr(frame.to_ndarray(format="rgb48le"), int(frame.color_trc))
+        else:
+            rgb = frame.to_ndarray(format="rgb24")
+    except (pyav().FFmpegError, ValueError):
+        return None
+    return np.ascontiguousarray(np.rot90(rgb, int(frame.rotation) // 90))
