@@ -27,6 +27,7 @@ from avatar.rig import Rig
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
+from capture.playback import Playback
 from preprocess.observe import Dropped
 
 CHECKPOINT_EVERY_S = 5.0
@@ -145,9 +146,11 @@ class Lesson:
             OSError: If a checkpoint cannot be written; the one before stays.
         """
         source = self._recording.source
+        self._rush(recall > 0)
         self._inbox = inbox = Inbox(self._frames(), paced=source.paced, live=source.live)
         try:
             added = self._recall(inbox, recall) - self.trainer.frames_seen
+            self._rush(False)
             self._saved_at = time.perf_counter()
             with self._console.bar("learning", self.trainer.config.seconds) as bar:
                 for event in train(self.trainer, inbox, self.held):
@@ -194,6 +197,11 @@ class Lesson:
             curve=tuple(self.curve),
             extended=extended,
         )
+
+    def _rush(self, rushed: bool) -> None:
+        """What a run has seen before is not played again at its own speed."""
+        if isinstance(self._recording.source, Playback):
+            self._recording.source.rushed = rushed
 
     def _frames(self) -> Iterator[Item]:
         """Frames as they become ready; runs on the inbox's thread."""

@@ -51,7 +51,7 @@ class Meter:
         self.latency_s, self.depth = Reservoir(), Reservoir()
         self.behind_s = 0.0
         self.inbox_dropped = 0
-        self._first_time_s = 0.0
+        self._first_time_s = self._began_at = 0.0
         self._there_at: deque[tuple[int, float]] = deque()
 
     def frames(self, frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -62,7 +62,10 @@ class Meter:
             self.lateness_s.add(now - there_at)
             if self.first_at is None:
                 self.first_at, self._first_time_s = there_at, frame.time_s
+                self._began_at = there_at
             self.last_s = max(self.last_s, frame.time_s - self._first_time_s)
+            if frame.due_s is not None:  # a resumed run plays from where it had come to
+                self._began_at = there_at - (frame.time_s - self._first_time_s)
             self.read += 1
             self._there_at.append((frame.index, there_at))
             yield frame
@@ -109,7 +112,7 @@ class Meter:
         """
         ready = None
         if ready_at is not None and self.first_at is not None:
-            ready = ready_at - (self.first_at + self.last_s)
+            ready = ready_at - (self._began_at + self.last_s)
         return StreamNote(
             realtime=self._source.paced,
             ingest_ms=Spread.of(self.prepared_s, scale=1000.0),

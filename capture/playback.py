@@ -16,6 +16,10 @@ class Playback:
     The first frame is at 0; what lies between two frames is what the container says, whatever its
     rate. Nothing is lost: where frames are not taken in time, the playback falls behind and
     catches up as soon as it can.
+
+    Attributes:
+        rushed: Whether frames come as fast as they are taken, as those do that an interrupted run
+            has seen before. Where it ends, the video plays on from there at its own speed.
     """
 
     live = False
@@ -29,6 +33,7 @@ class Playback:
             pace: Its clock; ending it ends the playback, also in the middle of a wait.
         """
         self._source, self._pace = source, pace
+        self.rushed = False
         self.path = source.path
         self.size_px = source.size_px
         self.selection = source.selection
@@ -51,12 +56,12 @@ class Playback:
 
     def frames(self) -> Iterator[Frame]:
         """The frames when they are due, read one ahead; every call plays anew."""
-        began = first = due = None
+        began = due = None
         for frame in self._source.frames():
-            if began is None or first is None or due is None:
-                began = due = self._pace.now()
-                first = frame.time_s
-            due = max(due, began + frame.time_s - first)
+            if began is None or due is None or self.rushed:
+                due = self._pace.now()
+                began = due - frame.time_s
+            due = max(due, began + frame.time_s)
             if not self._pace.until(due):
                 return
             yield replace(frame, due_s=due)

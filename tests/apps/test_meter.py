@@ -94,6 +94,13 @@ def test_ready_counts_from_the_last_frame_as_if_it_had_been_filmed():
     assert meter.note(ready_at=None).ready_after_last_frame_seconds is None
 
 
+def test_ready_counts_on_from_where_a_resumed_run_had_come_to():
+    """Two seconds were read back at once, at 100 s on the clock; the other two were played."""
+    meter = Meter(threading.Event(), Recorded())
+    list(meter.frames(frames([0.0, 1.0, 2.0, 4.0], due=[100.0, 100.0, 100.0, 102.0])))
+    assert meter.note(ready_at=102.5).ready_after_last_frame_seconds == pytest.approx(0.5)
+
+
 def test_ready_may_be_before_the_end_of_a_video_that_is_read_faster_than_it_plays():
     meter = Meter(threading.Event(), Recorded())
     list(meter.frames(frames([0.0, 60.0])))

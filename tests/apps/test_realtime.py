@@ -43,6 +43,16 @@ def test_seconds_beyond_the_clip_are_used_after_it(play, film):
     assert report["frames"]["read"] == 24
 
 
+def test_what_a_resumed_run_saw_before_is_not_played_again(play, film):
+    before = play(film, "--frames", ":12", "--seconds", "0.5")
+    report = play(film, "--seconds", "0.9", "--resume")
+    assert report["frames"]["read"] == 24
+    assert report["frames"]["used"] > before["frames"]["used"]
+    # the first half came at once, before the clock went on: only the other half was waited for
+    assert report["stream"]["ready_after_last_frame_seconds"] > 0.0
+    assert report["stream"]["lateness_ms"]["p50"] < 400.0
+
+
 @pytest.mark.parametrize(
     ("words", "seconds"),
     [({}, 60.0), ({"realtime": True}, 0.8), ({"realtime": True, "seconds": 5.0}, 5.0),
