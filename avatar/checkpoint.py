@@ -38,7 +38,7 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
 
 
 def _state(trainer: Trainer) -> dict[str, Any]:
-    occupancy, field = trainer.avatar.occupancy.grid, trainer.avatar.field
+    occupancy = trainer.avatar.occupancy.grid
     return {
         "format": FORMAT,
         "config": dataclasses.asdict(trainer.config),
@@ -48,7 +48,8 @@ def _state(trainer: Trainer) -> dict[str, Any]:
             )
             for item in dataclasses.fields(Rig)
         },
-        "field": [parameter.detach() for parameter in field.parameters()],
+        "field": [parameter.detach() for parameter in trainer.field.parameters()],
+        "mean": [parameter.detach() for parameter in trainer.avatar.field.parameters()],
         "optimizer": trainer.optimizer.state_dict(),
         "density": occupancy.density,
         "occupied": occupancy.occupied,
@@ -95,10 +96,10 @@ def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
     rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
     trainer = Trainer(rig, TrainConfig(**state["config"]), device)
     with torch.no_grad():
-        for parameter, values in zip(
-            trainer.avatar.field.parameters(), state["field"], strict=True
-        ):
-            parameter.copy_(values)
+        for field, name in ((trainer.field, "field"), (trainer.avatar.field, "mean")):
+            known = state.get(name, state["field"])  # checkpoints of old have no mean
+            for parameter, values in zip(field.parameters(), known, strict=True):
+                parameter.copy_(values)
     trainer.optimizer.load_state_dict(state["optimizer"])
     grid = trainer.avatar.occupancy.grid
     grid.density.copy_(state["density"])

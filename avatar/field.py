@@ -1,5 +1,6 @@
 """The canonical radiance field: a hash grid and a small network, with a hand-written gradient."""
 
+import copy
 import math
 from typing import NamedTuple, final
 
@@ -69,6 +70,16 @@ class Field:
         )
         for parameter in self.parameters():
             parameter.grad = torch.zeros_like(parameter)
+
+    def copied(self) -> "Field":
+        """A field of its own with the same numbers."""
+        other = copy.copy(self)
+        other.table, *other.layers = (
+            torch.nn.Parameter(parameter.detach().clone()) for parameter in self.parameters()
+        )
+        for parameter in other.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        return other
 
     def parameters(self) -> list[torch.nn.Parameter]:
         """The table, then weights and biases of both layers."""

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Float
 
 from avatar.adam import Adam
+from avatar.average import follow
 from avatar.cells import WarpCells
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.field import Field
@@ -39,7 +41,8 @@ class Trainer:
     """Everything that training changes, and one step of it.
 
     Attributes:
-        avatar: As it stands.
+        avatar: As it stands and is shown; its field is the running mean of `field`.
+        field: What steps change.
         config: The recipe.
         sampler: Where samples lie along rays.
         replay: The frames it learns from.
@@ -62,11 +65,12 @@ class Trainer:
             levels=config.levels, table_size=config.table_size,
         )  # fmt: skip
         start = torch.Generator().manual_seed(config.seed)
-        field = Field(levels, self.backend, device, start)
-        self.avatar = Avatar(
-            rig=rig, field=field, occupancy=Occupancy(rig, device), step_m=config.step_m
+        self.field = Field(levels, self.backend, device, start)
+        learner = Avatar(
+            rig=rig, field=self.field, occupancy=Occupancy(rig, device), step_m=config.step_m
         )
-        self.sampler = sampler_for(config, self.avatar)
+        self.sampler = sampler_for(config, learner)
+        self.avatar = replace(learner, field=self.field.copied())
         self.replay = Replay(config.key_frames, device)
         self.poses = PoseTable(rig, config.key_frames, device)
         self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
@@ -77,8 +81,8 @@ class Trainer:
         rate = config.learning_rate
         self.optimizer = Adam(
             [
-                {"params": [field.table], "lr": rate, "eps": 1e-15},
-                {"params": field.layers, "lr": rate * NETWORK_RATE},
+                {"params": [self.field.table], "lr": rate, "eps": 1e-15},
+                {"params": self.field.layers, "lr": rate * NETWORK_RATE},
             ],
             betas=(0.9, 0.99),
             fused=True,
@@ -122,7 +126,7 @@ class Trainer:
             rate: Factor of the learning rates, in (0, 1].
             hard_share: Share of the hard-surface loss's weight, in [0, 1].
         """
-        config, field = self.config, self.avatar.field
+        config, field = self.config, self.field
         batch = self.replay.draw(config.rays, self._generator)
         remembers = self.steps % config.occupancy_every < 2
         refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
@@ -145,6 +149,7 @@ class Trainer:
             self._update_occupancy()
         self.sampler.update(self.steps, self.replay.cells, self._generator)
         self.steps += 1
+        follow(self.avatar.field, field, self.steps)
         self.rays += config.rays
         self.samples += result.samples
         return result
@@ -165,7 +170,7 @@ class Trainer:
     def _update_occupancy(self) -> None:
         clearing = self.steps < CLEARING_STEPS
         self.avatar.occupancy.update(
-            lambda points: self.avatar.field.raw_at(points)[:, 3],
+            lambda points: self.field.raw_at(points)[:, 3],
             share=0.5 if clearing else 0.25,
             decay=FIRST_DECAY if clearing else DECAY,
             drop_specks=not clearing,

@@ -58,7 +58,8 @@ def numbers(trainer):
     grid = trainer.avatar.occupancy.grid
     moments = [t for state in trainer.optimizer.state_dict()["state"].values() for t in
                (state["exp_avg"], state["exp_avg_sq"], state["step"])]  # fmt: skip
-    return [*trainer.avatar.field.parameters(), grid.density, grid.occupied, *moments]
+    fields = [*trainer.field.parameters(), *trainer.avatar.field.parameters()]
+    return [*fields, grid.density, grid.occupied, *moments]
 
 
 def test_what_is_read_is_what_was_written_to_the_last_bit(trainer, tmp_path):
@@ -206,3 +207,9 @@ def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change
 
     with pytest.raises(BadInput, match=str(saved)):
         checkpoint.load(damaged(saved, lose), CPU)
+
+
+def test_a_checkpoint_from_before_there_was_a_mean_shows_what_was_learnt(saved, trainer):
+    again, _ = checkpoint.load(damaged(saved, lambda state: state.pop("mean")), CPU)
+    shown = zip(again.avatar.field.parameters(), trainer.field.parameters(), strict=True)
+    assert all(torch.equal(ours, theirs) for ours, theirs in shown)
