@@ -85,7 +85,7 @@ def serve(files: Mapping[str, bytes], port: int, console: Console) -> None:
     Raises:
         BadInput: If no port is free.
     """
-    server = _server(files, port)
+    server = server_of(files, port)
     address = f"http://{HOST}:{server.server_port}"
     with ended_by_ctrl_c() as ended:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -96,7 +96,12 @@ def serve(files: Mapping[str, bytes], port: int, console: Console) -> None:
     server.server_close()
 
 
-def _server(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
+def server_of(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
+    """A server of these files on this machine's own address, not running yet.
+
+    Raises:
+        BadInput: If neither this port nor one of the next ones is free.
+    """
     for tried in range(port, min(port + PORTS, 1 << 16)):
         try:
             return _Server((HOST, tried), _handler(files))

@@ -100,6 +100,11 @@ class Browser:
         data = self._ask("Page.captureScreenshot", format="png")["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
+    def cpu_seconds(self) -> float:
+        """CPU time that all of its processes have spent so far."""
+        processes = self._ask("SystemInfo.getProcessInfo", whole=True)["processInfo"]
+        return sum(process["cpuTime"] for process in processes)
+
     def emulate(self, *, scheme: str, size: tuple[int, int]) -> None:
         """A device's size, and whether its owner likes it dark."""
         preference = {"name": "prefers-color-scheme", "value": scheme}
@@ -125,10 +130,13 @@ class Browser:
             held = {"button": "left", "buttons": 1, "clickCount": 1}
             self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
 
-    def _ask(self, method: str, *, seconds: float = 60.0, **parameters: Any) -> dict[str, Any]:
+    def _ask(
+        self, method: str, *, seconds: float = 60.0, whole: bool = False, **parameters: Any
+    ) -> dict[str, Any]:
+        """Asks the page, or the whole browser."""
         number = next(self._numbers)
         question = {"id": number, "method": method, "params": parameters}
-        if self._session:
+        if self._session and not whole:
             question["sessionId"] = self._session
         os.write(self._says, json.dumps(question).encode() + b"\0")
         end = time.perf_counter() + seconds

@@ -1,6 +1,7 @@
 """The avatar in a browser: served, written to a folder, and driven as a person would."""
 
 import http.client
+import json
 import re
 import signal
 import subprocess
@@ -189,6 +190,41 @@ def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
+def test_a_gpu_that_goes_away_leaves_the_drawing_to_the_cpu(page):
+    if not page.run("player.graphics.there"):
+        pytest.skip("this Chromium has no WebGL2 with float targets")
+    drawn_by = page.run(
+        """(async () => {
+          const { Orbit } = await import("./orbit.js");
+          const { Show } = await import("./show.js");
+          const canvas = document.createElement("canvas");
+          document.body.append(canvas);
+          const state = { engine: "webgl", tier: "never opened", sharpness: "360", speed: 1 };
+          const opened = [];
+          const patched = Object.create(player, { open: { value: (wanted) => {
+            opened.push(wanted.engine);
+            state.tier = "hq";
+            return player.open({ ...wanted, tier: "hq" });
+          } } });
+          let show;
+          const shown = new Promise((resolve) => {
+            show = new Show(canvas, patched, new Orbit(player.avatar.look), state, (news) => {
+              if (news.row !== undefined) resolve();
+            });
+          });
+          show.run();
+          await shown;
+          canvas.remove();
+          return [...opened, state.engine];
+        })()""",
+        seconds=120.0,
+    )
+    assert drawn_by == ["wasm", "wasm"]
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
 def test_nothing_came_from_anywhere_else(page, served):
     names = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
     assert len(names) > 5
@@ -200,8 +236,12 @@ def test_nothing_came_from_anywhere_else(page, served):
 @pytest.mark.slow
 def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
     """Python's own server stands for any static host; without --poses the avatar turns round."""
-    outcome = call_play(package, "--web", "--out", tmp_path / "host" / "people" / "somebody")
+    out = tmp_path / "host" / "people" / "somebody"
+    outcome = call_play(package, "--web", "--out", out)
     assert outcome.code == 0
+    told = json.loads((out / "avatar.json").read_text())
+    told["tiers"]["other"] = told["tiers"]["hq"]
+    (out / "avatar.json").write_text(json.dumps(told))
     host = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"]
     with subprocess.Popen(
         host, cwd=tmp_path / "host", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -209,9 +249,16 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
         address = re.search(r"http://\S+", process.stdout.readline()).group(0)
         try:
             with Browser(tmp_path / "browser", size=SIZE) as browser:
+                browser.emulate(scheme="light", size=SIZE)
                 browser.go(f"{address.rstrip('/').rstrip(')')}/people/somebody/")
                 until(lambda: browser.run("!!window.player"), 120.0)
                 until(lambda: drawn(browser).mean() > 0.03, 60.0)
+                paused(browser)
+                before = browser.picture()
+                browser.run("document.querySelector('#tiers input[value=other]').click()")
+                until(lambda: browser.run("document.getElementById('status').hidden"), 60.0)
+                until(lambda: not moves(browser), 30.0)
+                np.testing.assert_array_equal(browser.picture()[STAGE], before[STAGE])
         finally:
             process.terminate()
 

@@ -46,7 +46,7 @@ const SOFTWARE = /swiftshader|llvmpipe|software|basic render|softpipe/i;
 
 /** Whether there is WebGL2 with float targets, and whether hardware is behind it. */
 export function graphics() {
-  const gl = document.createElement("canvas").getContext("webgl2");
+  const gl = typeof OffscreenCanvas !== "undefined" && document.createElement("canvas").getContext("webgl2");
   if (!gl || !gl.getExtension("EXT_color_buffer_float")) return { there: false, hardware: false };
   const told = gl.getExtension("WEBGL_debug_renderer_info");
   const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);

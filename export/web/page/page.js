@@ -29,8 +29,8 @@ export async function start() {
   window.player = player; // for scripts: verify(), measure()
   show.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
   markPlaying(state);
-  show.run();
   loading.done();
+  show.run().catch((error) => loading.failed(error.message));
 }
 
 /** What is shown while a tier is being loaded. */
@@ -65,8 +65,9 @@ class Loading {
   }
 }
 
-function tell({ failed, row, ms, rate, playing }, player, loading) {
+function tell({ failed, fallback, row, ms, rate, playing }, player, loading) {
   if (failed) return loading.failed(failed.message);
+  if (fallback) return markEngine("wasm");
   const second = (value) => (value / player.fps).toFixed(1);
   $("timeline").value = row;
   $("time").textContent = `${second(row)} / ${second(player.count)} s`;
@@ -158,6 +159,10 @@ function save(name, show) {
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   });
+}
+
+function markEngine(engine) {
+  for (const input of $("engines").querySelectorAll("input")) input.checked = input.value === engine;
 }
 
 function markPlaying({ playing }) {

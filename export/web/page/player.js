@@ -8,6 +8,7 @@ import { Skeleton, bones } from "./skeleton.js";
 
 const CLOSE = 2; // two pictures are alike where no premultiplied channel differs by more, in 1/255 …
 const ALIKE = 0.999; // … on at least this share of the pixels
+const PATIENCE_MS = 20000; // for a GPU's driver to compile the shaders
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
 export class Player {
@@ -42,7 +43,9 @@ export class Player {
   async best() {
     if (!this.graphics.hardware) return "wasm";
     try {
-      return (await this.verify("webgl")).every((each) => each.alike) ? "webgl" : "wasm";
+      const late = new Promise((_, reject) => { setTimeout(reject, PATIENCE_MS, new Error("it takes too long")); });
+      const found = await Promise.race([this.verify("webgl"), late]);
+      return found.every((each) => each.alike) ? "webgl" : "wasm";
     } catch (error) {
       console.warn("The GPU is not used:", error);
       return "wasm";

@@ -43,10 +43,19 @@ export class Show {
       try {
         await this.picture(this.size());
       } catch (error) {
-        this.told({ failed: error });
-        return;
+        if (!(await this.recovered())) return this.told({ failed: error });
       }
     }
+  }
+
+  /** A GPU that was taken away leaves the drawing to the CPU. */
+  async recovered() {
+    if (this.state.engine === "wasm") return false;
+    this.state.engine = "wasm";
+    await this.player.open(this.state);
+    this.told({ fallback: true });
+    this.changed();
+    return true;
   }
 
   /** Waits until something happens; true when it is time for the sharp picture. */

@@ -1,0 +1,112 @@
+"""The player in a browser against the player outside of it, by the same graph.
+
+    python -m benchmarks.browser AVATAR [--rounds 5]
+
+Draws the same 24 pictures of 540 px natively and in headless Chromium (WebAssembly, one thread), in
+turns. A loaded machine lengthens wall time; so CPU time is given as well, of Chromium with all its
+processes. Shaders are not measured: without a GPU they would say nothing.
+"""
+
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from tyro.conf import Positional
+
+from apps.exit_codes import exit_code
+from apps.follow import FollowingCamera
+from apps.novel import novel_motion
+from apps.web import clip_of, server_of
+from benchmarks.hardware import Hardware
+from benchmarks.marks import Mark, table
+from benchmarks.stopwatch import use_threads
+from export.player import Player
+from export.web.site import site
+from preprocess.pose import Motion
+from tests.apps.browser import Browser, until
+
+SIZE_PX = 540
+FRAMES = 24
+
+
+def main() -> int:
+    """The benchmark; returns its exit code."""
+
+    def compared(avatar: Annotated[Path, Positional], rounds: int = 5) -> int:
+        return exit_code("benchmarks.browser", lambda: compare(avatar, rounds))
+
+    return tyro.cli(compared, prog="python -m benchmarks.browser", description=__doc__)
+
+
+def compare(package: Path, rounds: int) -> int:
+    """Measures and prints."""
+    use_threads(1)
+    player, motion = Player.load(package), novel_motion(FRAMES)
+    clip = clip_of(player, motion, tuple(range(FRAMES)), 16.0)
+    server = server_of(site(package, clip, name="benchmark", level=1), 8090)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    found: list[tuple[float, float, float]] = []
+    with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
+        browser.go(f"http://127.0.0.1:{server.server_port}/")
+        until(lambda: browser.run("!!window.player"), 120.0)
+        browser.run("document.querySelector('#play.playing')?.click()")
+        browser_ms(browser)  # the browser compiles again what it finds hot
+        for _ in range(rounds):
+            found.append((native_ms(player, motion), *browser_ms(browser)))
+            told = "native {:.1f} CPU-ms; browser {:.1f} wall, {:.1f} CPU".format(*found[-1])
+            print(told, file=sys.stderr, flush=True)
+    server.shutdown()
+    server.server_close()
+    print("\n".join([*Hardware.here().lines(), "", *table(marks(np.array(found)))]))
+    return 0
+
+
+def native_ms(player: Player, motion: Motion) -> float:
+    """CPU time of a picture on onnxruntime's own terms."""
+    camera = FollowingCamera.of(player, motion, SIZE_PX)
+    began = time.process_time()
+    for row in range(FRAMES):
+        player.render(motion[row], camera.at(motion[row]))
+    return 1000.0 * (time.process_time() - began) / FRAMES
+
+
+def browser_ms(browser: Browser) -> tuple[float, float]:
+    """Wall time (median) and CPU time (mean) of a picture in the browser."""
+    before = browser.cpu_seconds()
+    asked = f"player.measure({{size: {SIZE_PX}, frames: {FRAMES}}})"
+    times = browser.run(asked, seconds=300.0)
+    spent = browser.cpu_seconds() - before
+    return float(np.median(times)), 1000.0 * spent / FRAMES
+
+
+def marks(found: Float[np.ndarray, "rounds 3"]) -> list[Mark]:
+    """The table's rows."""
+    native, wall, cpu = np.median(found, axis=0)
+    rounds = f"median of {len(found)} rounds of {FRAMES} pictures of {SIZE_PX} px"
+    return [
+        Mark(name="native, CPU-ms a picture", value=native, beside=rounds),
+        Mark(name="browser, wall-ms a picture", value=wall, beside="as long as others let it wait"),
+        Mark(name="browser, CPU-ms a picture", value=cpu, beside="all of Chromium's processes"),
+        Mark(
+            name="browser's wall by native CPU",
+            value=float(np.median(found[:, 1] / found[:, 0])),
+            least="≤ 2",
+            moonshot="≤ 1.3",
+            beside="what was asked for, on a quiet machine",
+        ),
+        Mark(
+            name="browser's CPU by native CPU",
+            value=float(np.median(found[:, 2] / found[:, 0])),
+            beside="the same without waiting",
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
