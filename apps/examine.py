@@ -8,7 +8,7 @@ from apps.recording import Recording, RecordingPaths
 from capture.errors import BadInput
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.diagnosis import GOOD, USABLE, Diagnosis, diagnose, mean
-from preprocess.doctor.evidence import Evidence, gather
+from preprocess.doctor.evidence import FRAMES, Evidence, gather
 from preprocess.doctor.mistakes import shifted
 from preprocess.doctor.soundness import unsound
 from preprocess.observe import check_cameras, check_masks
@@ -124,12 +124,13 @@ def looks_well(recording: Recording) -> bool:
     return now >= GOOD and now >= max(shifts)
 
 
-def _evidence(recording: Recording, count: int | None = None) -> Evidence:
+def _evidence(recording: Recording, count: int = FRAMES) -> Evidence:
     mask_row = check_masks(recording.masks, recording.source)
     camera_row = check_cameras(recording.cameras, recording.source)
-    more = {} if count is None else {"count": count}
-    skin = SkinPoints.of(recording.shaped)
-    return gather(recording.source, recording.masks, mask_row, camera_row, skin, **more)
+    return gather(
+        recording.source, recording.masks, mask_row, camera_row, SkinPoints.of(recording.shaped),
+        count=count, without=recording.cameras.missing,
+    )  # fmt: skip
 
 
 def _claim(recording: Recording) -> Claim:

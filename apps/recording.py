@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture.camera import Camera
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -17,6 +18,7 @@ from capture.video import turned_by
 from preprocess.body import Body, ShapedBody
 from preprocess.camera_file import CameraTrack, default_cameras, read_cameras, upright_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
+from preprocess.doctor.claim import Claim
 from preprocess.live import LiveParts
 from preprocess.masks import Masks, open_masks
 from preprocess.observation import Observation
@@ -24,8 +26,9 @@ from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
+from preprocess.refit import refit_to_masks
 from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
-from preprocess.shape import betas_for
+from preprocess.shape import shaped_for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +120,9 @@ class Recording:
             cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source))
         else:
             cameras = default_cameras(motion, source.size_px)
-        shaped = body.with_shape(betas_for(body, motion))
+        shaped = shaped_for(body, motion)
         motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
+        shaped, motion, fitted = refit_to_masks(motion, shaped, cameras, source, masks)
         estimated = named or (OURS if masks is None and not source.has_alpha else None)
         recording = cls(
             paths=paths,
@@ -128,7 +132,7 @@ class Recording:
             cameras=cameras,
             shaped=shaped,
             size_px=size_px,
-            notes=tuple(_notes(body, motion, masks, cameras, segment=estimated)),
+            notes=tuple(_notes(body, motion, masks, cameras, segment=estimated, fitted=fitted)),
             segment=None if estimated is None else make_segmenter(estimated, shaped),
         )
         if not doubtful:
@@ -158,7 +162,7 @@ class Recording:
             motion=motion,
             masks=None,
             cameras=cameras,
-            shaped=body.with_shape(betas_for(body, motion)),
+            shaped=shaped_for(body, motion),
             size_px=size_px,
             notes=tuple(_notes(body, motion, None, cameras)),
             live=live,
@@ -198,6 +202,11 @@ class Recording:
         source = "alpha channel" if self.masks is None else self.masks.path.name
         return {"masks": source, "mask_agreement": None}
 
+    def camera_of_row(self, row: int) -> Camera:
+        """The camera that sees one of the poses."""
+        claim = Claim.of(self.motion, self.cameras, self.source)
+        return self.cameras[int(claim.camera_rows()[row])]
+
     def played(self) -> "Recording":
         """The same, its frames coming at their own times."""
         return replace(self, source=Playback(self.source, Pace()))
@@ -208,10 +217,12 @@ class Recording:
         Raises:
             BadInput: If the person is behind the camera.
         """
-        pelvis = self.shaped.joints[0] + self.motion.root_translations[self.motion.valid]
+        claim = Claim.of(self.motion, self.cameras, self.source)
+        valid = self.motion.valid
+        pelves = self.shaped.joints[0] + self.motion.root_translations[valid]
+        forward = claim.extrinsics[claim.camera_rows()[valid], 2]  # of the camera that sees each
+        depth = float(np.median((pelves * forward[:, :3]).sum(axis=1) + forward[:, 3]))
         camera = self.cameras[0]
-        depths = pelvis @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-        depth = float(np.median(depths))
         if depth <= 0.0:
             raise BadInput(
                 f"The person is {-depth:.2f} m behind the camera; poses were expected in the "
@@ -230,6 +241,7 @@ def _notes(
     cameras: CameraTrack,
     *,
     segment: str | None = None,
+    fitted: str = "",
 ) -> Iterator[str]:
     if motion.note is not None:
         yield motion.note
@@ -245,7 +257,7 @@ def _notes(
     if motion.model != body.family:
         yield (
             f"The poses were made for the body model {motion.model!r}, but {body.family!r} is used "
-            "(--body): the shape is the mean one, and the joints sit a few centimetres off."
+            f"(--body), with joints where the mean shape has them. {fitted}".strip()
         )
     lost = len(motion) - int(motion.valid.sum())
     if lost:

@@ -1,10 +1,24 @@
-"""Which shape coefficients a motion gives a body."""
+"""Which shape a motion gives a body."""
+
+import json
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.body import Body
+from preprocess.body import Body, ShapedBody
 from preprocess.pose import Motion
+
+
+def shaped_for(body: Body, motion: Motion) -> ShapedBody:
+    """The person that a motion's tracker had in mind, as nearly as the body allows.
+
+    A body that is not SMPL's takes the rest joints of SMPL's mean shape if the poses are SMPL's:
+    then its joints move exactly as SMPL's do. Its skin goes along, each vertex with its joints.
+    """
+    shaped = body.with_shape(betas_for(body, motion))
+    return shaped if body.family == "smpl" or motion.model == body.family else on_smpl(shaped)
 
 
 def betas_for(body: Body, motion: Motion) -> Float[np.ndarray, "betas"]:
@@ -15,3 +29,21 @@ def betas_for(body: Body, motion: Motion) -> Float[np.ndarray, "betas"]:
     if motion.model == body.family:
         return motion.betas
     return np.zeros(body.shape_directions.shape[-1])
+
+
+def on_smpl(shaped: ShapedBody) -> ShapedBody:
+    """The body with its joints where SMPL's mean shape has them, its pelvis where it was.
+
+    The limbs rest in the same directions (see data/LICENSE-body24.md): what changes is mostly how
+    long they are.
+    """
+    joints = smpl_joints() - smpl_joints()[0] + shaped.joints[0]
+    moved = shaped.body.weights @ (joints - shaped.joints)
+    return ShapedBody(body=shaped.body, vertices=shaped.vertices + moved, joints=joints)
+
+
+@cache
+def smpl_joints() -> Float[np.ndarray, "24 3"]:
+    """Rest joints of SMPL's mean shape, metres (public; see data/LICENSE-body24.md)."""
+    text = (files("preprocess") / "data" / "smpl_rest_joints.json").read_text(encoding="utf-8")
+    return np.array(json.loads(text)["neutral"], dtype=np.float64)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from capture.camera import Camera
 from capture.source import Source
@@ -54,6 +54,16 @@ class Claim:
         away = np.where(self.motion.valid, np.abs(self.places - frame), np.inf)
         row = int(np.argmin(away))
         return row if away[row] <= reach else None
+
+    def camera_rows(self) -> Int[np.ndarray, "poses"]:
+        """Which camera sees each pose."""
+        numbers = np.nan_to_num(self.places).round().astype(np.int64)
+        return numbers.clip(0, len(self.extrinsics) - 1)
+
+    def eyes(self) -> Float[np.ndarray, "cameras 3"]:
+        """Where the cameras stand in the world."""
+        turned, moved = self.extrinsics[:, :3, :3], self.extrinsics[:, :3, 3]
+        return -np.einsum("cba,cb->ca", turned, moved)
 
     def camera(self, row: int, size_px: tuple[int, int]) -> Camera:
         """One camera, for pictures of another size of the same shape."""

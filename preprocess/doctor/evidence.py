@@ -100,6 +100,7 @@ def gather(
     skin: SkinPoints,
     *,
     count: int = FRAMES,
+    without: frozenset[int] = frozenset(),
 ) -> Evidence:
     """Reads a few masks; pictures are decoded only where the masks are in them.
 
@@ -110,12 +111,15 @@ def gather(
         camera_row: From a frame's number to its camera.
         skin: The person.
         count: How many frames are looked at.
+        without: Frames that cannot be used.
 
     Raises:
         BadInput: If no mask shows anybody.
     """
     start, step = source.selection.start, source.selection.step
-    frames = [start + step * n for n in spread(source.frame_count or 1, count)]
+    usable = [start + step * n for n in range(source.frame_count or 1)]
+    usable = [frame for frame in usable if frame not in without] or usable
+    frames = [usable[n] for n in spread(len(usable), count)]
     full = source.size_px
     size_px = _fitted(full, FIRST_LOOK_PX)
     if masks is None:

@@ -113,7 +113,7 @@ def rescaled(factor: float, pelvis: Float[np.ndarray, "3"]) -> Cure:
     """
 
     def undo(claim: Claim) -> Claim:
-        eyes = _eyes(claim)
+        eyes = claim.eyes()
         fixed = eyes.mean(axis=0) if np.ptp(eyes, axis=0).max() < 1e-3 else np.zeros(3)
         pelves = pelvis + claim.motion.root_translations
         moved = fixed + (pelves - fixed) / factor
@@ -297,21 +297,9 @@ def _with_root(claim: Claim, roots: Float[np.ndarray, "poses 3 3"]) -> Claim:
     return replace(claim, motion=replace(claim.motion, root_rotations=vectors))
 
 
-def _eyes(claim: Claim) -> Float[np.ndarray, "cameras 3"]:
-    """Where the cameras stand in the world."""
-    return -np.einsum("cba,cb->ca", claim.extrinsics[:, :3, :3], claim.extrinsics[:, :3, 3])
-
-
 def _camera_turns(claim: Claim) -> Float[np.ndarray, "poses 3 3"]:
     """Rotation from the world into the camera of each row."""
-    if len(claim.extrinsics) == 1:
-        return np.broadcast_to(claim.extrinsics[:, :3, :3], (len(claim.places), 3, 3))
-    return claim.extrinsics[_camera_rows(claim), :3, :3]
-
-
-def _camera_rows(claim: Claim) -> np.ndarray:
-    places = np.nan_to_num(claim.places).round().astype(np.int64)
-    return places.clip(0, len(claim.extrinsics) - 1)
+    return claim.extrinsics[claim.camera_rows(), :3, :3]
 
 
 def _turned_in_place(claim: Claim, turn: Rotation3) -> Claim:
@@ -322,7 +310,7 @@ def _turned_in_place(claim: Claim, turn: Rotation3) -> Claim:
 
 def _placed(claim: Claim, change: Rotation3) -> Claim:
     """The root's place changed in the camera's axes; its rotation stays."""
-    rows = _camera_rows(claim) if len(claim.extrinsics) > 1 else np.zeros(len(claim.places), int)
+    rows = claim.camera_rows()
     turned, moved = claim.extrinsics[rows, :3, :3], claim.extrinsics[rows, :3, 3]
     translations = claim.motion.root_translations
     seen = np.einsum("cab,cb->ca", turned, translations) + moved

@@ -50,11 +50,7 @@ def views(claim: Claim) -> float:
     """Share of the directions around the body from which a camera sees it, in twelve sectors."""
     valid = claim.motion.valid
     roots = Rotation.from_rotvec(claim.motion.root_rotations[valid])
-    rows = np.zeros(len(claim.places), dtype=np.int64)
-    if len(claim.extrinsics) > 1:
-        rows = np.nan_to_num(claim.places).astype(np.int64).clip(0, len(claim.extrinsics) - 1)
-    turned, moved = claim.extrinsics[rows[valid], :3, :3], claim.extrinsics[rows[valid], :3, 3]
-    eyes = -np.einsum("cba,cb->ca", turned, moved)
+    eyes = claim.eyes()[claim.camera_rows()[valid]]
     seen = roots.inv().apply(eyes - claim.motion.root_translations[valid])
     sector = np.floor((np.arctan2(seen[:, 0], seen[:, 2]) / (2.0 * np.pi) + 0.5) * SECTORS)
     return len(np.unique(sector.clip(0, SECTORS - 1))) / SECTORS
