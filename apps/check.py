@@ -176,7 +176,10 @@ def _say(examined: Examined, console: Console) -> None:
     if examined.refused is not None:
         console.say(f"ia-ingest would refuse it: {examined.refused}")
     if examined.diagnosis is None:
-        console.say("There are no masks, so nobody can say whether the poses fit the pictures.")
+        console.say(
+            "There are no masks to hold the body against (ia-ingest estimates some from the poses "
+            "themselves), so nobody can say whether the poses fit the pictures."
+        )
         return
     console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1).")
     for cure in examined.diagnosis.cures:

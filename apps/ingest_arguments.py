@@ -59,8 +59,8 @@ class IngestArguments:
     no_mask_invert: Flag = False
     """The person is bright in the masks."""
     cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """A cameras.npz (intrinsic, extrinsic: one, or one a frame), or `static`: it never moved and
-    nobody knows its focal length."""
+    """A cameras.npz (intrinsic, extrinsic: one, or one a frame), a COLMAP model, a transforms.json,
+    Record3D's or Polycam's export; or `static`: never moved, and its focal length is unknown."""
     body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Your own SMPL body, .npz or .pkl (nothing in it is executed); else the embedded body."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None

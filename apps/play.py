@@ -49,7 +49,7 @@ class PlayArguments:
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Whose poses, where the file holds several people's; without it whoever has most."""
     camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """A cameras.npz to look through (one camera, or one for each pose)."""
+    """Cameras to look through, as ia-ingest takes them: one, or one for each pose."""
     out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
     """Clip to write (.webm, .mp4, .gif), or a folder for RGBA frames 0000.png …; without it a
     .webm beside the package, named after the poses. With --web: a folder for the page."""
@@ -249,7 +249,11 @@ def _cameras_from(
 
 def _picture_size(path: Path) -> tuple[int, int]:
     """Width and height that a camera file belongs to; twice its principal point if it is silent."""
+    from preprocess.cameras.door import read_named
     from preprocess.npz import read_npz
+
+    if path.suffix != ".npz":
+        return read_named(path)[0].camera.size_px
 
     arrays = read_npz(path, ("width", "height", "intrinsic"))
     if {"width", "height"} <= arrays.keys():

@@ -117,7 +117,7 @@ class Recording:
         if paths.masks is not None:
             masks = open_masks(paths.masks, invert=wanted.mask_invert)
         if paths.cameras is not None:
-            cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source))
+            cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source), source)
         else:
             cameras = default_cameras(motion, source.size_px)
         shaped = shaped_for(body, motion)

@@ -66,4 +66,4 @@ def views_of(held: list[HeldOut], recording: Recording) -> Sequence[View]:
         return [(observation.pose, observation.camera) for observation in seen]
     row = int(np.flatnonzero(recording.motion.valid)[0])
     size = shrunk(recording.source.size_px, recording.size_px)
-    return [(recording.motion[row], recording.cameras[0].resized(size))]
+    return [(recording.motion[row], recording.camera_of_row(row).resized(size))]

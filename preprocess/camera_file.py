@@ -1,6 +1,6 @@
-"""Cameras from files: InstantAvatar's cameras.npz, one for all frames or one for each."""
+"""Cameras of a capture: InstantAvatar's cameras.npz, other programs' files, or none at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +8,9 @@ from jaxtyping import Float, Shaped
 
 from capture.camera import Camera
 from capture.errors import BadInput
+from capture.source import Source
+from preprocess.cameras.door import read_named
+from preprocess.cameras.matching import bridged, by_frame
 from preprocess.masks import same_shape
 from preprocess.npz import read_npz
 from preprocess.pose import Lens, Motion
@@ -24,11 +27,13 @@ class CameraTrack:
         cameras: One for all frames, or one for each in order.
         source: Where they come from, in words for the report.
         note: What was changed to make them fit, if anything.
+        missing: Frames that have no camera of their own, and cannot be used.
     """
 
     cameras: tuple[Camera, ...]
     source: str
     note: str | None = None
+    missing: frozenset[int] = frozenset()
 
     @property
     def moves(self) -> bool:
@@ -40,21 +45,25 @@ class CameraTrack:
         return self.cameras[frame_index if self.moves else 0]
 
 
-def read_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
-    """Reads an .npz: intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each.
+def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = None) -> CameraTrack:
+    """Reads cameras: an .npz of ours, or what COLMAP, nerfstudio, Record3D or Polycam wrote.
 
-    Optional: height and width (of the pictures that the matrices belong to), distortion (OpenCV's
+    The .npz holds intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each; optional:
+    height and width (of the pictures that the matrices belong to), distortion (OpenCV's
     coefficients). Cameras of another size and the same shape are scaled to `size_px`.
+
+    Args:
+        path: File or folder.
+        size_px: Width and height of the frames.
+        source: The frames, whose names or number tell which camera is whose. Without it cameras
+            of other programs are taken in order.
 
     Raises:
         BadInput: If there is no such file, or it holds no such cameras, or their pictures had
             another aspect ratio.
     """
     if path.is_dir() or path.suffix != ".npz":
-        raise BadInput(
-            f"{path}: cameras are read from a cameras.npz (intrinsic, extrinsic, height, width); "
-            "other formats are not read yet."
-        )
+        return _foreign(path, size_px, source)
     arrays = read_npz(path)
     if "intrinsic" not in arrays:
         found = ", ".join(sorted(arrays)) or "nothing"
@@ -91,7 +100,9 @@ def read_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
     return CameraTrack(cameras=cameras, source=path.name, note=note)
 
 
-def upright_cameras(path: Path, size_px: tuple[int, int], quarter_turns: int) -> CameraTrack:
+def upright_cameras(
+    path: Path, size_px: tuple[int, int], quarter_turns: int, source: Source | None = None
+) -> CameraTrack:
     """The cameras of a video whose stored pictures are turned to stand upright.
 
     Cameras that were made for the pictures as they are stored are turned with them; which they were
@@ -101,20 +112,54 @@ def upright_cameras(path: Path, size_px: tuple[int, int], quarter_turns: int) ->
         path: See `read_cameras`.
         size_px: Of the upright frames.
         quarter_turns: How often stored pictures are turned by 90° against the clock.
+        source: The frames; see `read_cameras`.
 
     Raises:
         BadInput: As `read_cameras`.
     """
     try:
-        return read_cameras(path, size_px)
+        return read_cameras(path, size_px, source)
     except BadInput:
         if quarter_turns % 2 == 0:
             raise
-        lying = read_cameras(path, (size_px[1], size_px[0]))
-    return CameraTrack(
+        lying = read_cameras(path, (size_px[1], size_px[0]), source)
+    return replace(
+        lying,
         cameras=tuple(camera.turned(quarter_turns) for camera in lying.cameras),
-        source=lying.source,
         note=f"The cameras in {path.name} were turned with the video, by its rotation flag.",
+    )
+
+
+def _foreign(path: Path, size_px: tuple[int, int], source: Source | None) -> CameraTrack:
+    """Cameras of other programs, one for every frame."""
+    found = read_named(path)
+    stored = {each.camera.size_px for each in found}
+    for size in stored:
+        if not same_shape(size, size_px):
+            raise _other_shape(path, size, size_px)
+    frames = {number: each.camera for number, each in enumerate(found)}
+    if source is not None:
+        frames = by_frame(found, source, path)
+    total = len(found) if source is None else source.frames_in_file
+    cameras, missing = bridged(frames, total)
+    notes = []
+    if stored != {size_px}:
+        sizes = ", ".join(f"{width}x{height}" for width, height in sorted(stored))
+        notes.append(
+            f"The cameras in {path.name} belong to {sizes} px and were scaled to the video's "
+            f"{size_px[0]}x{size_px[1]}."
+        )
+    between = total - len(frames) - len(missing)
+    if between > 0 or missing:
+        notes.append(
+            f"Of {total} frames {len(frames)} have a camera in {path.name}; {between} were "
+            f"interpolated, {len(missing)} are left out."
+        )
+    return CameraTrack(
+        cameras=tuple(camera.resized(size_px) for camera in cameras),
+        source=path.name,
+        note=" ".join(notes) or None,
+        missing=missing,
     )
 
 
@@ -199,12 +244,16 @@ def _stored_size(
     except (ValueError, TypeError, IndexError) as cause:
         raise BadInput(f"`width` and `height` in {path} are no numbers of pixels.") from cause
     if min(stored) < 1 or not same_shape(stored, size_px):
-        raise BadInput(
-            f"The cameras in {path} belong to pictures of {stored[0]}x{stored[1]} px, the video "
-            f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated or "
-            "cropped, change the cameras with it."
-        )
+        raise _other_shape(path, stored, size_px)
     return stored
+
+
+def _other_shape(path: Path, stored: tuple[int, int], size_px: tuple[int, int]) -> BadInput:
+    return BadInput(
+        f"The cameras in {path} belong to pictures of {stored[0]}x{stored[1]} px, the video "
+        f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated or "
+        "cropped, change the cameras with it."
+    )
 
 
 def _distortion(arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path) -> tuple[float, ...]:

@@ -12,6 +12,10 @@ MASKS = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
 """Names under which masks lie in a capture folder."""
 
 
+CAMERAS = ["cameras.npz", "transforms.json", "sparse"]
+"""Where cameras are looked for, in this order."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CapturePaths:
     """The parts of a capture.
@@ -67,7 +71,7 @@ def find_capture(
     inside = video.is_dir() and video.name != "images"
     places = [video if inside else video.parent, poses.parent]
     if cameras is None:
-        cameras = _first(places, ["cameras.npz"])
+        cameras = _first(places, CAMERAS)
     return CapturePaths(
         video=video,
         poses=poses,

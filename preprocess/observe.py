@@ -74,6 +74,8 @@ def observer(
     camera_row = check_cameras(cameras, source)
 
     def pose_of(frame: Frame) -> BodyPose | str:
+        if frame.index in cameras.missing:
+            return "no camera"
         row = row_of(frame)
         if row is None:
             return "no pose"

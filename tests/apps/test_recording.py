@@ -1,11 +1,8 @@
 """A video with poses as a stranger's tracker wrote them."""
 
 import pickle
-<<<<<<< HEAD
-import shutil
-=======
 import re
->>>>>>> fe12ec4 (SMPL's poses without SMPL's file: SMPL's mean joints, distance and place fitted to the masks)
+import shutil
 
 import numpy as np
 import pytest
@@ -67,7 +64,6 @@ def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp
         Recording.open(RecordingPaths(**paths, person="7"))
 
 
-<<<<<<< HEAD
 def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
@@ -85,7 +81,8 @@ def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
     told = recording.told_of_masks()
     assert told["masks"] == "estimated by GrabCut"
     assert 0.6 < told["mask_agreement"] < 1.0
-=======
+
+
 def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_path):
     rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
     rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
@@ -97,4 +94,3 @@ def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_p
     before, after = (float(number) for number in re.findall(r"(0\.\d\d) (?:before|after)", note))
     assert after > before + 0.05
     assert after > 0.7
->>>>>>> fe12ec4 (SMPL's poses without SMPL's file: SMPL's mean joints, distance and place fitted to the masks)

@@ -97,7 +97,7 @@ def test_what_is_no_camera_is_refused(write, changes, message):
 
 
 def test_other_formats_are_refused_by_name(tmp_path):
-    with pytest.raises(BadInput, match=r"cameras\.npz"):
+    with pytest.raises(BadInput, match=r"COLMAP.*transforms\.json"):
         read_cameras(tmp_path, SIZE)
     with pytest.raises(BadInput, match="does not exist"):
         read_cameras(tmp_path / "cameras.npz", SIZE)

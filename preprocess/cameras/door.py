@@ -1,0 +1,71 @@
+"""One door for cameras of other programs: which one wrote them is told by what is inside."""
+
+import json
+from pathlib import Path
+
+from capture.errors import BadInput
+from preprocess.cameras.colmap import find_model, read_colmap
+from preprocess.cameras.named import NamedCamera
+from preprocess.cameras.nerfstudio import read_transforms
+from preprocess.cameras.phones import (
+    MOST_BYTES,
+    find_polycam,
+    read_polycam,
+    read_r3d,
+    read_record3d,
+)
+
+READ = (
+    "an .npz (intrinsic, extrinsic, height, width), a COLMAP model (the folder of cameras.bin and "
+    "images.bin, or .txt), a transforms.json of nerfstudio or instant-ngp, Record3D's .r3d or its "
+    "metadata, or Polycam's folder"
+)
+"""For messages."""
+
+
+def read_named(path: Path) -> list[NamedCamera]:
+    """The cameras of a file or a folder.
+
+    Raises:
+        BadInput: If nothing there holds cameras.
+    """
+    if not path.exists():
+        raise BadInput(f"{path} does not exist; expected {READ}.")
+    if path.is_dir():
+        return _in_folder(path)
+    if path.suffix in (".bin", ".txt") and (model := find_model(path.parent)) is not None:
+        return read_colmap(model)
+    if path.suffix == ".r3d":
+        return read_r3d(path)
+    if path.suffix == ".json" or path.name == "metadata":
+        return _in_json(path)
+    raise BadInput(f"{path} holds no cameras that are known; expected {READ}.")
+
+
+def _in_folder(folder: Path) -> list[NamedCamera]:
+    model = find_model(folder)
+    if model is not None:
+        return read_colmap(model)
+    for name in ("transforms.json", "metadata", "metadata.json"):
+        if (folder / name).is_file():
+            return _in_json(folder / name)
+    cameras = find_polycam(folder)
+    if cameras is not None:
+        return read_polycam(cameras)
+    raise BadInput(f"{folder} holds no cameras that are known; expected {READ}.")
+
+
+def _in_json(path: Path) -> list[NamedCamera]:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise BadInput(f"{path} is larger than {MOST_BYTES >> 20} MiB; it holds no cameras.")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except BadInput:
+        raise
+    except (OSError, ValueError, RecursionError) as cause:
+        raise BadInput(f"{path} is no JSON that can be read ({cause}).") from cause
+    if isinstance(content, dict) and "frames" in content:
+        return read_transforms(content, path)
+    if isinstance(content, dict) and "poses" in content:
+        return read_record3d(content, path)
+    raise BadInput(f"{path} holds neither `frames` (nerfstudio) nor `poses` (Record3D).")

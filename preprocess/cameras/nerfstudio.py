@@ -1,0 +1,87 @@
+"""transforms.json of nerfstudio and instant-ngp: world-from-camera with OpenGL's axes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from capture.images import natural_key
+from preprocess.cameras.named import (
+    NamedCamera,
+    camera_from_opengl,
+    checked_rigid,
+    pinhole,
+    rigid_inverse,
+)
+
+LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FULL", "perspective")
+
+
+def read_transforms(content: dict[str, Any], path: Path) -> list[NamedCamera]:
+    """The cameras of a transforms.json, sorted by their pictures' names.
+
+    `applied_transform`, with which ns-process-data turns COLMAP's world, is taken back.
+
+    Raises:
+        BadInput: If it holds something else.
+    """
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise BadInput(f"{path} holds no `frames`; a transforms.json of nerfstudio was expected.")
+    applied = np.eye(4)
+    if "applied_transform" in content:
+        applied = checked_rigid(content["applied_transform"], f"{path}, applied_transform")
+    named = []
+    for frame in frames:
+        if not isinstance(frame, dict):
+            raise BadInput(f"{path}: one of the `frames` is no object; is the file damaged?")
+        name = _name(frame, path)
+        try:
+            camera = _camera({**content, **frame}, applied, path)
+        except (TypeError, ValueError, OverflowError) as cause:
+            if isinstance(cause, BadInput):
+                raise
+            raise BadInput(f"{path}: a camera's numbers are none ({cause}).") from cause
+        named.append(NamedCamera(name=name, camera=camera))
+    return sorted(named, key=lambda each: natural_key(Path(each.name or "")))
+
+
+def _name(frame: dict[str, Any], path: Path) -> str:
+    if not isinstance(frame.get("file_path"), str):
+        raise BadInput(f"{path}: a frame has no `file_path`, so nobody knows whose camera it is.")
+    return Path(frame["file_path"]).stem
+
+
+def _camera(numbers: dict[str, Any], applied: np.ndarray, path: Path) -> Camera:
+    """One frame's camera; what the frame does not say, the file does."""
+    lens = numbers.get("camera_model", "OPENCV")
+    if lens not in LENSES:
+        raise BadInput(f"{path}: camera model {lens}; expected one of {', '.join(LENSES)}.")
+    world = checked_rigid(numbers.get("transform_matrix"), f"{path}, transform_matrix")
+    if "fl_x" not in numbers and "camera_angle_x" in numbers:
+        numbers = {**numbers, **_from_angles(numbers, path)}
+    numbers = {"fl_y": numbers.get("fl_x"), **numbers}
+    if "cx" not in numbers and "w" in numbers and "h" in numbers:
+        numbers = {**numbers, "cx": numbers["w"] / 2.0, "cy": numbers["h"] / 2.0}
+    bends = [float(numbers.get(key) or 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    return pinhole(
+        numbers,
+        ("fl_x", "fl_y", "cx", "cy", "w", "h"),
+        camera_from_opengl(rigid_inverse(applied) @ world),
+        tuple(bends),
+        str(path),
+    )
+
+
+def _from_angles(numbers: dict[str, Any], path: Path) -> dict[str, float]:
+    """Focal lengths of the angles of view (NeRF's own files, and instant-ngp's)."""
+    try:
+        across = float(numbers["w"]) / 2.0 / np.tan(float(numbers["camera_angle_x"]) / 2.0)
+        down = across
+        if "camera_angle_y" in numbers:
+            down = float(numbers["h"]) / 2.0 / np.tan(float(numbers["camera_angle_y"]) / 2.0)
+    except (KeyError, TypeError, ValueError) as cause:
+        raise BadInput(f"{path}: expected w, h and camera_angle_x, or fl_x ({cause}).") from cause
+    return {"fl_x": across, "fl_y": down}

@@ -1,0 +1,344 @@
+"""Tests for cameras of other programs, written byte for byte as those programs do."""
+
+import json
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from capture.source import Source, open_source
+from preprocess.camera_file import read_cameras
+from preprocess.cameras.door import read_named
+
+SIZE = (640, 480)
+COUNT = 5
+
+
+@pytest.fixture
+def cameras(rng) -> list[Camera]:
+    """A walk round the origin, not level."""
+    found = []
+    for step in range(COUNT):
+        turn = Rotation.from_euler("xyz", [0.1 * step, 0.5 * step, 0.05])
+        camera_from_world = np.eye(4)
+        camera_from_world[:3, :3] = turn.as_matrix()
+        camera_from_world[:3, 3] = [0.1, -0.2, 3.0 + 0.1 * step]
+        found.append(
+            Camera(
+                focal_px=(500.0, 505.0),
+                center_px=(318.5, 243.0),
+                size_px=SIZE,
+                camera_from_world=camera_from_world,
+            )
+        )
+    return found
+
+
+@pytest.fixture
+def points(rng) -> np.ndarray:
+    """Something to look at."""
+    return rng.uniform(-0.6, 0.6, (50, 3))
+
+
+def opengl_pose(camera: Camera) -> np.ndarray:
+    """World-from-camera with y up and z back, as OpenGL, ARKit and NeRF say it."""
+    pose = np.linalg.inv(camera.camera_from_world)
+    return np.column_stack([pose[:, 0], -pose[:, 1], -pose[:, 2], pose[:, 3]])
+
+
+def seen(pose: np.ndarray, camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixels by OpenGL's own arithmetic, without our cameras: x right, y up, looking along -z."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
+    return np.stack(
+        [cx + fx * local[:, 0] / -local[:, 2], cy - fy * local[:, 1] / -local[:, 2]], axis=1
+    )
+
+
+@pytest.fixture
+def colmap(tmp_path, cameras):
+    """Writes a COLMAP model; returns its folder and the model."""
+
+    def write(kind="OPENCV", params=(500.0, 505.0, 318.5, 243.0, 0.05, -0.01, 0.001, 0.002)):
+        model = pycolmap.Reconstruction()
+        lens = pycolmap.Camera(model=kind, width=640, height=480, params=params, camera_id=1)
+        model.add_camera_with_trivial_rig(lens)
+        for number, camera in enumerate(cameras, 1):
+            image = pycolmap.Image(
+                name=f"frames/frame_{number:05d}.png", camera_id=1, image_id=number
+            )
+            pose = pycolmap.Rigid3d(camera.camera_from_world[:3])
+            model.add_image_with_trivial_frame(image, pose)
+        folder = tmp_path / "sparse" / "0"
+        folder.mkdir(parents=True)
+        return folder, model
+
+    return write
+
+
+@pytest.mark.parametrize("version", ["4.x", "3.x"])
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp_path):
+    folder, model = colmap()
+    model.write_binary(folder) if kind == "binary" else model.write_text(folder)
+    if version == "3.x":
+        for part in ("rigs", "frames"):
+            (folder / f"{part}.{'bin' if kind == 'binary' else 'txt'}").unlink()
+    found = read_named(tmp_path)
+    assert [each.name for each in found] == [f"frame_{n:05d}" for n in range(1, COUNT + 1)]
+    for number, each in enumerate(found, 1):
+        local = model.image(number).cam_from_world() * points
+        pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
+        np.testing.assert_allclose(each.camera.project(points), pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "params"),
+    [
+        ("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)),
+        ("PINHOLE", (500.0, 505.0, 320.0, 240.0)),
+        ("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1)),
+        ("RADIAL", (500.0, 320.0, 240.0, 0.1, -0.02)),
+        ("FULL_OPENCV", (500.0, 505.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0)),
+    ],
+)
+def test_every_lens_that_opencv_has_is_colmaps(colmap, points, kind, params):
+    folder, model = colmap(kind, params)
+    model.write_binary(folder)
+    camera = read_named(folder)[0].camera
+    local = model.image(1).cam_from_world() * points
+    pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
+    np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
+
+
+def test_a_fisheye_is_refused_with_what_to_do(colmap):
+    folder, model = colmap("OPENCV_FISHEYE", (500.0, 505.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0))
+    model.write_binary(folder)
+    with pytest.raises(BadInput, match=r"OPENCV_FISHEYE.*undistort"):
+        read_named(folder)
+
+
+def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
+    turned = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 0, 1]])
+    content = {
+        "w": 640, "h": 480, "fl_x": 500.0, "fl_y": 505.0, "cx": 318.5, "cy": 243.0,
+        "camera_model": "OPENCV", "k1": 0.0, "applied_transform": turned[:3].tolist(),
+        "frames": [
+            {"file_path": f"images/frame_{n:05d}.png",
+             "transform_matrix": (turned @ opengl_pose(camera)).tolist()}
+            for n, camera in reversed(list(enumerate(cameras, 1)))
+        ],
+    }  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    for path in (tmp_path, tmp_path / "transforms.json"):
+        found = read_named(path)
+        assert [each.name for each in found] == [f"frame_{n:05d}" for n in range(1, COUNT + 1)]
+        for each, camera in zip(found, cameras, strict=True):
+            wanted = seen(opengl_pose(camera), camera, points)
+            np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+
+
+def test_a_frame_may_have_a_lens_of_its_own_or_an_angle_of_view(cameras, tmp_path):
+    frame = {"file_path": "a_1.png", "transform_matrix": opengl_pose(cameras[0]).tolist()}
+    content = {"w": 640, "h": 480, "camera_angle_x": 2 * np.arctan(0.5), "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    camera = read_named(tmp_path)[0].camera
+    assert camera.focal_px == pytest.approx((640.0, 640.0))
+    assert camera.center_px == (320.0, 240.0)
+    frame |= {"fl_x": 300.0, "fl_y": 301.0, "cx": 1.0, "cy": 2.0}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert read_named(tmp_path)[0].camera.focal_px == (300.0, 301.0)
+
+
+def test_record3d_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
+    poses = [
+        [*Rotation.from_matrix(opengl_pose(c)[:3, :3]).as_quat(), *opengl_pose(c)[:3, 3]]
+        for c in cameras
+    ]
+    columns = [500.0, 0, 0, 0, 505.0, 0, 318.5, 243.0, 1.0]
+    content = {"poses": poses, "K": columns, "w": 640, "h": 480, "fps": 60, "dw": 192, "dh": 256}
+    (tmp_path / "metadata").write_text(json.dumps(content))
+    with zipfile.ZipFile(tmp_path / "walk.r3d", "w") as archive:
+        archive.writestr("metadata", json.dumps(content))
+    for path in (tmp_path, tmp_path / "metadata", tmp_path / "walk.r3d"):
+        for each, camera in zip(read_named(path), cameras, strict=True):
+            wanted = seen(opengl_pose(camera), camera, points)
+            np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+
+
+def test_polycam_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
+    folder = tmp_path / "keyframes" / "corrected_cameras"
+    folder.mkdir(parents=True)
+    for number, camera in enumerate(cameras):
+        matrix = opengl_pose(camera)
+        numbers = {f"t_{r}{c}": matrix[r, c] for r in range(3) for c in range(4)}
+        numbers |= {"fx": 500.0, "fy": 505.0, "cx": 318.5, "cy": 243.0}
+        numbers |= {"width": 640, "height": 480, "blur_score": 100.0}
+        (folder / f"{98000 + number}.json").write_text(json.dumps(numbers))
+    found = read_named(tmp_path)
+    assert [each.name for each in found] == [str(98000 + n) for n in range(COUNT)]
+    for each, camera in zip(found, cameras, strict=True):
+        wanted = seen(opengl_pose(camera), camera, points)
+        np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+
+
+def transforms(path: Path, cameras: list[Camera], names: list[str]) -> Path:
+    """A transforms.json."""
+    frames = [
+        {"file_path": f"images/{name}.png", "transform_matrix": opengl_pose(camera).tolist()}
+        for name, camera in zip(names, cameras, strict=True)
+    ]
+    content = {"w": 640, "h": 480, "fl_x": 500.0, "cx": 318.5, "cy": 243.0, "frames": frames}
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path) -> Source:
+    """A folder of seven pictures."""
+    (tmp_path / "images").mkdir()
+    for number in range(7):
+        picture = np.zeros((24, 32, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"shot_{number + 3}.png"), picture)
+    return open_source(tmp_path / "images")
+
+
+@pytest.fixture
+def video(tmp_path):
+    """A video of so many frames."""
+
+    def make(frames: int) -> Source:
+        path = tmp_path / f"{frames}.avi"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (32, 24))
+        for _ in range(frames):
+            writer.write(np.zeros((24, 32, 3), np.uint8))
+        writer.release()
+        return open_source(path)
+
+    return make
+
+
+def test_cameras_find_their_pictures_by_name(cameras, folder, tmp_path):
+    names = ["shot_3", "shot_4", "shot_6", "shot_7", "shot_8"]
+    path = transforms(tmp_path / "transforms.json", cameras, names)
+    track = read_cameras(path, SIZE, folder)
+    assert len(track.cameras) == 7
+    assert track.missing == {6}
+    for frame, camera in zip((0, 1, 3, 4, 5), cameras, strict=True):
+        np.testing.assert_allclose(track[frame].camera_from_world, camera.camera_from_world)
+    assert "5 have a camera" in (track.note or "")
+    assert "1 were interpolated, 1 are left out" in (track.note or "")
+
+
+def test_a_camera_between_two_stands_and_turns_half_way(cameras, folder, tmp_path):
+    two = [cameras[0], cameras[2]]
+    path = transforms(tmp_path / "transforms.json", two, ["shot_3", "shot_5"])
+    between = read_cameras(path, SIZE, folder)[1]
+    middle = 0.5 * (two[0].center_world + two[1].center_world)
+    np.testing.assert_allclose(between.center_world, middle)
+    turns = [Rotation.from_matrix(c.camera_from_world[:3, :3]) for c in (*two, between)]
+    halves = [(turns[2] * turns[0].inv()).magnitude(), (turns[1] * turns[2].inv()).magnitude()]
+    assert halves[0] == pytest.approx(halves[1])
+    assert sum(halves) == pytest.approx((turns[1] * turns[0].inv()).magnitude())
+
+
+def test_numbers_in_names_count_a_videos_frames(cameras, video, tmp_path):
+    names = [f"frame_{n:05d}" for n in (1, 3, 4, 8, 9)]
+    path = transforms(tmp_path / "transforms.json", cameras, names)
+    track = read_cameras(path, SIZE, video(10))
+    for frame, camera in zip((0, 2, 3, 7, 8), cameras, strict=True):
+        np.testing.assert_allclose(track[frame].camera_from_world, camera.camera_from_world)
+
+
+def test_consecutive_numbers_of_a_few_frames_say_nothing_about_a_longer_video(
+    cameras, video, tmp_path
+):
+    names = [f"frame_{n:05d}" for n in range(1, 6)]
+    path = transforms(tmp_path / "transforms.json", cameras, names)
+    with pytest.raises(BadInput, match=r"5 cameras.*40 frames"):
+        read_cameras(path, SIZE, video(40))
+    assert len(read_cameras(path, SIZE, video(5)).cameras) == 5
+
+
+def test_cameras_of_larger_pictures_are_scaled_and_of_other_shapes_refused(cameras, tmp_path):
+    path = transforms(tmp_path / "transforms.json", cameras, [f"f{n}" for n in range(COUNT)])
+    small = read_cameras(path, (320, 240))
+    assert small[0].focal_px == (250.0, 250.0)
+    assert "scaled" in (small.note or "")
+    with pytest.raises(BadInput, match="same shape"):
+        read_cameras(path, (480, 640))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", "JSON"),
+        ("[]", "neither"),
+        ('{"frames": []}', "frames"),
+        ('{"frames": [{"file_path": "a", "transform_matrix": [[1]]}], "w": 1}', "4x4"),
+        ('{"frames": [{"transform_matrix": 3}]}', "file_path"),
+        ('{"poses": [[0, 0, 0, 0, 1, 1, 1]], "K": [1,0,0,0,1,0,0,0,1], "w": 4, "h": 4}', "poses"),
+        ('{"poses": "x", "K": 1, "w": 4, "h": 4}', "Record3D"),
+    ],
+)
+def test_strange_json_is_refused_with_what_is_wrong(content, words, tmp_path):
+    (tmp_path / "transforms.json").write_text(content)
+    with pytest.raises(BadInput, match=words):
+        read_named(tmp_path)
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["frames", "poses", "K", "w", "h", "fl_x", "file_path",
+                             "transform_matrix", "camera_angle_x", "applied_transform"]),
+            inner, max_size=6,
+        ),
+        max_leaves=12,
+    )
+)  # fmt: skip
+def test_any_json_is_read_or_refused(tmp_path_factory, content):
+    path = tmp_path_factory.mktemp("json") / "transforms.json"
+    path.write_text(json.dumps(content))
+    try:
+        found = read_named(path)
+    except BadInput:
+        return
+    assert found
+    assert all(np.isfinite(each.camera.camera_from_world).all() for each in found)
+
+
+def test_a_damaged_colmap_model_is_refused(colmap, rng):
+    folder, model = colmap()
+    model.write_binary(folder)
+    for size in (0, 7, 100):
+        (folder / "images.bin").write_bytes(rng.bytes(size))
+        with pytest.raises(BadInput, match="COLMAP"):
+            read_named(folder)
+
+
+def test_a_world_that_is_turned_with_its_cameras_looks_the_same(cameras, points, tmp_path):
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.3, -0.8, 0.1]).as_matrix()
+    turned = [
+        replace(camera, camera_from_world=camera.camera_from_world @ np.linalg.inv(turn))
+        for camera in cameras
+    ]
+    path = transforms(tmp_path / "transforms.json", turned, [f"f{n}" for n in range(COUNT)])
+    track = read_cameras(path, SIZE)
+    for frame, camera in enumerate(cameras):
+        there = points @ turn[:3, :3].T
+        np.testing.assert_allclose(
+            track[frame].project(there), replace(camera, focal_px=(500.0, 500.0)).project(points)
+        )
