@@ -144,28 +144,32 @@ class Recording:
         cls, wanted: RecordingPaths, camera: str | None, size_px: int | None
     ) -> "Recording":
         """The same of a live source, whose first picture and first pose are waited for."""
-        paths = find_live_capture(wanted.video, wanted.poses, wanted.masks, wanted.cameras)
+        named = segmenter_name(wanted.masks)
+        given_masks = wanted.masks if named is None else None
+        paths = find_live_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
         body, pace = Body.load(wanted.body), Pace()
         source = open_live(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
         live = LiveParts.open(
             paths, source, pace, family=body.family, invert=wanted.mask_invert,
-            first_within_s=wanted.idle_s,
+            first_within_s=wanted.idle_s, estimated=named is not None,
         )  # fmt: skip
         motion = live.poses.motion
         if paths.cameras is not None:
             cameras = read_cameras(paths.cameras, source.size_px)
         else:
             cameras = default_cameras(motion, source.size_px)
+        shaped = shaped_for(body, motion)
         recording = cls(
             paths=paths,
             source=source,
             motion=motion,
             masks=None,
             cameras=cameras,
-            shaped=shaped_for(body, motion),
+            shaped=shaped,
             size_px=size_px,
-            notes=tuple(_notes(body, motion, None, cameras)),
+            notes=tuple(_notes(body, motion, None, cameras, segment=named)),
             live=live,
+            segment=None if named is None else make_segmenter(named, shaped),
         )
         recording.observer()
         recording.footprint_m()
@@ -187,7 +191,7 @@ class Recording:
     def observer(self) -> Callable[[Frame], Observation | Dropped]:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
-            return self.live.observer(self.source, self.cameras, self.size_px)
+            return self.live.observer(self.source, self.cameras, self.size_px, self.segment)
         return observer(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
             segment=self.segment,

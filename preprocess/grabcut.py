@@ -15,6 +15,7 @@ from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess.body import ShapedBody
+from preprocess.matte import softened
 from preprocess.outline import Outline
 from preprocess.pose import BodyPose
 
@@ -24,8 +25,13 @@ WORK_PX = 320
 SMALL_PX = 200
 """Smaller pictures are enlarged twice: masks then know parts of a pixel."""
 
-INSIDE, OUTSIDE = 0.015, 0.06
-"""How far inside and outside the body's outline nothing is in doubt, in heights of the person."""
+SURE = (0.01, 0.045)
+UNSURE = (0.02, 0.07)
+"""How far inside and outside the body's outline pixels are in doubt, in heights of the person:
+where poses are right, and where they are off."""
+
+RIGHT, OFF = 0.03, 0.08
+"""Share of the body outside the masks of right poses, and of poses that are off by 2° and 1 cm."""
 
 AROUND = 0.15
 """How much of the background is looked at, in heights of the person."""
@@ -75,6 +81,7 @@ class GrabCut:
         self._behind: Float32[np.ndarray, "height width 3"] | None = None
         self._times: Float32[np.ndarray, "height width"] | None = None
         self._camera: Camera | None = None
+        self._spilt = RIGHT
         self.found, self.agreement = 0, 0.0
 
     def __call__(
@@ -100,9 +107,11 @@ class GrabCut:
         if agreement < LEAST_AGREEMENT:
             raise BadInput(f"the estimated mask agrees by {agreement:.0%} only with the posed body")
         self._learn_background(rgb, person | seeds.body)
+        spilt = float((seeds.body & ~person).sum() / seeds.body.sum())
+        self._spilt += 0.3 * (spilt - self._spilt)
         self.found += 1
         self.agreement += (agreement - self.agreement) / self.found
-        alpha = person.astype(np.float32)
+        alpha = softened(rgb, person)
         if size_px != frame.size_px:
             way = cv2.INTER_LINEAR if scale < 1.0 else cv2.INTER_AREA
             alpha = cv2.resize(alpha, frame.size_px, interpolation=way)
@@ -115,8 +124,10 @@ class GrabCut:
             raise BadInput("the posed body is not in the picture")
         tall = max(int(rows.max() - rows.min()), int(columns.max() - columns.min()), 8)
         drawn = body.astype(np.uint8)
-        inside = cv2.erode(drawn, _disc(INSIDE * tall)) > 0
-        reach = max(2, round(OUTSIDE * tall))
+        doubt = float(np.clip((self._spilt - RIGHT) / (OFF - RIGHT), 0.0, 1.0))
+        inwards, outwards = (1.0 - doubt) * np.array(SURE) + doubt * np.array(UNSURE)
+        inside = cv2.erode(drawn, _disc(float(inwards * tall))) > 0
+        reach = max(2, round(outwards * tall))
         near = cv2.dilate(drawn, _disc(float(reach))) > 0
         margin = reach + max(8, round(AROUND * tall))
         box = (

@@ -13,6 +13,7 @@ from preprocess.growing_masks import GrowingMasks
 from preprocess.growing_poses import GrowingPoses
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, joiner, own_alpha, shrunk
+from preprocess.segmenter import Segmenter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,6 +40,7 @@ class LiveParts:
         family: str,
         invert: bool | None,
         first_within_s: float,
+        estimated: bool = False,
     ) -> "LiveParts":
         """Waits for the first pose.
 
@@ -49,16 +51,17 @@ class LiveParts:
             family: Body family of pose files that do not say theirs.
             invert: Whether the person is dark in the masks; None finds out.
             first_within_s: How long the first pose may take.
+            estimated: Whether masks will be estimated, so that none are waited for.
 
         Raises:
             BadInput: If no pose comes, or there is no folder of masks where one is needed.
         """
         masks = None
-        if not source.has_alpha:
+        if not (source.has_alpha or estimated):
             if paths.masks is None or not paths.masks.is_dir():
                 raise BadInput(
-                    f"There is no folder of masks {paths.masks}, and making masks from the video "
-                    "is not built yet. Give --masks: the folder to which they will be written."
+                    f"There is no folder of masks {paths.masks}. Give --masks: the folder to which "
+                    "they will be written, or segmenter:grabcut to have them estimated."
                 )
             masks = GrowingMasks(paths.masks, pace, invert=invert)
         poses = GrowingPoses(
@@ -68,7 +71,11 @@ class LiveParts:
         return cls(poses=poses, masks=masks, pace=pace)
 
     def observer(
-        self, source: Source, cameras: CameraTrack, size_px: int | None
+        self,
+        source: Source,
+        cameras: CameraTrack,
+        size_px: int | None,
+        segment: Segmenter | None = None,
     ) -> Callable[[Frame], Observation | Dropped]:
         """What makes an observation of a frame, waiting for its pose and its mask.
 
@@ -82,4 +89,4 @@ class LiveParts:
             )
         alpha_of = own_alpha if self.masks is None else self.masks.of
         target_px = shrunk(source.size_px, size_px)
-        return joiner(self.poses.of, alpha_of, lambda index: cameras[0], target_px)
+        return joiner(self.poses.of, alpha_of, lambda index: cameras[0], target_px, segment=segment)

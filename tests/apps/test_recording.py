@@ -3,9 +3,11 @@
 import pickle
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from apps.recording import Recording, RecordingPaths
 from capture.errors import BadInput
@@ -94,3 +96,21 @@ def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_p
     before, after = (float(number) for number in re.findall(r"(0\.\d\d) (?:before|after)", note))
     assert after > before + 0.05
     assert after > 0.7
+
+
+def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
+    folder = tmp_path / "live"
+    folder.mkdir()
+    frames = list(own.source.frames())[:4]
+    for frame in frames:
+        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
+    (folder / "DONE").touch()
+    paths = {"video": folder, "poses": film / "poses.npz", "cameras": f"{film}/cameras.npz"}
+    with pytest.raises(BadInput, match="segmenter:grabcut"):
+        Recording.open(RecordingPaths(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
+    named = Path("segmenter:grabcut")
+    live = Recording.open(RecordingPaths(**paths, live=True, masks=named, idle_s=1.0))
+    assert any("estimated" in note for note in live.notes)
+    found = list(live.observations())
+    assert [observation.frame.index for observation in found] == [0, 1, 2, 3]
+    assert all((observation.alpha > 0.5).any() for observation in found)
