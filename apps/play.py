@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -57,6 +57,8 @@ class PlayArguments:
     """Longer side in pixels; without it 540, or what --camera says."""
     fps: Annotated[float | None, arg(metavar="F", help_behavior_hint="")] = None
     """Pictures a second; without it what the poses say, else 30."""
+    tier: Literal["hq", "lite"] = "hq"
+    """Quality: lite takes three quarters of the time."""
     background: str = "white"
     """Of clips: a colour (white, #203040) or a picture. Frames keep their alpha."""
     web: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
@@ -120,7 +122,7 @@ def _clip(given: PlayArguments, console: Console) -> int:
     out = given.out or given.avatar.parent / f"{given.poses.stem}.webm"
     check_clip(out)
     blend = background(given.background)
-    player = Player.load(given.avatar)
+    player = Player.load(given.avatar, tier=given.tier)
     shots = _shots(given, player, console)
     fps = given.fps or poses_a_second(shots.motion)
     with console.bar(f"drawing {out.name}", float(len(shots.rows))) as bar:
@@ -144,9 +146,10 @@ def _bench(given: PlayArguments, console: Console) -> int:
     from export.player import Player
 
     started = time.perf_counter()
-    player = Player.load(given.avatar)
+    player = Player.load(given.avatar, tier=given.tier)
     load_ms = 1000.0 * (time.perf_counter() - started)
-    result = benchmark(player, list(_shots(given, player, console)), load_ms=load_ms)
+    shots = list(_shots(given, player, console))
+    result = benchmark(player, shots, load_ms=load_ms, tier=given.tier)
     if given.json is not None:
         write_text(given.json, result.to_json())
     console.say(

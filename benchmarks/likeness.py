@@ -16,8 +16,8 @@ from benchmarks.main_job import observations
 from benchmarks.marks import Mark
 from benchmarks.stage import opened
 from capture.camera import Camera
-from export.package import read_tiers
 from export.player import Player, premultiplied
+from export.tiers import TIERS
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
 
@@ -74,7 +74,7 @@ def _shot(seen: Observation, avatar: Avatar) -> Shot:
 
 def likeness_marks(name: str, package: Path, shots: Mapping[str, Sequence[Shot]]) -> Iterator[Mark]:
     """For each tier and each kind of picture, how near and how far behind."""
-    for tier in read_tiers(package):
+    for tier in TIERS:
         player = Player.load(package, tier=tier)
         (near, nearest), (lost, least_lost) = ASKED[tier]
         for kind, some in shots.items():

@@ -11,8 +11,8 @@ from apps.bench import Benchmark, benchmark
 from benchmarks.hardware import ROOT
 from benchmarks.likeness import Shot
 from benchmarks.marks import Mark
-from export.package import read_tiers
 from export.player import Player
+from export.tiers import TIERS
 
 ROUNDS = 5
 ASKED = {"hq": ("≤ 45", "≤ 25"), "lite": ("≤ 28", "≤ 15")}
@@ -36,7 +36,7 @@ print(loaded - began, time.process_time() - began)
 
 def pace_marks(name: str, package: Path, shots: Sequence[Shot]) -> Iterator[Mark]:
     """CPU time of a picture, and its ratio to the reference graph's, tiers in turns."""
-    players = {tier: Player.load(package, tier=tier) for tier in read_tiers(package)}
+    players = {tier: Player.load(package, tier=tier) for tier in TIERS}
     seen = [(shot.pose, shot.camera) for shot in shots]
     rounds: dict[str, list[Benchmark]] = {tier: [] for tier in players}
     for _ in range(ROUNDS):
@@ -65,7 +65,7 @@ def pace_marks(name: str, package: Path, shots: Sequence[Shot]) -> Iterator[Mark
 
 def load_marks(name: str, package: Path) -> Iterator[Mark]:
     """From the file to the first picture, in a fresh process whose imports are done."""
-    for tier in read_tiers(package):
+    for tier in TIERS:
         times = [_first(package, tier) for _ in range(3)]
         loaded, drawn = (float(value) for value in np.median(times, axis=0))
         yield Mark(

@@ -27,8 +27,8 @@ from export.lattice import FieldAt, Lattice
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
 from export.package import AvatarPackage, PackageDraft
 from export.player import ALIKE, Likeness, Player, premultiplied
-from export.rules import DrawingRules
 from export.tables import Tables
+from export.tiers import TIERS
 from export.twin import Shot, draw
 from preprocess.pose import BodyPose
 
@@ -38,6 +38,10 @@ report says so."""
 CHECKED_PX = 256
 """Longer side of the pictures that are compared with the volume renderer."""
 MOST_GOLDEN = 4
+SIMPLIFIED = (
+    "The player draws the avatar at {score:.1f} dB to the volume renderer ({good:.0f} dB are "
+    "good): fine detail or fuzzy edges are simplified."
+)
 
 View = tuple[BodyPose, Camera]
 """A pose and a camera that looks at it."""
@@ -135,19 +139,24 @@ def export_field(
     with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
         drawing = beside.submit(_drawing, lattice, rig, config, views, metrics)
         exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
-        package, player = drawing.result()
+        package, players = drawing.result()
         compressed = beside.submit(draft.add_drawing, package)
-        worst = _check_graph(player, package)
-        score, warnings = _check_pictures(player, views, exact)
-        golden = tuple(player.render(frame.pose, frame.camera) for frame in package.manifest.golden)
-        note = replace(
-            package.manifest.tiers["hq"], psnr_to_renderer=score, largest_difference=worst
-        )
+        notes, warnings = {}, list[str]()
+        for tier, player in players.items():
+            looks = slice(None) if tier == "hq" else slice(1)
+            worst = _check_graph(player, package, tier, package.manifest.golden[looks])
+            score = _check_pictures(player, views[looks], exact[looks], tier)
+            if tier == "hq" and score < GOOD_PSNR:
+                warnings.append(SIMPLIFIED.format(score=score, good=GOOD_PSNR))
+            note = package.manifest.tiers[tier]
+            notes[tier] = replace(note, psnr_to_renderer=score, largest_difference=worst)
+        hq = players["hq"]
+        golden = tuple(hq.render(frame.pose, frame.camera) for frame in package.manifest.golden)
         package = replace(
             package,
-            manifest=replace(package.manifest, tiers={"hq": note}),
+            manifest=replace(package.manifest, tiers=notes),
             golden=golden,
-            preview=_png(player.render(*views[0])),
+            preview=_png(hq.render(*views[0])),
         )
         compressed.result()
         size = draft.finish(package)
@@ -155,8 +164,8 @@ def export_field(
         path=path,
         bytes=size,
         seconds=time.perf_counter() - started,
-        psnr_to_renderer={"hq": score},
-        largest_difference=worst,
+        psnr_to_renderer={tier: note.psnr_to_renderer for tier, note in notes.items()},
+        largest_difference=max(note.largest_difference for note in notes.values()),
         warnings=tuple(warnings),
     )
 
@@ -167,23 +176,25 @@ def _drawing(
     config: BakeConfig,
     views: Sequence[View],
     metrics: Mapping[str, Any],
-) -> tuple[AvatarPackage, Player]:
-    """The package before its checks, and a player of it."""
-    package = _package(tables_of(lattice, rig, config), DrawingRules(), rig, views, metrics)
-    return package, Player(package)
+) -> tuple[AvatarPackage, dict[str, Player]]:
+    """The package before its checks, and a player of each tier."""
+    package = _package(tables_of(lattice, rig, config), rig, views, metrics)
+    return package, {tier: Player(package, tier=tier) for tier in TIERS}
 
 
 def _package(
     tables: Tables,
-    rules: DrawingRules,
     rig: Rig,
     views: Sequence[View],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
     """The package as it stands before the checks: no scores, no pictures."""
-    note = TierNote(
-        layout=Layout.of(tables), rules=rules, psnr_to_renderer=0.0, largest_difference=0.0
-    )
+    notes = {
+        tier: TierNote(
+            layout=Layout.of(tables), rules=rules, psnr_to_renderer=0.0, largest_difference=0.0
+        )
+        for tier, rules in TIERS.items()
+    }
     golden = [
         GoldenFrame(pose=pose, camera=_fitted(camera, GOLDEN_PX))
         for pose, camera in views[:MOST_GOLDEN]
@@ -193,13 +204,15 @@ def _package(
             rest_joints=rig.rest_joints,
             parents=rig.parents,
             canonical_rotations=rig.canonical_rotations,
-            tiers={"hq": note},
+            tiers=notes,
             golden=tuple(golden),
             metrics=dict(metrics),
             sha256={},
         ),
-        graphs={"hq": build_graph(tables, rules).SerializeToString()},
-        tables={"hq": tables},
+        graphs={
+            tier: build_graph(tables, rules).SerializeToString() for tier, rules in TIERS.items()
+        },
+        tables=dict.fromkeys(TIERS, tables),
         golden=(),
         preview=b"",
     )
@@ -212,11 +225,13 @@ def _fitted(camera: Camera, longest_px: int) -> Camera:
     return camera.resized((width, height))
 
 
-def _check_graph(player: Player, package: AvatarPackage) -> float:
+def _check_graph(
+    player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
+) -> float:
     """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
-    tables, rules = package.tables["hq"], package.manifest.tiers["hq"].rules
+    tables, rules = package.tables[tier], package.manifest.tiers[tier].rules
     worst = 0.0
-    for number, frame in enumerate(package.manifest.golden):
+    for number, frame in enumerate(frames):
         camera = frame.camera
         shot = Shot(
             bones=player.bones(frame.pose, camera),
@@ -230,8 +245,8 @@ def _check_graph(player: Player, package: AvatarPackage) -> float:
         worst = max(worst, likeness.largest)
         if not likeness.alike:
             raise ExportRefused(
-                f"In view {number} the player's graph is within 2/255 of its meaning on only "
-                f"{likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
+                f"In view {number} the player's graph ({tier}) is within 2/255 of its meaning on "
+                f"only {likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
                 "written; the checkpoint is kept. This is a fault of the program: please report "
                 "it with the version of onnxruntime."
             )
@@ -239,26 +254,24 @@ def _check_graph(player: Player, package: AvatarPackage) -> float:
 
 
 def _check_pictures(
-    player: Player, views: Sequence[View], exact: Sequence[Float32[np.ndarray, "_ _ 3"]]
-) -> tuple[float, list[str]]:
-    """Compares the player with the exact renderer's pictures on white."""
+    player: Player,
+    views: Sequence[View],
+    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
+    tier: str,
+) -> float:
+    """Compares the player with the exact renderer's pictures on white; the mean PSNR, dB."""
     scores = []
     for (pose, camera), truth in zip(views, exact, strict=True):
         drawn = _on_white(premultiplied(player.render(pose, _fitted(camera, CHECKED_PX))))
         scores.append(min(psnr(drawn, truth), 99.0))
     score = float(np.mean(scores))
-    if score < LOWEST_PSNR:
+    if tier == "hq" and score < LOWEST_PSNR:
         raise ExportRefused(
             f"The player draws the avatar at {score:.1f} dB to the volume renderer; at least "
             f"{LOWEST_PSNR:.0f} are wanted. Nothing was written; the checkpoint is kept. Train "
             "longer (--resume), so that the avatar has a firm surface."
         )
-    if score < GOOD_PSNR:
-        return score, [
-            f"The player draws the avatar at {score:.1f} dB to the volume renderer "
-            f"({GOOD_PSNR:.0f} dB are good): fine detail or fuzzy edges are simplified."
-        ]
-    return score, []
+    return score
 
 
 def _on_white(picture: Picture) -> Float32[np.ndarray, "height width 3"]:

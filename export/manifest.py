@@ -42,7 +42,7 @@ class TierNote:
     """One quality of the player.
 
     Attributes:
-        layout: How its streams are read.
+        layout: Sizes and scales of what it draws; that of "hq" says how the streams are read.
         rules: How it is drawn.
         psnr_to_renderer: Against the volume renderer, dB.
         largest_difference: Between graph and twin, in 1/255, over the golden frames.
@@ -70,7 +70,7 @@ class Manifest:
         rest_joints: Rest joints, metres.
         parents: Parent of each joint, -1 for the root.
         canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
-        tiers: By name; "hq" is always there.
+        tiers: By name, "hq" first, which is always there.
         golden: Of the "hq" tier, at its usual number of samples.
         metrics: What training reported, as JSON.
         licence: A note on who may use it.
@@ -116,7 +116,7 @@ class Manifest:
                 rest_joints=_numbers(content["rest_joints"], (24, 3)),
                 parents=_tree(content["parents"]),
                 canonical_rotations=_numbers(content["canonical_rotations"], (23, 3)),
-                tiers={str(name): _tier(note) for name, note in content["tiers"].items()},
+                tiers=_tiers(content["tiers"]),
                 golden=tuple(_golden(frame) for frame in content["golden"]),
                 metrics=dict(content["metrics"]),
                 licence=str(content["licence"]),
@@ -164,6 +164,13 @@ def _tree(values: Any) -> Int[np.ndarray, "24"]:
     if not (known and all(0 <= parents[j] < j for j in range(1, 24))):
         raise ValueError("parents must be a tree of 24 joints, each after its parent")
     return parents
+
+
+def _tiers(content: dict[str, Any]) -> dict[str, TierNote]:
+    tiers = {str(name): _tier(note) for name, note in content.items()}
+    if "hq" not in tiers:
+        raise ValueError(f'there is no tier "hq", only {", ".join(tiers)}')
+    return tiers
 
 
 def _tier(note: dict[str, Any]) -> TierNote:

@@ -34,7 +34,7 @@ class AvatarPackage:
     Attributes:
         manifest: What it says about itself.
         graphs: ONNX model of each tier; its tables are external.
-        tables: Of each tier.
+        tables: What each tier draws: the same, in its own way.
         golden: Pictures of `manifest.golden`, straight alpha.
         preview: A PNG.
     """
@@ -51,9 +51,9 @@ def graph_entry(tier: str) -> str:
     return "player.onnx" if tier == "hq" else f"{tier}/player.onnx"
 
 
-def stream_entry(tier: str, stream: str) -> str:
-    """Where a tier's stream lies."""
-    return f"{tier}/{stream}.bin"
+def stream_entry(stream: str) -> str:
+    """Where a stream lies; all tiers draw the same."""
+    return f"hq/{stream}.bin"
 
 
 def golden_entry(number: int) -> str:
@@ -109,8 +109,8 @@ class PackageDraft:
         """Adds graphs and tables."""
         for tier, graph in package.graphs.items():
             self._add(graph_entry(tier), graph)
-            for name, stream in encode(package.tables[tier]).items():
-                self._add(stream_entry(tier, name), stream)
+        for name, stream in encode(package.tables["hq"]).items():
+            self._add(stream_entry(name), stream)
 
     def finish(self, package: AvatarPackage) -> int:
         """Adds golden frames, preview and manifest, and gives the package its name.
@@ -154,8 +154,12 @@ class PackageDraft:
         self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
 
 
-def read_package(path: Path, *, tier: str = "hq") -> AvatarPackage:
-    """Reads one tier of a package, checking each entry's size before and its sum after reading.
+def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
+    """Reads a package, checking each entry's size before and its sum after reading.
+
+    Args:
+        path: The `.iavatar` file.
+        tier: The one that is wanted; all if None.
 
     Raises:
         BadInput: If the file is missing, truncated, altered, or no package, or has no such tier.
@@ -169,15 +173,6 @@ def read_package(path: Path, *, tier: str = "hq") -> AvatarPackage:
         raise BadInput(
             f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
         ) from error
-
-
-def read_tiers(path: Path) -> tuple[str, ...]:
-    """The names of a package's tiers, "hq" first.
-
-    Raises:
-        BadInput: As `read_package`.
-    """
-    return tuple(read_package(path).manifest.tiers)
 
 
 class _Archive:
@@ -213,9 +208,9 @@ class _Archive:
         return content
 
 
-def _read(archive: _Archive, tier: str) -> AvatarPackage:
+def _read(archive: _Archive, tier: str | None) -> AvatarPackage:
     manifest = Manifest.from_json(archive.read(MANIFEST, most=LARGEST_TEXT))
-    if tier not in manifest.tiers:
+    if tier is not None and tier not in manifest.tiers:
         known = ", ".join(sorted(manifest.tiers))
         raise BadInput(f"{archive.path} has no tier {tier!r}; it has: {known}.")
 
@@ -229,7 +224,9 @@ def _read(archive: _Archive, tier: str) -> AvatarPackage:
             )
         return content
 
-    layout = manifest.tiers[tier].layout
+    layout = manifest.tiers["hq"].layout
+    tables = decode(_streams(checked, layout), layout)
+    tiers = {name: n for name, n in manifest.tiers.items() if tier in (None, name)}
     golden = []
     for number, frame in enumerate(manifest.golden):
         width, height = frame.camera.size_px
@@ -237,16 +234,16 @@ def _read(archive: _Archive, tier: str) -> AvatarPackage:
         golden.append(np.frombuffer(content, dtype=np.uint8).reshape(height, width, 4))
     return AvatarPackage(
         manifest=manifest,
-        graphs={tier: checked(graph_entry(tier))},
-        tables={tier: decode(_streams(checked, tier, layout), layout)},
+        graphs={name: checked(graph_entry(name)) for name in tiers},
+        tables=dict.fromkeys(tiers, tables),
         golden=tuple(golden),
         preview=checked(PREVIEW),
     )
 
 
-def _streams(checked: Callable[[str, int], bytes], tier: str, layout: Layout) -> dict[str, bytes]:
+def _streams(checked: Callable[[str, int], bytes], layout: Layout) -> dict[str, bytes]:
     streams = {}
     for name, (dtype, shape) in layout.streams().items():
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        streams[name] = checked(stream_entry(tier, name), size)
+        streams[name] = checked(stream_entry(name), size)
     return streams

@@ -45,7 +45,7 @@ class DrawingRules:
     longest_correction_m: float = 0.01
     ended: float = 0.01
     largest_footprint_px: int = 16
-    footprint_spacings: float = 1.4
+    footprint_spacings: float = 1.1
     behind: float = 0.35
     lead_m: float = 0.005
     most_lead_m: float = 0.025

@@ -51,7 +51,7 @@ class Surfels:
 
     @property
     def normals(self) -> Float32[np.ndarray, "surfels 3"]:
-        """Outward canonical normals, of length 1 within 1 %."""
+        """Outward canonical normals, of length 1 within 5 %."""
         return self.normal_codes.astype(np.float32) / np.float32(127.0)
 
     @property

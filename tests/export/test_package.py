@@ -12,7 +12,7 @@ from avatar.config import TrainConfig
 from avatar.trainer import Trainer
 from capture.errors import BadInput
 from export import build
-from export.bake import BakeConfig
+from export.bake import COARSEST_M, FINEST_M, BakeConfig
 from export.build import export_avatar, export_field
 from export.errors import ExportRefused
 from export.package import read_package, write_package
@@ -39,7 +39,7 @@ def with_manifest(**changes):
 
 
 def test_a_package_comes_back_byte_by_byte(exported, tmp_path):
-    package = read_package(exported.path)
+    package = read_package(exported.path, tier=None)
     again = tmp_path / "again.iavatar"
     assert write_package(package, again) == exported.bytes
     assert again.read_bytes() == exported.path.read_bytes()
@@ -162,6 +162,7 @@ def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported,
         ({"parents": [-1] + [23] * 23}, "damaged"),
         ({"tiers": {"hq": {}}}, "damaged"),
         ({"tiers": []}, "damaged"),
+        ({"tiers": {}}, "damaged"),
     ],
 )
 def test_a_manifest_that_cannot_be_is_refused(exported, tmp_path, change, message):
@@ -171,8 +172,8 @@ def test_a_manifest_that_cannot_be_is_refused(exported, tmp_path, change, messag
 
 
 def test_a_tier_that_is_not_there_is_named(exported):
-    with pytest.raises(BadInput, match=r"no tier 'lite'; it has: hq"):
-        Player.load(exported.path, tier="lite")
+    with pytest.raises(BadInput, match=r"no tier 'best'; it has: hq, lite"):
+        Player.load(exported.path, tier="best")
 
 
 @pytest.fixture
@@ -231,9 +232,9 @@ def test_the_fog_of_an_untrained_avatar_is_refused(stand_in, views, coarse, tmp_
 
 
 def test_voxels_follow_the_field_within_bounds():
-    assert BakeConfig.for_cells(0.001).voxel_m == 0.004
-    assert 0.004 < BakeConfig.for_cells(0.009).voxel_m < 0.006
-    assert BakeConfig.for_cells(0.1).voxel_m == 0.006
+    assert BakeConfig.for_cells(0.001).voxel_m == FINEST_M
+    assert FINEST_M < BakeConfig.for_cells(0.009).voxel_m < COARSEST_M
+    assert BakeConfig.for_cells(0.1).voxel_m == COARSEST_M
 
 
 def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):

@@ -147,3 +147,12 @@ sys.exit(f"the player pulls in {{heavy}}" if heavy else 0)
 
 def test_resting_is_a_pose_too(player, camera):
     assert player.render(BodyPose.rest(), camera(60, 60)).any()
+
+
+def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player, views, truth):
+    lite = Player.load(exported.path, tier="lite")
+    drawn, exact = premultiplied(lite.render(*views["canonical"])), truth["canonical"]
+    close = premultiplied(player.render(*views["canonical"]))
+    assert psnr(on_white(drawn), on_white(exact)) > 36.0
+    assert psnr(on_white(close), on_white(exact)) > psnr(on_white(drawn), on_white(exact))
+    assert set(exported.psnr_to_renderer) == {"hq", "lite"}

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from export.bake import rounded
 from export.skin import finer_nodes
 
 
@@ -44,3 +45,25 @@ def test_along_z_rows_follow_each_other(skin):
 
 def test_all_weights_sum_to_one(skin):
     np.testing.assert_allclose(finer_nodes(skin).weights.sum(axis=0), 1.0, atol=1e-5)
+
+
+def test_stored_normals_point_outward_and_are_nearly_unit(tables):
+    normals = tables.surfels.normals
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=0.06)
+    codes = tables.surfels.normal_codes
+    assert codes.max() <= 127
+    assert codes.min() >= -127
+    middle = tables.surfels.positions.mean(axis=0)
+    outward = ((tables.surfels.positions - middle) * normals).sum(axis=1)
+    assert (outward > 0).mean() > 0.6
+
+
+@pytest.mark.parametrize(("step", "largest"), [(8, 255), (16, 255), (32, 65535), (1, 255)])
+def test_rounding_codes_moves_none_by_more_than_a_step(step, largest):
+    codes = np.arange(largest + 1).astype(np.uint16 if largest > 255 else np.uint8)
+    near = rounded(codes, step, largest)
+    assert near.dtype == codes.dtype
+    assert (near % step == 0).all()
+    error = np.abs(near.astype(int) - codes.astype(int))
+    assert error[: largest - step].max() <= step // 2
+    assert error.max() < step
