@@ -130,11 +130,17 @@ class _Draft:
         assert array.dtype.name in NARROW
         plain = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
         planes = plain.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T
-        packed = zlib.compress(np.ascontiguousarray(planes).tobytes(), self._level)
-        file = f"data/{hashlib.sha256(packed).hexdigest()[:16]}.bin"
-        self.files[file] = packed
+        content = np.ascontiguousarray(planes).tobytes()
+        file = f"data/{hashlib.sha256(content).hexdigest()[:16]}.bin"
+        if file not in self.files:
+            self.files[file] = zlib.compress(content, self._level)
         shape = list(array.shape)
-        return {"file": file, "dtype": array.dtype.name, "shape": shape, "bytes": len(packed)}
+        return {
+            "file": file,
+            "dtype": array.dtype.name,
+            "shape": shape,
+            "bytes": len(self.files[file]),
+        }
 
 
 def _bytes(content: bytes) -> Shaped[np.ndarray, "bytes"]:

@@ -7,17 +7,22 @@ import { WIDTH_BITS, sources } from "./shaders.js";
 const WIDTH = 1 << WIDTH_BITS;
 const gl = new OffscreenCanvas(1, 1).getContext("webgl2", { antialias: false, powerPreference: "high-performance" });
 const tiers = {};
+const held = {}; // textures by the files that they were made of: tiers mostly share them
 
 async function open({ tier, note }) {
   if (tiers[tier]) return;
   if (!gl || !gl.getExtension("EXT_color_buffer_float")) throw new Error("There is no WebGL2 with float targets here.");
-  const names = note.tables.map((entry) => entry.name);
-  const loaded = await Promise.all(note.tables.map((entry) => load(entry, arrived)));
-  preparing();
-  const columns = Object.fromEntries(names.map((name, i) => [name, loaded[i]]));
+  const files = note.tables.map((entry) => entry.file).join();
+  held[files] ??= await tablesOf(note.tables);
   const programs = {};
   for (const [name, [vertex, fragment]] of Object.entries(sources(note))) programs[name] = program(vertex, fragment);
-  tiers[tier] = { note, programs, textures: tables(columns), surfels: columns.surfel.length, targets: {} };
+  tiers[tier] = { note, programs, textures: held[files], targets: {} };
+}
+
+async function tablesOf(entries) {
+  const loaded = await Promise.all(entries.map((entry) => load(entry, arrived)));
+  preparing();
+  return tables(Object.fromEntries(entries.map(({ name }, i) => [name, loaded[i]])));
 }
 
 function program(vertex, fragment) {
@@ -83,6 +88,7 @@ function tables(columns) {
     brick_offset: texture("r32i", rowsFor(columns.brick_offset.length), columns.brick_offset, 1),
     voxels: voxelsOf(columns.voxel_red_blue, columns.voxel_green_density),
     nodes: rowsFor(nodes),
+    surfels: columns.surfel.length,
   };
 }
 
@@ -169,15 +175,15 @@ function draw({ tier: name, bones, camera, width, height, samples }) {
   gl.enable(gl.DEPTH_TEST);
   gl.depthFunc(gl.LESS);
   clear(t, "nearest");
-  pass("nearest", "nearest", [1, 1], tier.surfels);
+  pass("nearest", "nearest", [1, 1], tier.textures.surfels);
   clear(t, "keys");
-  pass("splat", "keys", [width + border, height + border], tier.surfels);
+  pass("splat", "keys", [width + border, height + border], tier.textures.surfels);
   gl.disable(gl.DEPTH_TEST);
   pass("first", "first", [width, height]);
   if (tier.note.rules.layers > 1) {
     gl.enable(gl.DEPTH_TEST);
     clear(t, "keys");
-    pass("behind", "keys", [width + border, height + border], tier.surfels);
+    pass("behind", "keys", [width + border, height + border], tier.textures.surfels);
     gl.disable(gl.DEPTH_TEST);
   }
   pass("second", "second", [width, height]);
