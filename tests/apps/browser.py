@@ -61,10 +61,16 @@ class Browser:
         self._session, self._held, self._numbers = "", b"", itertools.count(1)
 
     def __enter__(self) -> "Browser":
-        target = self._ask("Target.createTarget", url="about:blank")["targetId"]
+        until(self._pages, 60.0)
+        target = self._pages()[0]  # the window's own: one behind it is not always painted
         attached = self._ask("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
+        self._ask("Page.bringToFront")
         return self
+
+    def _pages(self) -> list[str]:
+        found = self._ask("Target.getTargets", whole=True)["targetInfos"]
+        return [target["targetId"] for target in found if target["type"] == "page"]
 
     def __exit__(self, *error: object) -> None:
         self._process.terminate()
