@@ -191,10 +191,11 @@ def _report(
 def _frames_note(learnt: Learnt) -> FramesNote:
     meter = learnt.meter
     return FramesNote(
-        read=learnt.added + meter.held_out + meter.dropped_count,
+        read=learnt.added + meter.held_out + meter.dropped_count + meter.passed_over,
         used=learnt.added,
         held_out=meter.held_out,
         dropped=tuple(meter.dropped),
+        alike=meter.passed_over,
         not_replayed=learnt.added - sum(i >= 0 for i in learnt.trainer.replay.indices),
     )
 

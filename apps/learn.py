@@ -21,20 +21,17 @@ from avatar.config import TrainConfig
 from avatar.coverage import Coverage
 from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
-from avatar.hold import HeldOut, keep, prepared, score
+from avatar.hold import HeldOut, Ready, keep, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
 from capture.playback import Playback
-from preprocess.observe import Dropped
 
 CHECKPOINT_EVERY_S = 5.0
 LATE_S = 0.5
 """A playback that lags more than this is spoken of."""
-
-Item = PreparedFrame | HeldOut | Dropped
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -203,7 +200,7 @@ class Lesson:
         if isinstance(self._recording.source, Playback):
             self._recording.source.rushed = rushed
 
-    def _frames(self) -> Iterator[Item]:
+    def _frames(self) -> Iterator[Ready]:
         """Frames as they become ready; runs on the inbox's thread."""
         frames = self.meter.frames(self._recording.source.frames())
         found = self.meter.watched(map(self._recording.observer(), frames))
@@ -212,7 +209,7 @@ class Lesson:
         observations = shown(found, self.coverage, self._watchers, every=every, total=total)
         return self.meter.timed(prepared(observations, rig, every=every, total=total))
 
-    def _recall(self, inbox: Inbox[Item], count: int) -> int:
+    def _recall(self, inbox: Inbox[Ready], count: int) -> int:
         """Puts frames back into the memory of a trainer that has learnt from them before."""
         seen = 0
         if not count:

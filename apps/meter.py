@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar, final
 
 from apps.report import DroppedNote, Spread, StreamNote
+from avatar.hold import PassedOver
 from capture.frame import Frame
 from capture.reservoir import Reservoir
 from capture.source import Source
@@ -27,6 +28,7 @@ class Meter:
         read: Frames that came out of the source.
         dropped: Those that were left out, the first `MOST_NOTES` of them.
         dropped_count: How many were left out.
+        passed_over: How many are not learnt from because they look like the one before.
         held_out: How many the trainer got that are not learnt from.
         first_at: When the first frame was there, on `time.perf_counter`'s clock.
         last_s: The newest frame's time, counted from the first frame's.
@@ -42,7 +44,7 @@ class Meter:
     def __init__(self, stop: threading.Event, source: Source) -> None:
         """A meter whose streams end early once `stop` is set."""
         self._stop, self._source = stop, source
-        self.read = self.dropped_count = self.held_out = 0
+        self.read = self.dropped_count = self.passed_over = self.held_out = 0
         self.dropped: list[DroppedNote] = []
         self.first_at: float | None = None
         self.last_s = 0.0
@@ -92,7 +94,10 @@ class Meter:
             except StopIteration:
                 return
             waited = self._source.waited_s - waited
-            self.prepared_s.add(time.perf_counter() - started - waited)
+            if isinstance(item, PassedOver):
+                self.passed_over += 1
+            else:
+                self.prepared_s.add(time.perf_counter() - started - waited)
             yield item
 
     def arrived(self, index: int, *, held_out: bool) -> None:

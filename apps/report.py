@@ -41,6 +41,7 @@ class FramesNote:
         used: Trained on.
         held_out: Scored, and never trained on.
         dropped: Left out.
+        alike: Not trained on, because each looks like the one before it.
         not_replayed: Trained on when they came, but not among the key frames that stayed.
     """
 
@@ -48,6 +49,7 @@ class FramesNote:
     used: int
     held_out: int
     dropped: tuple[DroppedNote, ...]
+    alike: int
     not_replayed: int
 
 

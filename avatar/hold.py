@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
 
 from avatar.cells import WarpCells
 from avatar.events import Score
+from avatar.likeness import Distinct
 from avatar.metrics import psnr, ssim
 from avatar.model import Avatar
 from avatar.prepare import PreparedFrame, prepare
@@ -44,6 +45,16 @@ class HeldOut:
         return replace(self, cells=WarpCells.of(rig, self.observation.pose.joint_rotations))
 
 
+class PassedOver(NamedTuple):
+    """A frame that is not learnt from: it looks like the one before."""
+
+    index: int
+
+
+Ready = PreparedFrame | HeldOut | Dropped | PassedOver
+"""What becomes of a frame before the trainer sees it."""
+
+
 def is_held_out(position: int, *, every: int, total: int | None) -> bool:
     """Whether the frame at a position of the stream is held out: 9, 19, 29, …
 
@@ -62,15 +73,28 @@ def is_held_out(position: int, *, every: int, total: int | None) -> bool:
 
 def prepared(
     observations: Iterator[Observation | Dropped], rig: Rig, *, every: int, total: int | None
-) -> Iterator[PreparedFrame | HeldOut | Dropped]:
-    """Makes each observation ready, for training or for scoring, in the order they come."""
+) -> Iterator[Ready]:
+    """Makes observations ready, for training or for scoring, in the order they come.
+
+    Args:
+        observations: Of a stream.
+        rig: Whose body.
+        every: Every so manieth is held out.
+        total: How many there will be, if that is known.
+
+    Yields:
+        One item for each observation.
+    """
+    distinct = Distinct(rig)
     for position, observation in enumerate(observations):
         if isinstance(observation, Dropped):
             yield observation
         elif is_held_out(position, every=every, total=total):
             yield HeldOut(observation=observation)
-        else:
+        elif distinct.takes(observation):
             yield prepare(observation, rig)
+        else:
+            yield PassedOver(index=observation.frame.index)
 
 
 def on_white(

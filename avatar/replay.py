@@ -14,14 +14,13 @@ from torch import Tensor
 
 from avatar.cells import CELL_M, WarpCells
 from avatar.kernels.backend import CellTables, Rays
+from avatar.likeness import likeness
 from avatar.prepare import PreparedFrame, Sight
 from preprocess.pose import BodyPose
 
 NEAR_SHARE = 0.9
 """Of the rays, how many go through pixels near the person."""
 ERROR_MEMORY = 0.9
-JOINT_SPREAD = 0.5
-"""How much a radian of a joint counts beside a radian of the view when frames are compared."""
 
 
 class RootCorrection(NamedTuple):
@@ -112,9 +111,6 @@ class Replay:
         Returns:
             The slot that it took.
         """
-        likeness = np.concatenate(
-            [_facing(frame), frame.pose.joint_rotations.ravel() * JOINT_SPREAD]
-        )
         if len(self) < self.capacity:
             slot = len(self)
             self.indices.append(frame.index)
@@ -123,7 +119,7 @@ class Replay:
             slot = self._most_alike()
             self.indices[slot] = frame.index
             self._seen[slot] = frame.pose, frame.sight
-        self._compare(slot, likeness)
+        self._compare(slot, likeness(frame.origin, frame.pose))
         self._fill(slot, frame)
         held = self._error[: len(self)]
         self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
@@ -216,11 +212,11 @@ class Replay:
         store[slot, :needed] = torch.from_numpy(values).to(self.device)
         return store
 
-    def _compare(self, slot: int, likeness: Float[np.ndarray, "numbers"]) -> None:
+    def _compare(self, slot: int, numbers: Float[np.ndarray, "72"]) -> None:
         """Notes how far a slot's frame is from every other."""
         held = len(self)
-        self._likeness[slot] = likeness
-        gap = np.linalg.norm(self._likeness[:held] - likeness, axis=1)
+        self._likeness[slot] = numbers
+        gap = np.linalg.norm(self._likeness[:held] - numbers, axis=1)
         gap[slot] = np.inf
         self._gap[slot, :held] = self._gap[:held, slot] = gap
 
@@ -230,8 +226,3 @@ class Replay:
         pair = self._gap[[first, second]]
         pair[:, [first, second]] = np.inf
         return int((first, second)[int(pair.min(axis=1).argmin())])
-
-
-def _facing(frame: PreparedFrame) -> Float[np.ndarray, "3"]:
-    """The direction from which the camera sees the body: a unit vector of the body frame."""
-    return frame.origin / np.linalg.norm(frame.origin)

@@ -5,8 +5,16 @@ from collections.abc import Iterator
 from typing import final
 
 from avatar.events import Arrived, Evaluated, Finished, Idle, Score, Stepped, TrainEvent, Warned
-from avatar.hold import SCORED_AT_A_MARK, HeldOut, interleaved, keep, score, spread
-from avatar.prepare import PreparedFrame
+from avatar.hold import (
+    SCORED_AT_A_MARK,
+    HeldOut,
+    PassedOver,
+    Ready,
+    interleaved,
+    keep,
+    score,
+    spread,
+)
 from avatar.step import cosine
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
@@ -40,9 +48,7 @@ class Clock:
         return trainer.wall_seconds
 
 
-def train(
-    trainer: Trainer, inbox: Inbox[PreparedFrame | HeldOut | Dropped], held: list[HeldOut]
-) -> Iterator[TrainEvent]:
+def train(trainer: Trainer, inbox: Inbox[Ready], held: list[HeldOut]) -> Iterator[TrainEvent]:
     """Trains until the time is up, on whatever has arrived.
 
     The learning rate is constant while frames arrive and falls as a cosine after the last. Of a
@@ -117,7 +123,7 @@ class _Stream:
     def __init__(
         self,
         trainer: Trainer,
-        inbox: Inbox[PreparedFrame | HeldOut | Dropped],
+        inbox: Inbox[Ready],
         held: list[HeldOut],
     ) -> None:
         self._trainer, self._inbox, self._held = trainer, inbox, held
@@ -141,6 +147,8 @@ class _Stream:
         for item in self._inbox.take(wait_s=wait_s):
             if isinstance(item, Dropped):
                 yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+                continue
+            if isinstance(item, PassedOver):
                 continue
             if not self._started:
                 self.clock, self._started = Clock(self._trainer), True

@@ -64,7 +64,7 @@ def played_marks(capture: Path, run: Path) -> Iterator[Mark]:
         beside=f"in the mask {held['psnr_mask']:.2f}; {report['training']['steps']:,} steps, "
         f"{report['training']['rays_per_second'] / 1000:.0f} k rays/s; "
         f"{report['frames']['used']} frames learnt from, {len(report['frames']['dropped'])} left "
-        f"out; {report['frames']['not_replayed']} not kept",
+        f"out; {report['frames']['alike']} alike, {report['frames']['not_replayed']} not kept",
     )
     yield Mark(
         name="preparing a frame, p95, ms",

@@ -20,7 +20,7 @@ KEYS = {
     "": "format command recipe machine frames training held_out held_out_refined curve stream "
     "package coverage extended",
     "machine": "device backend threads",
-    "frames": "read used held_out dropped not_replayed",
+    "frames": "read used held_out dropped alike not_replayed",
     "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
     "samples_per_ray peak_memory_mb",
     "held_out": "frames size psnr psnr_mask ssim lpips background poses",
@@ -64,7 +64,9 @@ def test_the_report_has_the_keys_that_were_agreed(report):
 
 def test_every_frame_is_accounted_for(report):
     frames = report["frames"]
-    assert frames == {"read": 24, "used": 22, "held_out": 2, "dropped": [], "not_replayed": 0}
+    assert frames == {
+        "read": 24, "used": 22, "held_out": 2, "dropped": [], "alike": 0, "not_replayed": 0
+    }  # fmt: skip
     assert report["held_out"]["frames"] == [9, 19]
     assert report["held_out"]["size"] == [64, 64]
 

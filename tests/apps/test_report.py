@@ -43,6 +43,7 @@ def report(**changes):
             used=17,
             held_out=2,
             dropped=(DroppedNote(index=7, reason="pose invalid"),),
+            alike=0,
             not_replayed=0,
         ),
         "training": TrainingNote(

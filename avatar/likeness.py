@@ -1,0 +1,58 @@
+"""How alike two frames are to who learns from them, and which frames of a video are needed."""
+
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from avatar.rig import Rig
+from preprocess.observation import Observation
+from preprocess.pose import BodyPose
+
+JOINT_SPREAD = 0.5
+"""How much a radian of a joint counts beside a radian of the view when frames are compared."""
+ALIKE = 0.05
+"""Frames nearer to each other than this, about 3° of view, show a person from the same side."""
+RARELY_S = 0.5
+"""A person who stands still is looked at this often all the same."""
+
+
+def likeness(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, "72"]:
+    """What frames are compared by: the distance between two such vectors is like an angle.
+
+    Args:
+        origin: Where the camera is in the body frame.
+        pose: Of the body.
+
+    Returns:
+        The direction from which the body is seen, and its joints' rotations.
+    """
+    facing = origin / np.linalg.norm(origin)
+    return np.concatenate([facing, pose.joint_rotations.ravel() * JOINT_SPREAD])
+
+
+@final
+class Distinct:
+    """Chooses the frames of a stream that show something new.
+
+    At 30 frames a second most look like the one before: to make each ready would cost more than
+    it teaches, and take the time from training.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        """Nothing has been seen yet."""
+        self._rig = rig
+        self._last: tuple[float, Float[np.ndarray, numbers]] | None = None
+
+    def takes(self, observation: Observation) -> bool:
+        """Whether a frame is worth learning from, after those that were taken before."""
+        world_from_body = self._rig.world_from_body(observation.pose)
+        away = observation.camera.center_world - world_from_body[:3, 3]
+        now = likeness(away @ world_from_body[:3, :3], observation.pose)
+        at = observation.frame.time_s
+        if self._last is not None:
+            time_s, before = self._last
+            if np.linalg.norm(now - before) < ALIKE and abs(at - time_s) < RARELY_S:
+                return False
+        self._last = at, now
+        return True

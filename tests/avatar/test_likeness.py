@@ -1,0 +1,60 @@
+"""Which frames of a stream are needed: those that show something new."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from avatar.hold import HeldOut, PassedOver, prepared
+from avatar.likeness import ALIKE, JOINT_SPREAD, RARELY_S, Distinct, likeness
+from avatar.prepare import PreparedFrame
+from preprocess.pose import BodyPose
+
+
+def turned(observation, index, *, angle=0.0, bend=0.0, time_s=None):
+    """The same picture in a pose whose root has turned and whose elbow has bent so far."""
+    joints = np.zeros((23, 3))
+    joints[17, 1] = bend
+    pose = BodyPose(
+        root_rotation=np.array([0.0, angle, 0.0]),
+        root_translation=observation.pose.root_translation,
+        joint_rotations=joints,
+    )
+    frame = dataclasses.replace(
+        observation.frame, index=index, time_s=index / 100.0 if time_s is None else time_s
+    )
+    return dataclasses.replace(observation, frame=frame, pose=pose)
+
+
+def test_distance_is_the_angle_of_the_view_and_a_share_of_the_joints():
+    bent = np.zeros((23, 3))
+    bent[4] = [0.3, 0.0, 0.4]
+    rest, other = BodyPose.rest(), dataclasses.replace(BodyPose.rest(), joint_rotations=bent)
+    front, side = np.array([0.0, 0.0, 3.0]), 7.0 * np.array([np.sin(0.02), 0.0, np.cos(0.02)])
+    assert np.linalg.norm(likeness(front, rest) - likeness(side, rest)) == pytest.approx(
+        0.02, rel=1e-4
+    )
+    apart = np.linalg.norm(likeness(front, rest) - likeness(front, other))
+    assert apart == pytest.approx(0.5 * JOINT_SPREAD)
+
+
+@pytest.mark.parametrize("what", ["angle", "bend"])
+def test_of_a_slow_motion_the_frames_are_taken_that_are_far_enough_apart(rig, clip, what):
+    distinct, step = Distinct(rig), 0.3 * ALIKE / (1.0 if what == "angle" else JOINT_SPREAD)
+    stream = [turned(clip.observations[0], i, **{what: i * step}) for i in range(13)]
+    taken = [i for i, observation in enumerate(stream) if distinct.takes(observation)]
+    assert taken == [0, 4, 8, 12]
+
+
+def test_who_stands_still_is_looked_at_now_and_then(rig, clip):
+    distinct, times = Distinct(rig), np.arange(0.0, 2.01, 0.1)
+    stream = [turned(clip.observations[0], i, time_s=t) for i, t in enumerate(times)]
+    taken = [t for t, observation in zip(times, stream, strict=True) if distinct.takes(observation)]
+    np.testing.assert_allclose(taken, np.arange(0.0, 2.01, RARELY_S))
+
+
+def test_frames_that_are_passed_over_go_by_in_their_order(rig, clip):
+    angles = [0.0, 0.2 * ALIKE, 0.4 * ALIKE, 2.0 * ALIKE, 2.1 * ALIKE]
+    stream = [turned(clip.observations[0], i, angle=a) for i, a in enumerate(angles)]
+    kinds = [type(item) for item in prepared(iter(stream), rig, every=3, total=None)]
+    assert kinds == [PreparedFrame, PassedOver, HeldOut, PreparedFrame, PassedOver]
