@@ -17,7 +17,7 @@ RARELY_S = 0.5
 """A person who stands still is looked at this often all the same."""
 
 
-def likeness(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, "72"]:
+def likeness(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, " 72"]:
     """What frames are compared by: the distance between two such vectors is like an angle.
 
     Args:

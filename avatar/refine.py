@@ -40,6 +40,9 @@ STRAYED_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
 MEAN_PULL = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
+BEGUN_AFTER_STEPS = 60
+"""A frame's pose is corrected once its frame has been learnt from for so many steps: before, the
+field does not know what is seen from there, and what is new looks like what is off."""
 JUDGED_AFTER_STEPS, JUDGED_BY = 300, 3
 """A pose is judged once its frame has been learnt from for so many steps, by so many pulls."""
 EXACT = 1.3
@@ -142,17 +145,21 @@ class PoseTable:
         )
 
     def settle(self, step: int) -> bool:
-        """Leaves alone poses that proved exact or were refined enough; whether any are left."""
+        """Which poses may be corrected now; whether there are any.
+
+        Those whose frames are new wait; those that proved exact, or were refined long enough, stay
+        as they are for good.
+        """
         held = np.array([pose is not None for pose in self._given])
         age = step - self._since
         self._judged = age >= JUDGED_AFTER_STEPS
         told = self._told / self._asked.clip(min=1)
         exact = (self._asked >= JUDGED_BY) & (0.5 * (told + self._evidence) < EXACT)
         self._settled |= exact | (age >= SETTLED_AFTER_STEPS)
-        young = held & ~self._settled
-        self._open.copy_(torch.from_numpy(young))
+        open_now = held & ~self._settled & (age >= BEGUN_AFTER_STEPS)
+        self._open.copy_(torch.from_numpy(open_now))
         self._rays *= self._open
-        return bool(young.any())
+        return bool(open_now.any())
 
     def feel(
         self,

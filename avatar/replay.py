@@ -212,7 +212,7 @@ class Replay:
         store[slot, :needed] = torch.from_numpy(values).to(self.device)
         return store
 
-    def _compare(self, slot: int, numbers: Float[np.ndarray, "72"]) -> None:
+    def _compare(self, slot: int, numbers: Float[np.ndarray, " 72"]) -> None:
         """Notes how far a slot's frame is from every other."""
         held = len(self)
         self._likeness[slot] = numbers

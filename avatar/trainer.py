@@ -31,8 +31,6 @@ NETWORK_RATE = 0.3
 """The network's learning rate as a share of the table's."""
 CLEARING_STEPS = 300
 """Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
-REFINED_AFTER_STEPS = 30
-"""Poses are corrected once there is something to compare them with."""
 CORRECTIONS_PER_STEP = 2
 
 
@@ -129,8 +127,8 @@ class Trainer:
         config, field = self.config, self.field
         batch = self.replay.draw(config.rays, self._generator)
         remembers = self.steps % config.occupancy_every < 2
-        refines = config.refine_poses and self.steps >= REFINED_AFTER_STEPS
-        refines = refines and self.steps % self.poses.every == 0 and self.poses.settle(self.steps)
+        refines = config.refine_poses and self.steps % self.poses.every == 0
+        refines = refines and self.poses.settle(self.steps)
         result = gradients(
             field, self.sampler, self.replay.cells, batch, config,
             hard_share=hard_share,

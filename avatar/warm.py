@@ -8,9 +8,10 @@ from jaxtyping import UInt8
 
 from avatar.cells import WarpCells
 from avatar.prepare import BodyRays, PreparedFrame
+from avatar.refine import BEGUN_AFTER_STEPS
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.trainer import REFINED_AFTER_STEPS, Trainer
+from avatar.trainer import Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
@@ -31,7 +32,7 @@ def warm_up(trainer: Trainer) -> float:
     stand_in = Trainer(rig, config, device)
     camera = _camera_before(rig)
     stand_in.add(_frame(rig, camera))
-    stand_in.steps = REFINED_AFTER_STEPS
+    stand_in.steps = BEGUN_AFTER_STEPS
     for _ in range(config.occupancy_every):
         stand_in.step(rate=1.0, hard_share=1.0)
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it

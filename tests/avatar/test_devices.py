@@ -12,8 +12,9 @@ from avatar import checkpoint, fit, pose_step
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished
 from avatar.hold import HeldOut, prepared, score
+from avatar.refine import BEGUN_AFTER_STEPS
 from avatar.train import train
-from avatar.trainer import REFINED_AFTER_STEPS, Trainer
+from avatar.trainer import Trainer
 from capture.inbox import Inbox
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -50,7 +51,7 @@ def trainer(device, rig, clip):
     trainer = Trainer(rig, CONFIG, device)
     for item in prepared(iter(clip.observations[:4]), rig, every=0, total=None):
         trainer.add(item)
-    trainer.steps = REFINED_AFTER_STEPS - 3
+    trainer.steps = BEGUN_AFTER_STEPS - 3
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pose_step, "CHANCE", -1.0)  # these poses are exact, and would not move
         patch.setattr(pose_step, "CERTAIN", 0.0)

@@ -17,7 +17,13 @@ from avatar.kernels.backend import CellTables, Samples
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.levels import FEATURES
-from avatar.refine import JUDGED_AFTER_STEPS, JUDGED_BY, SETTLED_AFTER_STEPS, PoseTable
+from avatar.refine import (
+    BEGUN_AFTER_STEPS,
+    JUDGED_AFTER_STEPS,
+    JUDGED_BY,
+    SETTLED_AFTER_STEPS,
+    PoseTable,
+)
 from avatar.render import cell_tables
 from avatar.step import cosine
 from avatar.trainer import Trainer
@@ -234,6 +240,23 @@ def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator
     assert corrected(SETTLED_AFTER_STEPS + 1000) == set()
 
 
+def test_a_frame_that_has_just_come_is_not_corrected_yet(rig, bent_pose, generator):
+    """The field does not know yet what is seen from there, and all of its rays pull one way."""
+    table = PoseTable(rig, 2, CPU)
+    table.put(0, pose_of(bent_pose), step=500)
+    wrenches, loss = torch.randn(300, 24, 6, generator=generator) + 3.0, torch.full((300,), 0.1)
+
+    def corrected(step):
+        open_now = table.settle(step)
+        table.feel(torch.zeros(300, dtype=torch.int64), wrenches, loss)
+        slot = table.correct_one(rate=1.0)
+        assert open_now == (slot is not None)
+        return slot
+
+    assert corrected(500 + BEGUN_AFTER_STEPS - 1) is None
+    assert corrected(500 + BEGUN_AFTER_STEPS) == 0
+
+
 def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, generator):
     """Chance is not believed again later; the frame whose rays all pull one way stays open."""
     table, pose = PoseTable(rig, 2, CPU), pose_of(bent_pose)
@@ -247,7 +270,7 @@ def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, gener
         table.feel(torch.full((300,), slot), wrenches, loss)
         return table.correct_one(rate=1.0) is not None
 
-    for step in range(60):  # too early to judge; it takes that long until all together agree
+    for step in range(60, 120):  # too early to judge; so long it takes until all together agree
         pulled(step, 0, 0.0)
     for step in range(later, later + JUDGED_BY):
         pulled(step, 0, 0.0)
