@@ -42,7 +42,7 @@ class Distinct:
     def __init__(self, rig: Rig) -> None:
         """Nothing has been seen yet."""
         self._rig = rig
-        self._last: tuple[float, Float[np.ndarray, numbers]] | None = None
+        self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 
     def takes(self, observation: Observation) -> bool:
         """Whether a frame is worth learning from, after those that were taken before."""
