@@ -78,7 +78,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
             _check_learnt(learnt, recording)
             startup = (learnt.meter.first_at or started) - started
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
-            with console.waiting("baking the avatar and checking its player"):
+            with console.waiting("baking the avatar and checking its player"), lesson.saving():
                 mark = learnt.curve[-1] if learnt.curve else None
                 views = views_of(learnt.held, recording)
                 taken = snapshot(trainer, run.package, views, mark=mark)

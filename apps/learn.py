@@ -3,6 +3,8 @@
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -135,6 +137,8 @@ class Lesson:
     def learn(self, *, recall: int = 0) -> Learnt:
         """Trains until the time is up or somebody stops it. Scores come later (`scored`).
 
+        What was learnt since the last checkpoint is not written yet (`saving`).
+
         Args:
             recall: Frames that the trainer has learnt from before: they are put back into its
                 memory before the clock starts.
@@ -166,7 +170,6 @@ class Lesson:
             self._console.warn(warning)
         self._console.count_the_rest()
         if len(self.trainer.replay):
-            self._save()
             seen = percent(self.coverage.seen)
             self._console.say(f"{seen} of the person was seen. {advice(self.coverage)}")
         return Learnt(
@@ -178,6 +181,18 @@ class Lesson:
             added=added + self.trainer.frames_seen,
             interrupted=interrupted,
         )
+
+    @contextmanager
+    def saving(self) -> Iterator[None]:
+        """Writes a checkpoint beside what happens in this block, which changes nothing learnt.
+
+        Raises:
+            OSError: If it cannot be written; the one before stays.
+        """
+        with ThreadPoolExecutor(1) as beside:
+            saved = beside.submit(self._save)
+            yield
+        saved.result()
 
     def scored(self, learnt: Learnt) -> Learnt:
         """The same with every held-out frame scored, in given poses and in fitted ones.

@@ -77,6 +77,8 @@ class RunFolder:
 
     def what_is_kept(self) -> str:
         """What a user can do after a run has failed half-way."""
+        if not self.has_checkpoint() and self.package.exists():
+            return f"Only {self.package} was written: it can be played, but not learnt on."
         if not self.has_checkpoint():
             return f"Nothing was written to {self.path}."
         return (

@@ -23,7 +23,7 @@ from preprocess.observe import Dropped
 READING_SHARE = 0.5
 """Share of the time after which a video that is still being read comes before training."""
 FAREWELL_STEPS = 20
-"""Steps after the last frame, at the least: a new frame's rays are drawn first."""
+"""Steps on the last frame, at the least: a new frame's rays are drawn first."""
 SCORING_SHARE = 0.015
 """Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
@@ -157,11 +157,11 @@ class _Stream:
                 yield Arrived(index=item.observation.frame.index, held_out=True)
             else:
                 self._trainer.add(item)
+                self._last_steps = self._trainer.steps + FAREWELL_STEPS
                 yield Arrived(index=item.index, held_out=False)
         too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
         if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
-            self._last_steps = self._trainer.steps + FAREWELL_STEPS
 
     def is_behind(self, now: float) -> bool:
         """Whether reading must come first for a while; a video's own pace cannot be hurried."""

@@ -193,13 +193,27 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     assert 0.0 < trainer.wall_seconds < 5.0
 
 
-def test_a_disk_that_is_full_from_the_start_leaves_nothing(
+def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_found_room(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
     def full(state, file):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    assert outcome.code == 3
+    assert "can be played" in outcome.complaint()
+    assert [file.name for file in (tmp_path / "run").rglob("*")] == ["avatar.iavatar"]
+
+
+def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
+    capture, call_ingest, tmp_path, monkeypatch
+):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    monkeypatch.setattr("apps.snapshot.export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "Nothing was written" in outcome.complaint()
