@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.optimize import minimize
 
 from capture.errors import BadInput
 from capture.source import Source
@@ -63,6 +62,8 @@ def refitted(claim: Claim, evidence: Evidence) -> Refit:
         claim: Poses of SMPL's family, and cameras.
         evidence: Masks, and the body.
     """
+    from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
+
     shaped, some = evidence.skin.shaped, evidence.some(FRAMES)
     scenes = [scene for witness in some.witnesses if (scene := _scene(claim, some, witness))]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence
@@ -180,6 +179,8 @@ def _fit(
     make: Callable[[float], Cure], claim: Claim, evidence: Evidence, *, near: bool = False
 ) -> Cure:
     """The factor that agrees best: a coarse look (unless it is near 1), then a narrow one."""
+    from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
+
     logs = np.zeros(1) if near else np.linspace(-0.8, 0.8, 9)
 
     def loss(log: float) -> float:

@@ -5,7 +5,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from preprocess.doctor.claim import Claim
@@ -95,6 +94,8 @@ def _turned(up: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 
 
 def _refined(scene: _Scene, start: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """Moved and turned about the bodies' middle until masks agree best (Nelder and Mead)."""
+    from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
+
     middle = np.mean([p.mean(axis=0) for p, _ in scene.bodies], axis=0) @ start[:3, :3].T
 
     def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
