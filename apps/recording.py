@@ -19,6 +19,7 @@ from preprocess.body import Body, ShapedBody
 from preprocess.camera_file import CameraTrack, default_cameras, read_cameras, upright_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
+from preprocess.focal import focal_from_masks
 from preprocess.live import LiveParts
 from preprocess.masks import Masks, open_masks
 from preprocess.observation import Observation
@@ -122,6 +123,8 @@ class Recording:
             cameras = default_cameras(motion, source.size_px)
         shaped = shaped_for(body, motion)
         motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
+        if paths.cameras is None and motion.intrinsic is None and motion.lens is None:
+            cameras = focal_from_masks(cameras, motion, shaped, source, masks)
         shaped, motion, fitted = refit_to_masks(motion, shaped, cameras, source, masks)
         estimated = named or (OURS if masks is None and not source.has_alpha else None)
         recording = cls(

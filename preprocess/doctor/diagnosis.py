@@ -121,7 +121,7 @@ def _polished(
     for place, cure in enumerate(named[:-1]):
         if cure.factor is not None:
             make = _maker(cure.cause, pelvis)
-            again = _fit(make, healed, evidence, near=True).factor or 1.0
+            again = fit_factor(make, healed, evidence, near=True).factor or 1.0
             named[place] = make(cure.factor * again)
             healed = claim
             for each in named:
@@ -172,13 +172,20 @@ def _nearer_shifts(shifts: list[Tried], claim: Claim) -> list[Cure]:
 def _fitted(claim: Claim, evidence: Evidence) -> list[Cure]:
     """The focal length and the size that fit best, one at a time."""
     pelvis = evidence.skin.shaped.joints[0]
-    return [_fit(_maker(cause, pelvis), claim, evidence) for cause in FITTED]
+    return [fit_factor(_maker(cause, pelvis), claim, evidence) for cause in FITTED]
 
 
-def _fit(
+def fit_factor(
     make: Callable[[float], Cure], claim: Claim, evidence: Evidence, *, near: bool = False
 ) -> Cure:
-    """The factor that agrees best: a coarse look (unless it is near 1), then a narrow one."""
+    """The factor that agrees best: a coarse look (unless it is near 1), then a narrow one.
+
+    Args:
+        make: What makes a cure of a factor: `refocused`, `rescaled`.
+        claim: What the cure is applied to.
+        evidence: Masks of a few frames.
+        near: Whether the factor is within 20 % of 1.
+    """
     from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
 
     logs = np.zeros(1) if near else np.linspace(-0.8, 0.8, 9)

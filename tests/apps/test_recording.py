@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from apps.recording import Recording, RecordingPaths
+from benchmarks import spoils
 from capture.errors import BadInput
 from preprocess.kinematics import rotation_matrices
 from preprocess.poses import read_poses
@@ -114,3 +115,21 @@ def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
     found = list(live.observations())
     assert [observation.frame.index for observation in found] == [0, 1, 2, 3]
     assert all((observation.alpha > 0.5).any() for observation in found)
+
+
+def test_a_focal_length_that_nobody_knows_is_found_in_the_masks(capture, own):
+    spoils.in_camera_space(capture)
+    (capture / "cameras.npz").unlink()
+    found = Recording.open(RecordingPaths(video=capture))
+    assert found.cameras[0].focal_px == pytest.approx(own.cameras[0].focal_px, rel=0.04)
+    assert any("found from the masks" in note for note in found.notes)
+
+
+def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
+    spoils.in_camera_space(capture)
+    (capture / "cameras.npz").unlink()
+    intrinsic = own.cameras[0].intrinsic.copy()
+    intrinsic[[0, 1], [0, 1]] *= 0.8
+    changed(capture / "poses.npz", K=intrinsic)
+    found = Recording.open(RecordingPaths(video=capture))
+    assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
