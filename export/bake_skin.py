@@ -26,7 +26,9 @@ def skin_of(rig: Rig, hull: Hull) -> Skin:
     within = depths <= hull.thickness[:, None] + APART_M
     points = hull.positions[:, None] - hull.normals[:, None] * depths[:, None].astype(np.float32)
     cells = np.floor((points[within] - rig.box_low) / step_m).astype(np.int64)
-    cells = np.unique(np.clip(cells, 0, shape - 2), axis=0)
+    touched = np.zeros(shape - 1, dtype=bool)
+    touched[tuple(np.clip(cells, 0, shape - 2).T)] = True
+    cells = np.argwhere(touched)
     first, last = cells.min(axis=0), cells.max(axis=0) + 2
     stored = np.zeros(last - first, dtype=bool)
     for corner in np.ndindex(2, 2, 2):

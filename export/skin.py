@@ -1,6 +1,7 @@
 """The skin at half its step: nodes so close that posed positions may be taken as linear between."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
@@ -32,6 +33,7 @@ class SkinNodes:
     weights: Float32[np.ndarray, "24 rows"]
 
 
+@lru_cache(maxsize=1)
 def finer_nodes(skin: Skin) -> SkinNodes:
     """Every node of the halved grid that a cell with eight stored corners holds."""
     inside = _inside(skin.index > 0)
