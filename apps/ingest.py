@@ -23,7 +23,8 @@ from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
-    from apps.learn import Learnt
+    from apps.learn import Learnt, Lesson
+    from apps.snapshot import Snapshot
     from apps.view.viewer import Viewer
     from avatar.trainer import Trainer
 
@@ -57,7 +58,6 @@ def ingest(given: IngestArguments, console: Console) -> int:
         from apps.deliver import RunNote, deliver
         from apps.device import device_for
         from apps.learn import Lesson
-        from apps.snapshot import snapshot, views_of
         from apps.threads import use_threads
         from avatar.kernels.choice import backend_for
 
@@ -74,15 +74,10 @@ def ingest(given: IngestArguments, console: Console) -> int:
                 trainer, recording, run, console, stop, notes,
                 watchers=() if viewer is None else (viewer,),
             )  # fmt: skip
-            learnt = lesson.learn(recall=recall)
-            _check_learnt(learnt, recording)
+            learnt, taken = _taught(lesson, recall, recording, run, console)
             startup = (learnt.meter.first_at or started) - started
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
-            with console.waiting("baking the avatar and checking its player"), lesson.saving():
-                mark = learnt.curve[-1] if learnt.curve else None
-                views = views_of(learnt.held, recording)
-                taken = snapshot(trainer, run.package, views, mark=mark)
-            delivered = deliver(lesson.scored(learnt), taken, recording, run, note, console)
+            delivered = deliver(learnt, taken, recording, run, note, console)
             if given.json is not None:
                 write_text(given.json, delivered.report.to_json())
             code = _conclude(delivered, run, console, interrupted=stop.is_set())
@@ -184,6 +179,29 @@ def _viewer(
     from apps.view.viewer import Viewer
 
     return Viewer(recording, run, console, given.view)
+
+
+def _taught(
+    lesson: "Lesson", recall: int, recording: Recording, run: RunFolder, console: Console
+) -> "tuple[Learnt, Snapshot]":
+    """Learns and writes the package: where a video was waited for, at once, and later a finer one.
+
+    Scores come after the first package, which need not wait for them.
+    """
+    from apps.snapshot import finer, snapshot, views_of
+
+    learnt, hasty = lesson.learn(recall=recall), recording.source.paced
+    _check_learnt(learnt, recording)
+    views, trainer = views_of(learnt.held, recording), learnt.trainer
+    with console.waiting("baking the avatar and checking its player"), lesson.saving():
+        mark = learnt.curve[-1] if learnt.curve else None
+        taken = snapshot(trainer, run.package, views, mark=mark, hasty=hasty)
+    learnt = lesson.scored(learnt)
+    if hasty:
+        with console.waiting("baking the avatar more finely"):
+            mark = learnt.curve[-1] if learnt.curve else None
+            taken = finer(taken, snapshot(trainer, run.package, views, mark=mark))
+    return learnt, taken
 
 
 def _check_learnt(learnt: "Learnt", recording: Recording) -> None:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from export.build import ExportReport, View, export_avatar
 from export.errors import ExportRefused
 from preprocess.observe import shrunk
 
-CHECKED_VIEWS = 4
+CHECKED_VIEWS, HASTY_VIEWS = 4, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,12 @@ class Snapshot:
 
 
 def snapshot(
-    trainer: Trainer, path: Path, views: Sequence[View], *, mark: CurvePoint | None
+    trainer: Trainer,
+    path: Path,
+    views: Sequence[View],
+    *,
+    mark: CurvePoint | None,
+    hasty: bool = False,
 ) -> Snapshot:
     """Writes the package, whole or not at all; training may go on afterwards.
 
@@ -44,6 +49,7 @@ def snapshot(
             than nothing.
         views: Poses and cameras to check it with (`views_of`).
         mark: How well held-out frames were rendered when that was last asked; goes with it.
+        hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
 
     Raises:
         OSError: If the disk is full; what was there before stays.
@@ -53,10 +59,23 @@ def snapshot(
         "recipe": asdict(trainer.config),
     }
     try:
-        exported = export_avatar(trainer.avatar, path, views=views, metrics=metrics)
+        exported = export_avatar(
+            trainer.avatar,
+            path,
+            views=views[:HASTY_VIEWS] if hasty else views,
+            metrics=metrics,
+            hasty=hasty,
+        )
     except ExportRefused as error:
         return Snapshot(exported=None, refused=str(error), ready_at=time.perf_counter())
     return Snapshot(exported=exported, refused=None, ready_at=time.perf_counter())
+
+
+def finer(first: Snapshot, later: Snapshot) -> Snapshot:
+    """What there is after a hasty package was replaced, if it was; it was ready with the first."""
+    if first.exported is None:
+        return later
+    return first if later.exported is None else replace(later, ready_at=first.ready_at)
 
 
 def views_of(held: list[HeldOut], recording: Recording) -> Sequence[View]:

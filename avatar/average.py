@@ -9,11 +9,11 @@ import torch
 
 from avatar.field import Field
 
-HORIZON = 150
+HORIZON = 250
 """Steps over which the mean reaches back: the longer, the later it shows what is new."""
-YOUNG_SHARE = 1 / 8
+YOUNG_SHARE = 1 / 5
 """Share of all steps so far that it reaches back at most: the first ones were fog."""
-EVERY = 8
+EVERY = 16
 """Steps between updates."""
 
 

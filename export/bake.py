@@ -1,6 +1,6 @@
 """Bakes a trained field into the tables that the player draws."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Int32, UInt, UInt8, UInt16
@@ -21,6 +21,7 @@ from export.tables import (
     Tables,
     density_codes,
 )
+from export.tiers import TIERS
 from preprocess.kinematics import body_from_rest
 
 FAINT_SHARE = 0.1
@@ -32,6 +33,8 @@ COARSE_M = 0.012
 VOXEL_SHARE = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 FINEST_M, COARSEST_M = 0.0038, 0.006
+HASTY = 1.5
+"""How much coarser a package is that cannot wait."""
 COLOR_STEP, DENSITY_STEP, POSITION_STEP, NORMAL_STEP = 8, 16, 32, 7
 """Codes are rounded to multiples of these: nobody sees it, and bytes halve. Steps of density are
 54 %, of positions a millimetre, of normals three degrees."""
@@ -49,16 +52,27 @@ class BakeConfig:
         voxel_m: Distance between brick voxels.
         surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
         hull_density: Density of the hull's level set, 1/m; less where the whole field is faint.
+        tiers: Which qualities the package has; "hq" is always among them.
     """
 
     voxel_m: float = 0.004
     surfel_spacing_m: float = 0.006
     hull_density: float = 20.0
+    tiers: tuple[str, ...] = tuple(TIERS)
 
     @classmethod
     def for_cells(cls, finest_m: float) -> "BakeConfig":
         """For a field whose finest cells are that long: about two voxels each."""
         return cls(voxel_m=float(np.clip(VOXEL_SHARE * finest_m, FINEST_M, COARSEST_M)))
+
+    def hasty(self) -> "BakeConfig":
+        """For a package that is wanted at once, and that a finer one will follow."""
+        return replace(
+            self,
+            voxel_m=min(HASTY * self.voxel_m, COARSEST_M),
+            surfel_spacing_m=HASTY * self.surfel_spacing_m,
+            tiers=("hq",),
+        )
 
 
 def bake(

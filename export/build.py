@@ -82,6 +82,7 @@ def export_avatar(
     metrics: Mapping[str, Any],
     renderer: Callable[[Avatar, BodyPose, Camera], Picture] = render,
     config: BakeConfig | None = None,
+    hasty: bool = False,
 ) -> ExportReport:
     """Writes an avatar's package, or nothing.
 
@@ -93,6 +94,7 @@ def export_avatar(
         metrics: What training reported, kept in the manifest (JSON).
         renderer: The exact picture of an avatar.
         config: How finely to bake; follows the field's own finest cells if None.
+        hasty: Whether it is wanted at once, coarser and with one quality alone.
 
     Raises:
         ExportRefused: If the player would not draw what the avatar looks like, or there is nothing
@@ -109,6 +111,7 @@ def export_avatar(
         rgb, density = avatar.field_at(points.to(device))
         return rgb.cpu(), density.cpu()
 
+    config = config or BakeConfig.for_cells(finest_m)
     return export_field(
         field_at,
         avatar.rig,
@@ -117,7 +120,7 @@ def export_avatar(
         views=views,
         metrics=metrics,
         renderer=lambda pose, camera: renderer(avatar, pose, camera),
-        config=config or BakeConfig.for_cells(finest_m),
+        config=config.hasty() if hasty else config,
     )
 
 
@@ -143,10 +146,10 @@ def export_field(
         drawing = beside.submit(_drawing, lattice, rig, config, views, metrics)
         exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
         package, hq = drawing.result()
-        others = {t: beside.submit(Player, package, tier=t) for t in TIERS if t != "hq"}
+        others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
         compressed = beside.submit(draft.add_drawing, package)
         notes, warnings = {}, list[str]()
-        for tier in TIERS:
+        for tier in config.tiers:
             player = hq if tier == "hq" else others[tier].result()
             looks = slice(None) if tier == "hq" else slice(1)
             proofs = package.manifest.golden[: PROVEN[tier]]
@@ -183,22 +186,24 @@ def _drawing(
     metrics: Mapping[str, Any],
 ) -> tuple[AvatarPackage, Player]:
     """The package before its checks, and a player of its best tier."""
-    package = _package(tables_of(lattice, rig, config), rig, views, metrics)
+    package = _package(tables_of(lattice, rig, config), config.tiers, rig, views, metrics)
     return package, Player(package)
 
 
 def _package(
     tables: Tables,
+    tiers: Sequence[str],
     rig: Rig,
     views: Sequence[View],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
     """The package as it stands before the checks: no scores, no pictures."""
+    rules = {tier: TIERS[tier] for tier in tiers}
     notes = {
         tier: TierNote(
-            layout=Layout.of(tables), rules=rules, psnr_to_renderer=0.0, largest_difference=0.0
+            layout=Layout.of(tables), rules=rule, psnr_to_renderer=0.0, largest_difference=0.0
         )
-        for tier, rules in TIERS.items()
+        for tier, rule in rules.items()
     }
     golden = [
         GoldenFrame(pose=pose, camera=_fitted(camera, GOLDEN_PX))
@@ -215,9 +220,9 @@ def _package(
             sha256={},
         ),
         graphs={
-            tier: build_graph(tables, rules).SerializeToString() for tier, rules in TIERS.items()
+            tier: build_graph(tables, rule).SerializeToString() for tier, rule in rules.items()
         },
-        tables=dict.fromkeys(TIERS, tables),
+        tables=dict.fromkeys(tiers, tables),
         golden=(),
         preview=b"",
     )

@@ -237,6 +237,17 @@ def test_voxels_follow_the_field_within_bounds():
     assert BakeConfig.for_cells(0.1).voxel_m == COARSEST_M
 
 
+def test_a_hasty_package_is_coarser_and_plays_the_best_quality_alone(export, coarse, views):
+    report = export(config=coarse.hasty())
+    package = read_package(report.path)
+    assert list(package.manifest.tiers) == list(report.psnr_to_renderer) == ["hq"]
+    assert len(package.tables["hq"].surfels.positions) < 0.7 * len(
+        read_package(export(config=coarse).path).tables["hq"].surfels.positions
+    )
+    assert Player(package).render(*views["bent"])[..., 3].max() > 200
+    assert BakeConfig.for_cells(0.1).hasty().voxel_m == COARSEST_M
+
+
 def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
     path = tmp_path / "a.iavatar"
     path.write_bytes(b"older")
