@@ -10,7 +10,7 @@ from jaxtyping import Float32
 
 from avatar.cells import WarpCells
 from avatar.events import Score
-from avatar.likeness import Distinct
+from avatar.likeness import ROOM, Distinct
 from avatar.metrics import psnr, ssim
 from avatar.model import Avatar
 from avatar.prepare import PreparedFrame, prepare
@@ -72,7 +72,12 @@ def is_held_out(position: int, *, every: int, total: int | None) -> bool:
 
 
 def prepared(
-    observations: Iterator[Observation | Dropped], rig: Rig, *, every: int, total: int | None
+    observations: Iterator[Observation | Dropped],
+    rig: Rig,
+    *,
+    every: int,
+    total: int | None,
+    room: int = ROOM,
 ) -> Iterator[Ready]:
     """Makes observations ready, for training or for scoring, in the order they come.
 
@@ -81,11 +86,12 @@ def prepared(
         rig: Whose body.
         every: Every so manieth is held out.
         total: How many there will be, if that is known.
+        room: How many are learnt from before any is passed over.
 
     Yields:
         One item for each observation.
     """
-    distinct = Distinct(rig)
+    distinct = Distinct(rig, room=room)
     for position, observation in enumerate(observations):
         if isinstance(observation, Dropped):
             yield observation

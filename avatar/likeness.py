@@ -13,6 +13,8 @@ JOINT_SPREAD = 0.5
 """How much a radian of a joint counts beside a radian of the view when frames are compared."""
 ALIKE = 0.05
 """Frames nearer to each other than this, about 3° of view, show a person from the same side."""
+ROOM = 200
+"""So many frames are taken whatever they show, as many as stay for replay."""
 RARELY_S = 0.5
 """A person who stands still is looked at this often all the same."""
 
@@ -33,15 +35,15 @@ def likeness(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarra
 
 @final
 class Distinct:
-    """Chooses the frames of a stream that show something new.
+    """Chooses the frames of a long stream that show something new.
 
     At 30 frames a second most look like the one before: to make each ready would cost more than
     it teaches, and take the time from training.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        """Nothing has been seen yet."""
-        self._rig = rig
+    def __init__(self, rig: Rig, *, room: int = ROOM) -> None:
+        """Nothing has been seen yet; the first `room` frames are all taken."""
+        self._rig, self._room = rig, room
         self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 
     def takes(self, observation: Observation) -> bool:
@@ -52,7 +54,8 @@ class Distinct:
         at = observation.frame.time_s
         if self._last is not None:
             time_s, before = self._last
-            if np.linalg.norm(now - before) < ALIKE and abs(at - time_s) < RARELY_S:
+            alike = np.linalg.norm(now - before) < ALIKE and abs(at - time_s) < RARELY_S
+            if alike and not self._room:
                 return False
-        self._last = at, now
+        self._last, self._room = (at, now), max(self._room - 1, 0)
         return True

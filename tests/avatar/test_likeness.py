@@ -40,14 +40,20 @@ def test_distance_is_the_angle_of_the_view_and_a_share_of_the_joints():
 
 @pytest.mark.parametrize("what", ["angle", "bend"])
 def test_of_a_slow_motion_the_frames_are_taken_that_are_far_enough_apart(rig, clip, what):
-    distinct, step = Distinct(rig), 0.3 * ALIKE / (1.0 if what == "angle" else JOINT_SPREAD)
+    distinct, step = Distinct(rig, room=0), 0.3 * ALIKE / (1.0 if what == "angle" else JOINT_SPREAD)
     stream = [turned(clip.observations[0], i, **{what: i * step}) for i in range(13)]
     taken = [i for i, observation in enumerate(stream) if distinct.takes(observation)]
     assert taken == [0, 4, 8, 12]
 
 
+def test_as_long_as_there_is_room_every_frame_is_taken(rig, clip):
+    distinct = Distinct(rig, room=4)
+    stream = [turned(clip.observations[0], i, angle=1e-3 * ALIKE * i) for i in range(9)]
+    assert [i for i, seen in enumerate(stream) if distinct.takes(seen)] == [0, 1, 2, 3]
+
+
 def test_who_stands_still_is_looked_at_now_and_then(rig, clip):
-    distinct, times = Distinct(rig), np.arange(0.0, 2.01, 0.1)
+    distinct, times = Distinct(rig, room=0), np.arange(0.0, 2.01, 0.1)
     stream = [turned(clip.observations[0], i, time_s=t) for i, t in enumerate(times)]
     taken = [t for t, observation in zip(times, stream, strict=True) if distinct.takes(observation)]
     np.testing.assert_allclose(taken, np.arange(0.0, 2.01, RARELY_S))
@@ -56,5 +62,5 @@ def test_who_stands_still_is_looked_at_now_and_then(rig, clip):
 def test_frames_that_are_passed_over_go_by_in_their_order(rig, clip):
     angles = [0.0, 0.2 * ALIKE, 0.4 * ALIKE, 2.0 * ALIKE, 2.1 * ALIKE]
     stream = [turned(clip.observations[0], i, angle=a) for i, a in enumerate(angles)]
-    kinds = [type(item) for item in prepared(iter(stream), rig, every=3, total=None)]
+    kinds = [type(item) for item in prepared(iter(stream), rig, every=3, total=None, room=0)]
     assert kinds == [PreparedFrame, PassedOver, HeldOut, PreparedFrame, PassedOver]
