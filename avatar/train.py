@@ -24,6 +24,9 @@ READING_SHARE = 0.5
 """Share of the time after which a video that is still being read comes before training."""
 FAREWELL_STEPS = 20
 """Steps on the last frame, at the least: a new frame's rays are drawn first."""
+STREAMED_RATE = 0.5
+"""Factor of the learning rates while a video plays: what is shown has no falling rate behind it, and
+the mean of smaller swings is closer to what lies between them."""
 SCORING_SHARE = 0.015
 """Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
@@ -87,8 +90,11 @@ def train(trainer: Trainer, inbox: Inbox[Ready], held: list[HeldOut]) -> Iterato
 
 
 def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
+    falling = cosine(stream.progress(now))
     result = trainer.step(
-        rate=cosine(stream.progress(now)), hard_share=min(1.0, 4.0 * now / trainer.config.seconds)
+        rate=min(falling, stream.highest_rate),
+        pose_rate=falling,
+        hard_share=min(1.0, 4.0 * now / trainer.config.seconds),
     )
     return Stepped(
         step=trainer.steps,
@@ -132,6 +138,11 @@ class _Stream:
         self._last_steps = 0
         self.clock = Clock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
+
+    @property
+    def highest_rate(self) -> float:
+        """Factor of the field's learning rates that is never exceeded."""
+        return STREAMED_RATE if self._inbox.paced else 1.0
 
     @property
     def ended(self) -> bool:

@@ -117,12 +117,13 @@ class Trainer:
             self.held_up_wall += time.perf_counter() - wall
             self.held_up_cpu += time.process_time() - cpu
 
-    def step(self, *, rate: float, hard_share: float) -> StepResult:
+    def step(self, *, rate: float, hard_share: float, pose_rate: float | None = None) -> StepResult:
         """Draws rays, follows their gradient once, and keeps the occupancy up to date.
 
         Args:
             rate: Factor of the learning rates, in (0, 1].
             hard_share: Share of the hard-surface loss's weight, in [0, 1].
+            pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None.
         """
         config, field = self.config, self.field
         batch = self.replay.draw(config.rays, self._generator)
@@ -141,7 +142,7 @@ class Trainer:
         self.optimizer.step()
         field.table_grad.zero_()
         if refines:
-            self._correct_poses(rate)
+            self._correct_poses(rate if pose_rate is None else pose_rate)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             self._update_occupancy()
