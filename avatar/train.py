@@ -25,8 +25,8 @@ READING_SHARE = 0.5
 FAREWELL_STEPS = 20
 """Steps on the last frame, at the least: a new frame's rays are drawn first."""
 STREAMED_RATE = 0.5
-"""Factor of the learning rates while a video plays: what is shown has no falling rate behind it, and
-the mean of smaller swings is closer to what lies between them."""
+"""Factor of the learning rates while a video plays: what is shown has no falling rate behind it,
+and the mean of smaller swings is closer to what lies between them."""
 SCORING_SHARE = 0.015
 """Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)

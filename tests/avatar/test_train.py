@@ -256,14 +256,14 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
 def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip):
     """Read as fast as possible, reading would come first after half of the time."""
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
-    assert set(rates[1]) == {QUICK.learning_rate}
+    assert set(rates[1]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
     assert len(rates[3]) == train_module.FAREWELL_STEPS
     assert trainer.wall_seconds > 0.8  # the last frame came after the time that was given
 
 
 def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip):
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=1.5, opens_after_s=0.0)
-    assert set(rates[1]) == {QUICK.learning_rate}
+    assert set(rates[1]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
     falling = np.array(rates[3][1:])
     assert (np.diff(falling) <= 0.0).all()
     assert falling[-1] < 0.1 * QUICK.learning_rate
