@@ -5,6 +5,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from avatar.config import TrainConfig
 from avatar.rig import Rig
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
@@ -13,7 +14,7 @@ JOINT_SPREAD = 0.5
 """How much a radian of a joint counts beside a radian of the view when frames are compared."""
 ALIKE = 0.05
 """Frames nearer to each other than this, about 3° of view, show a person from the same side."""
-ROOM = 200
+ROOM = TrainConfig.key_frames
 """So many frames are taken whatever they show, as many as stay for replay."""
 RARELY_S = 0.5
 """A person who stands still is looked at this often all the same."""

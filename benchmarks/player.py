@@ -1,10 +1,12 @@
 """The player against what was asked of it: cost, likeness and size on avatars of the sample.
 
     python -m benchmarks.player [--quick] [--json FILE] [--keep FOLDER]
+                                [--person CAPTURE --dance POSES]
 
 Films two actors, learns each for a minute as a user does, bakes what was learnt and plays it on one
 thread. Costs are CPU time, and their ratio to a small reference graph that runs in between; the
-volume renderer's pictures and the studio's are what the player is compared with. There are no
+volume renderer's pictures and the studio's are what the player is compared with. A real person's
+capture is learnt the same way, if one is named; then a pose file says how to dance. There are no
 thresholds here: whether a mark is reached is for the reader to see.
 """
 
@@ -13,7 +15,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from avatar import checkpoint
 from avatar.trainer import Trainer
 from benchmarks.baked import baked, package_marks
 from benchmarks.hardware import ROOT, Hardware
-from benchmarks.likeness import likeness_marks, shots_of
+from benchmarks.likeness import Shot, likeness_marks, shots_of, shots_of_person
 from benchmarks.marks import Mark, table
 from benchmarks.pace import load_marks, pace_marks
 from benchmarks.stage import filmed
@@ -46,6 +48,10 @@ class Played:
     """File for the figures."""
     keep: Path | None = None
     """Folder for what is filmed and learnt; what lies there is used again."""
+    person: Path | None = None
+    """A real person's capture folder, with poses and masks."""
+    dance: Path | None = None
+    """A pose file that the real person dances to."""
 
 
 def main() -> int:
@@ -70,6 +76,8 @@ def measured(job: Played, folder: Path) -> Iterator[Mark]:
     """All rows; each is also told on standard error as soon as it is known."""
     subjects = (1,) if job.quick else (1, 2)
     groups = [subject_marks(folder, subject, quick=job.quick) for subject in subjects]
+    if job.person is not None and job.dance is not None:
+        groups.append(person_marks(folder, job.person, job.dance))
     for mark in itertools.chain.from_iterable(groups):
         print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
         yield mark
@@ -77,13 +85,27 @@ def measured(job: Played, folder: Path) -> Iterator[Mark]:
 
 def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Mark]:
     """One actor."""
-    name = f"subject {subject}"
     suffix = "" if subject == 1 else f"_{subject}"
     capture = filmed(folder / f"sample{SIZE_PX}{suffix}", SIZE_PX, subject=subject)
-    trainer = learnt(capture, folder / f"run{SIZE_PX}{suffix}")
+    trainer = learnt(capture, folder / f"run{SIZE_PX}{suffix}", frames=FRAMES)
     use_threads(1)
     shots = shots_of(capture, trainer.avatar, frames=FRAMES, every=2 if quick else 1)
     package = folder / f"player{SIZE_PX}{suffix}.iavatar"
+    yield from all_marks(f"subject {subject}", trainer, package, shots)
+
+
+def person_marks(folder: Path, capture: Path, dance: Path) -> Iterator[Mark]:
+    """A real person."""
+    trainer = learnt(capture, folder / "run_person", size=SIZE_PX)
+    use_threads(1)
+    shots = shots_of_person(capture, trainer.avatar, dance, size=SIZE_PX)
+    yield from all_marks("real person", trainer, folder / "player_person.iavatar", shots)
+
+
+def all_marks(
+    name: str, trainer: Trainer, package: Path, shots: Mapping[str, Sequence[Shot]]
+) -> Iterator[Mark]:
+    """What is measured of anybody."""
     bake = baked(trainer, package, shots["held out"][:4])
     yield from package_marks(name, package, bake)
     yield from load_marks(name, package)
@@ -91,11 +113,15 @@ def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Mark]:
     yield from likeness_marks(name, package, shots)
 
 
-def learnt(capture: Path, run: Path) -> Trainer:
+def learnt(
+    capture: Path, run: Path, *, frames: int | None = None, size: int | None = None
+) -> Trainer:
     """The trainer that ia-ingest left in a folder, which it is asked to fill if there is none."""
     if not (run / "checkpoint").exists():
         command = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
-        command += ["--frames", f"0:{FRAMES}", "--seconds", str(SECONDS), "--overwrite"]
+        command += ["--seconds", str(SECONDS), "--overwrite"]
+        command += [] if frames is None else ["--frames", f"0:{frames}"]
+        command += [] if size is None else ["--size", str(size)]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=True)
     return checkpoint.load(run / "checkpoint", torch.device("cpu"))[0]
 

@@ -40,9 +40,9 @@ def filmed(out: Path, size: int, **more: Any) -> Path:
     return out
 
 
-def opened(capture: Path, *, frames: slice | None = None) -> Recording:
-    """A filmed sample, as it is."""
-    return Recording.open(RecordingPaths(video=capture, frames=frames))
+def opened(capture: Path, *, frames: slice | None = None, size: int | None = None) -> Recording:
+    """A filmed sample or another capture, as it is or with a longer side of `size` pixels."""
+    return Recording.open(RecordingPaths(video=capture, frames=frames), size_px=size)
 
 
 def recipe(recording: Recording, seconds: float, **changes: Any) -> TrainConfig:
