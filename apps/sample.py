@@ -26,6 +26,10 @@ class SampleConfig:
 
         ia-ingest demo/capture/video.mp4 --poses demo/capture/poses.npz --out demo/run
 
+    With --motion walkaround a phone is carried around the actor in a furnished room. Like a
+    phone's video it comes without cameras: poses.npz is told in the camera of each frame, with K;
+    the true cameras lie in OUT/truth/cameras.npz, to compare with or to give as --cameras.
+
     Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C. The folder is written whole or not
     at all.
     """

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from capture.errors import BadInput
 from preprocess.npz import read_npz
-from preprocess.pose import Motion
+from preprocess.pose import Motion, Space
 from preprocess.rotations import joint_rotations
 
 LAYOUTS = (
@@ -29,8 +29,9 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
 
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
-    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model. Rows with NaN are marked as not
-    valid. Rotations may be 3x3 matrices; a body_pose of 63 numbers has no hands.
+    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model, space ("world", or "camera":
+    each row is in the camera of its frame). Rows with NaN are marked as not valid. Rotations may be
+    3x3 matrices; a body_pose of 63 numbers has no hands.
 
     A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
     a last line that is half written is left out.
@@ -90,11 +91,12 @@ def motion_of(arrays: Arrays, path: Path, *, default_model: str = "body24") -> M
         times_s=times,
         intrinsic=_intrinsic(arrays, path),
         camera_from_world=_cameras(arrays, count, path),
+        space=_space(arrays, path),
     )
 
 
 def _read_lines(path: Path) -> Arrays:
-    """One array for each key that every line has; of `model`, what the first line says.
+    """One array for each key that every line has; of words, what the first line says.
 
     Raises:
         BadInput: If there is no such file, or a line before the last holds no JSON object.
@@ -104,10 +106,11 @@ def _read_lines(path: Path) -> Arrays:
         whole = text[: text.rfind("\n") + 1]
         lines = [dict(json.loads(line)) for line in whole.splitlines() if line.strip()]
         keys = set.intersection(*(set(line) for line in lines)) if lines else set()
-        arrays = {key: np.array([line[key] for line in lines]) for key in keys - {"model"}}
+        words = {"model", "space"} & keys
+        arrays = {key: np.array([line[key] for line in lines]) for key in keys - words}
     except (OSError, ValueError, TypeError) as cause:
         raise BadInput(f"{path} is no file of one JSON object a line ({cause}).") from cause
-    return {**arrays, **({"model": np.array(lines[0]["model"])} if "model" in keys else {})}
+    return {**arrays, **{key: np.array(lines[0][key]) for key in words}}
 
 
 def write_motion(path: Path, motion: Motion) -> None:
@@ -123,6 +126,7 @@ def write_motion(path: Path, motion: Motion) -> None:
         "time": motion.times_s,
         "K": motion.intrinsic,
         "camera": motion.camera_from_world,
+        "space": None if motion.space == "world" else np.array(motion.space),
     }
     present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
     np.savez_compressed(path, **present)
@@ -210,6 +214,14 @@ def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
     if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
         raise BadInput(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
     return intrinsic
+
+
+def _space(arrays: Arrays, path: Path) -> Space:
+    """Where the poses are."""
+    said = str(arrays["space"]) if "space" in arrays else "world"
+    if said == "world" or said == "camera":
+        return said
+    raise BadInput(f"`space` in {path} is {said!r}; expected world or camera.")
 
 
 def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses 4 4"] | None:

@@ -37,6 +37,38 @@ def _turning(share: float, turns: float, phases: Float[np.ndarray, "8"]) -> Gest
     )
 
 
+def in_place(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+    """Gestures on the spot while somebody walks around: arms, knees, a slow turn, small shifts."""
+    phases = np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * np.pi, 12)
+    return _acted(actor, [_gesturing(i / frames, turns, phases) for i in range(frames)], fps)
+
+
+def _gesturing(share: float, turns: float, phases: Float[np.ndarray, "12"]) -> Gesture:
+    """The gestures after `share` of their length."""
+    wave = np.sin(2.0 * np.pi * share * np.array([3, 2, 4, 3, 2, 4, 3, 2, 3, 4, 1, 1]) + phases)
+    knees = 9.0 + 8.0 * wave[8], 9.0 + 8.0 * wave[9]
+    arms = [
+        Arm(
+            lift=-30.0 + 20.0 * wave[i], forward=14.0 + 16.0 * wave[i + 1],
+            elbow=34.0 + 24.0 * wave[i + 2], twist=16.0 * wave[i + 3],
+        )
+        for i in (0, 4)
+    ]  # fmt: skip
+    legs = [Leg(out=7.0, forward=0.55 * knee, knee=knee) for knee in knees]
+    return Gesture(
+        left=arms[0],
+        right=arms[1],
+        left_leg=legs[0],
+        right_leg=legs[1],
+        lean=3.0 * wave[9],
+        turn=6.0 * wave[8],
+        look=12.0 * wave[1],
+        nod=4.0 * wave[2],
+        yaw=360.0 * turns * share,
+        shift=(0.08 * wave[10], 0.08 * wave[11]),
+    )
+
+
 def dance(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
     """A dance that turns round while it goes, for filming."""
     keys = list(FILMED_DANCE)

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from capture.camera import Camera
 from preprocess.pose import Motion
+from preprocess.poses.place import moved
 
 NOISE_FRAMES = 3.0
 """A tracker wanders rather than flickers: its error is smooth over about this many frames."""
@@ -33,6 +35,20 @@ def tracked(motion: Motion, *, degrees: float, centimetres: float, seed: int) ->
         root_translations=motion.root_translations + moved,
         joint_rotations=motion.joint_rotations + turned[:, 1:],
     )
+
+
+def in_cameras(
+    motion: Motion, cameras: tuple[Camera, ...], pelvis: Float[np.ndarray, "3"]
+) -> Motion:
+    """The motion as a tracker tells it that knows no world: each row in its frame's camera, with K.
+
+    Args:
+        motion: In the world, a row a frame.
+        cameras: One for each frame.
+        pelvis: Where the person's pelvis rests.
+    """
+    views = np.stack([camera.camera_from_world for camera in cameras])
+    return replace(moved(motion, views, pelvis), space="camera", intrinsic=cameras[0].intrinsic)
 
 
 def _smooth_noise(

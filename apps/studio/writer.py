@@ -2,11 +2,9 @@
 
 import errno
 import shutil
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from os import cpu_count, getpid
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from os import getpid
 from pathlib import Path
 from typing import Literal
 
@@ -14,16 +12,17 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from apps.studio import backdrop, motions
+from apps.studio import backdrop, motions, walk
 from apps.studio.actor import Actor
 from apps.studio.framing import framed
+from apps.studio.room import Room
 from apps.studio.roughen import roughened
-from apps.studio.shade import over
-from apps.studio.tracker import tracked
+from apps.studio.stage import Stage
+from apps.studio.tracker import in_cameras, tracked
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.quiet import silence_opencv
-from preprocess.pose import BodyPose, Motion
+from preprocess.pose import Motion
 from preprocess.pose_file import write_motion
 
 Progress = Callable[[int, int], None]
@@ -39,23 +38,36 @@ class ShootConfig:
     fps: float = 30.0
     """Frames per second of the video."""
     size: int = 270
-    """Width and height of the pictures in pixels."""
-    turns: float = 2.0
-    """How often the actor turns round."""
+    """Width and height of the pictures in pixels; a walkaround's are so wide, and 16:9."""
+    turns: float | None = None
+    """How often the actor turns round; if not given 2, in a walkaround -0.75 (against the walk)."""
     seed: int = 0
     """Of the swaying, the clutter and the noise; from 1 on it varies the actor's looks, too."""
     subject: Literal[1, 2] = 1
     """Which of the two actors."""
-    motion: Literal["turn", "dance"] = "turn"
-    """What the actor does: turns with arms held off the body, or dances."""
-    background: Literal["plain", "clutter"] = "clutter"
-    """What stands behind the actor: a bare wall, or a room full of things."""
+    motion: Literal["turn", "dance", "walkaround"] = "turn"
+    """What happens: the actor turns with arms held off the body, or dances; or gestures while a
+    phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras
+    lie in truth/cameras.npz)."""
+    background: Literal["plain", "clutter", "room", "tiles"] | None = None
+    """What stands behind the actor: a bare wall, a painted room full of things (if not given), a
+    real room with furniture (a walkaround's, if not given), or one where every pattern repeats."""
     pose_noise_deg: float = 0.0
     """Noise of the poses: standard deviation of each rotation component, in degrees."""
     pose_noise_cm: float = 0.0
     """Noise of the poses: standard deviation of each component of the place, in centimetres."""
     mask_noise_px: float = 0.0
     """Noise of the masks: standard deviation of their border, in pixels."""
+
+    @property
+    def walks(self) -> bool:
+        """Whether the camera moves."""
+        return self.motion == "walkaround"
+
+    @property
+    def behind(self) -> Literal["plain", "clutter", "room", "tiles"]:
+        """What stands behind the actor, if nobody said it, too."""
+        return self.background or ("room" if self.walks else "clutter")
 
     def check(self) -> None:
         """Refuses what cannot be filmed.
@@ -70,9 +82,14 @@ class ShootConfig:
         }  # fmt: skip
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 option = "--" + name.replace("_", "-")
                 raise BadInput(f"{option} is {value}, but must lie between {low} and {high}.")
+        if self.walks and self.behind in ("plain", "clutter"):
+            raise BadInput(
+                f"--background {self.behind} is painted for a camera that stands still; with "
+                "--motion walkaround give room or tiles."
+            )
 
 
 def shoot(
@@ -81,7 +98,8 @@ def shoot(
     """Films the actor into the folder `out`, which appears whole or not at all.
 
     Args:
-        out: Folder that will hold video.mp4, masks/, cameras.npz, poses.npz, dance.npz and truth/.
+        out: Folder that will hold video.mp4, masks/, cameras.npz (a walkaround's lie in truth/),
+            poses.npz, dance.npz and truth/.
         config: What is filmed.
         progress: Told after each picture; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way.
@@ -123,71 +141,77 @@ def _check_place(out: Path, *, overwrite: bool) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Studio:
-    """All that stays the same from picture to picture."""
-
-    actor: Actor
-    camera: Camera
-    background: UInt8[np.ndarray, "height width 3"]
-
-    def picture(
-        self, pose: BodyPose
-    ) -> tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-        """The actor in the room, and the exact soft mask."""
-        rgb, alpha = self.actor.layers_of(pose, self.camera)
-        feet = self.actor.shaped.with_pose(pose).joints()[[10, 11]]
-        return over(rgb, alpha, backdrop.shadowed(self.background, feet, self.camera)), alpha
-
-    def pictures(
-        self, motion: Motion
-    ) -> Iterator[tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]]:
-        """All pictures of a motion in order, a few drawn ahead on other threads."""
-        workers = max(1, min(4, cpu_count() or 1))
-        with ThreadPoolExecutor(workers) as pool:
-            ahead = deque()
-            try:
-                for row in range(len(motion)):
-                    ahead.append(pool.submit(self.picture, motion[row]))
-                    if len(ahead) > workers:
-                        yield ahead.popleft().result()
-                while ahead:
-                    yield ahead.popleft().result()
-            finally:
-                for waiting in ahead:
-                    waiting.cancel()
-
-
 def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:
     actor = Actor.of(config.subject, config.seed)
-    camera = framed(actor, config.size)
-    background = backdrop.paint(config.background, camera, np.random.default_rng([config.seed, 4]))
-    studio = _Studio(actor=actor, camera=camera, background=background)
-    act = motions.turn if config.motion == "turn" else motions.dance
-    truth = act(actor, frames=config.frames, fps=config.fps, turns=config.turns, seed=config.seed)
+    truth = _acted(actor, config)
+    stages = _stages(actor, truth, config)
     novel = motions.novel(actor)
     total = len(truth) + len(novel)
-    _write_video(folder, studio, truth, config, lambda done: progress(done, total))
+    _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
     _write_novel(
-        folder / "truth" / "novel", studio, novel, lambda done: progress(len(truth) + done, total)
-    )
+        folder / "truth" / "novel", stages[1], novel,
+        lambda done: progress(len(truth) + done, total),
+    )  # fmt: skip
+    cameras = stages[0].cameras
+    given = truth if not config.walks else in_cameras(truth, cameras, actor.shaped.joints[0])
     given = tracked(
-        truth, degrees=config.pose_noise_deg, centimetres=config.pose_noise_cm, seed=config.seed
+        given, degrees=config.pose_noise_deg, centimetres=config.pose_noise_cm, seed=config.seed
     )
     write_motion(folder / "poses.npz", given)
     write_motion(folder / "truth" / "poses.npz", truth)
     write_motion(folder / "dance.npz", motions.clip(actor))
+    if config.walks:
+        # Nobody tells a phone where it is: the cameras are truth, and lie where no command looks.
+        _write_cameras(folder / "truth" / "cameras.npz", cameras)
+        _write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
+    else:
+        _write_cameras(folder / "cameras.npz", cameras)
+
+
+def _acted(actor: Actor, config: ShootConfig) -> Motion:
+    acts = {"turn": motions.turn, "dance": motions.dance, "walkaround": motions.in_place}
+    turns = config.turns
+    if turns is None:
+        turns = -0.75 if config.walks else 2.0
+    return acts[config.motion](
+        actor, frames=config.frames, fps=config.fps, turns=turns, seed=config.seed
+    )
+
+
+def _stages(actor: Actor, truth: Motion, config: ShootConfig) -> tuple[Stage, Stage]:
+    """Where the film is made, and where the poses that no film holds are pictured."""
+    kind = config.behind
+    if config.walks:
+        tall = walk.height_of(actor)
+        at = (truth.root_translations + actor.shaped.joints[0])[:, [0, 2]]
+        cameras = walk.carried(at, tall, config.size, config.seed)
+        apart = walk.standing(tall, config.size)
+    else:
+        apart = framed(actor, config.size)
+        cameras = (apart,)
+    if kind == "room" or kind == "tiles":
+        behind = Room.furnished(kind, config.size, config.seed)
+    else:
+        behind = backdrop.paint(kind, apart, np.random.default_rng([config.seed, 4]))
+    filmed = Stage(actor=actor, cameras=cameras, behind=behind)
+    return filmed, replace(filmed, cameras=(apart,), first=len(truth))
+
+
+def _write_cameras(path: Path, cameras: tuple[Camera, ...]) -> None:
+    """One camera, or one a frame, with their common K."""
+    extrinsics = np.stack([camera.camera_from_world for camera in cameras])
+    width, height = cameras[0].size_px
     np.savez(
-        folder / "cameras.npz",
-        intrinsic=camera.intrinsic,
-        extrinsic=camera.camera_from_world,
-        height=config.size,
-        width=config.size,
+        path,
+        intrinsic=cameras[0].intrinsic,
+        extrinsic=extrinsics[0] if len(cameras) == 1 else extrinsics,
+        height=height,
+        width=width,
     )
 
 
 def _write_video(
-    folder: Path, studio: _Studio, motion: Motion, config: ShootConfig, done: Callable[[int], None]
+    folder: Path, stage: Stage, motion: Motion, config: ShootConfig, done: Callable[[int], None]
 ) -> None:
     """video.mp4, lossless (FFV1), and masks/."""
     (folder / "masks").mkdir()
@@ -195,10 +219,10 @@ def _write_video(
     # The default mp4v costs 30 dB on stripes; FFV1 is exact, fast, and OpenCV reads it.
     silence_opencv()
     code = cv2.VideoWriter.fourcc(*"FFV1")
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, studio.camera.size_px)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, stage.cameras[0].size_px)
     generator = np.random.default_rng([config.seed, 5])
     try:
-        for index, (rgb, alpha) in enumerate(studio.pictures(motion)):
+        for index, (rgb, alpha) in enumerate(stage.pictures(motion)):
             writer.write(np.ascontiguousarray(rgb[..., ::-1]))
             mask = roughened(alpha, config.mask_noise_px, generator)
             _write_png(folder / "masks" / f"{index:04d}.png", _eight_bit(mask))
@@ -217,13 +241,11 @@ def _check_video(path: Path, frames: int) -> None:
         raise OSError(errno.ENOSPC, f"only {written} of {frames} video frames could be written")
 
 
-def _write_novel(
-    folder: Path, studio: _Studio, motion: Motion, done: Callable[[int], None]
-) -> None:
+def _write_novel(folder: Path, stage: Stage, motion: Motion, done: Callable[[int], None]) -> None:
     """Never-seen poses with their true images and masks."""
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
-    for index, (rgb, alpha) in enumerate(studio.pictures(motion)):
+    for index, (rgb, alpha) in enumerate(stage.pictures(motion)):
         _write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
         _write_png(folder / "masks" / f"{index:04d}.png", _eight_bit(alpha))
         done(index + 1)
