@@ -1,6 +1,7 @@
-"""What stands behind an avatar: a colour by its name, or a picture."""
+"""What stands behind an avatar: a colour by its name, a picture, or nothing."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from capture.errors import BadInput
 from capture.images import read_image
 
 Blend = Callable[[UInt8[np.ndarray, "height width 4"]], UInt8[np.ndarray, "height width 3"]]
+TRANSPARENT = "transparent"
 
 
 def background(wish: str) -> Blend:
@@ -33,10 +35,12 @@ def background(wish: str) -> Blend:
     path = Path(wish)
     if not path.is_file():
         raise BadInput(
-            f"--background {wish} is neither a colour (white, #203040) nor a picture that is there."
+            f"--background {wish} is neither a colour (white, #203040), nor {TRANSPARENT}, nor a "
+            "picture that is there."
         )
     picture, _ = read_image(path)
-    return lambda rgba: _over(rgba, _covering(picture, rgba.shape[1], rgba.shape[0]))
+    fitted = lru_cache(1)(lambda width, height: _covering(picture, width, height))
+    return lambda rgba: _over(rgba, fitted(rgba.shape[1], rgba.shape[0]))
 
 
 def _over(

@@ -31,6 +31,8 @@ class Benchmark:
         load_ms: Opening the package, wall.
         reference_ms: CPU time of one run of the reference graph, median.
         provider: onnxruntime's execution provider.
+        workers: How many pictures were drawn at the same time.
+        pictures_per_second: Wall.
         format: Of this record.
     """
 
@@ -43,6 +45,8 @@ class Benchmark:
     load_ms: float
     reference_ms: float
     provider: str = "CPUExecutionProvider"
+    workers: int = 1
+    pictures_per_second: float = 0.0
     format: int = 1
 
     def to_json(self) -> str:
@@ -57,15 +61,15 @@ def benchmark(
     *,
     load_ms: float,
     tier: str = "hq",
+    workers: int = 1,
+    samples: int | None = None,
 ) -> Benchmark:
     """Draws every shot, after a few to warm up."""
     shots = list(shots) * -(-FEWEST // len(shots))
-    for pose, camera in shots[:WARM_UP]:
-        player.render(pose, camera)
+    list(player.render_all(shots[: WARM_UP * workers], workers=workers, samples=samples))
     covered = 0.0
     wall, cpu = time.perf_counter(), time.process_time()
-    for pose, camera in shots:
-        picture = player.render(pose, camera)
+    for picture in player.render_all(shots, workers=workers, samples=samples):
         covered += float(np.count_nonzero(picture[..., 3])) / picture[..., 3].size
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return Benchmark(
@@ -77,6 +81,9 @@ def benchmark(
         wall_ms_per_frame=1000.0 * wall / len(shots),
         load_ms=load_ms,
         reference_ms=_reference_ms(_reference_graph()),
+        provider=player.provider,
+        workers=workers,
+        pictures_per_second=len(shots) / wall,
     )
 
 

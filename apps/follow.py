@@ -1,17 +1,21 @@
-"""The camera that nobody had to give: it follows the pelvis and shows the whole person."""
+"""The camera that nobody had to give: it follows the person and shows all of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from apps.viewpoint import Viewpoint
 from capture.camera import Camera
 from export.player import Player
-from preprocess.kinematics import rotation_matrices
+from preprocess.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.pose import BodyPose, Motion
+from preprocess.skeleton import JOINT_NAMES
 
 SHARE = 0.8
 """Of the picture's height, how much the standing person takes."""
+WIDEST = 1.5
+"""Height over width of a picture beyond which the person is smaller, so that arms fit in."""
 AWAY = 3.5
 """How far the camera stands, in heights of the person."""
 MEASURED_PX = 192
@@ -19,65 +23,98 @@ MEASURED_PX = 192
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FollowingCamera:
-    """A square picture in front of the first pose, upright as that pose is.
+    """A picture in front of the first pose, upright as that pose is.
 
     Trackers do not know where up is; a body's first pose mostly does.
 
     Attributes:
         size_px: Width and height.
-        axes: Rows: the picture's right, down and forward in the world.
-        pelvis: Rest pelvis, metres.
+        axes: Rows: the right, down and forward of a level picture from the front, in the world.
+        player: Whose person it is.
         height_m: Of the person standing.
         middle_m: How far the person's middle is above the pelvis.
+        viewpoint: Where it stands.
     """
 
-    size_px: int
+    size_px: tuple[int, int]
     axes: Float[np.ndarray, "3 3"]
-    pelvis: Float[np.ndarray, "3"]
+    player: Player
     height_m: float
     middle_m: float
+    viewpoint: Viewpoint
 
     @classmethod
-    def of(cls, player: Player, motion: Motion, size_px: int) -> "FollowingCamera":
-        """A camera for a motion; the person is measured in a small picture of a standing pose."""
-        pelvis = player.manifest.rest_joints[0]
+    def of(
+        cls,
+        player: Player,
+        motion: Motion,
+        size_px: int | tuple[int, int],
+        viewpoint: Viewpoint | None = None,
+    ) -> "FollowingCamera":
+        """A camera for a motion; the person is measured in a small picture of a standing pose.
+
+        Args:
+            player: Draws that picture.
+            motion: Its first valid pose says where the front is, and where up.
+            size_px: Width and height; one number for a square.
+            viewpoint: Before the person if None.
+        """
         first = int(np.flatnonzero(motion.valid)[0])
-        facing = np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[first]).T
         guess = cls(
-            size_px=MEASURED_PX,
+            size_px=(MEASURED_PX, MEASURED_PX),
             axes=np.diag([1.0, -1.0, -1.0]),
-            pelvis=pelvis,
+            player=player,
             height_m=2.2,
             middle_m=0.0,
+            viewpoint=Viewpoint(),
         )
-        standing = BodyPose(
-            root_rotation=np.zeros(3),
-            root_translation=np.zeros(3),
-            joint_rotations=player.manifest.canonical_rotations,
-        )
+        standing = standing_pose(player)
         rows = np.flatnonzero((player.render(standing, guess.at(standing))[..., 3] > 127).any(1))
         if not len(rows):  # nothing to be seen: leave it at the guess
             rows = np.array([0, MEASURED_PX - 1])
         metres = 2.2 / SHARE / MEASURED_PX
-        return cls(
-            size_px=size_px,
-            axes=facing,
-            pelvis=pelvis,
+        return replace(
+            guess,
+            size_px=(size_px, size_px) if isinstance(size_px, int) else size_px,
+            axes=np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[first]).T,
             height_m=float(rows[-1] + 1 - rows[0]) * metres,
             middle_m=float(MEASURED_PX - rows[0] - rows[-1] - 1) / 2.0 * metres,
+            viewpoint=viewpoint or Viewpoint(),
         )
 
-    def at(self, pose: BodyPose) -> Camera:
-        """The camera for one pose."""
-        distance = AWAY * self.height_m
-        focal = SHARE * self.size_px * distance / self.height_m
-        center = self.pelvis + pose.root_translation
+    def at(self, pose: BodyPose, seconds: float = 0.0) -> Camera:
+        """The camera for one pose, so many seconds after the first picture."""
+        view, (width, height) = self.viewpoint, self.size_px
+        away = AWAY * self.height_m
+        focal = SHARE * min(height, WIDEST * width) * away / self.height_m * view.zoom
+        axes = view.turned(seconds) @ self.axes
         camera_from_world = np.eye(4)
-        camera_from_world[:3, :3] = self.axes
-        camera_from_world[:3, 3] = [0.0, self.middle_m, distance] - self.axes @ center
+        camera_from_world[:3, :3] = axes
+        camera_from_world[:3, 3] = -axes @ self._looked_at(pose)
+        camera_from_world[2, 3] += view.distance_m or away
         return Camera(
             focal_px=(focal, focal),
-            center_px=(self.size_px / 2.0, self.size_px / 2.0),
-            size_px=(self.size_px, self.size_px),
+            center_px=(width / 2.0, height / 2.0),
+            size_px=self.size_px,
             camera_from_world=camera_from_world,
         )
+
+    def _looked_at(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
+        """What is in the middle of the picture, in the world."""
+        manifest, joint = self.player.manifest, self.viewpoint.joint
+        pelvis = manifest.rest_joints[0]
+        if joint is None:
+            return pelvis + pose.root_translation - self.middle_m * self.axes[1]
+        number = JOINT_NAMES.index(joint)
+        body = body_from_rest(manifest.rest_joints, manifest.parents, pose.joint_rotations)
+        world = world_from_body(pelvis, pose.root_rotation, pose.root_translation) @ body[number]
+        return world[:3, :3] @ manifest.rest_joints[number] + world[:3, 3]
+
+
+def standing_pose(player: Player) -> BodyPose:
+    """The avatar in its canonical pose: upright, arms a little away."""
+    return BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.zeros(3),
+        joint_rotations=player.manifest.canonical_rotations,
+    )

@@ -9,10 +9,16 @@ from apps.console import Console
 
 
 @contextmanager
-def asked_to_stop(console: Console) -> Iterator[threading.Event]:
+def asked_to_stop(
+    console: Console, kept: str = "what was learnt is being saved"
+) -> Iterator[threading.Event]:
     """An event that the first Ctrl-C sets; the second raises KeyboardInterrupt as always.
 
     Off the main thread, where signals do not arrive, it is never set.
+
+    Args:
+        console: Hears that it is stopping.
+        kept: What happens to the work done so far.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -22,7 +28,7 @@ def asked_to_stop(console: Console) -> Iterator[threading.Event]:
     def first(signal_number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop.set()
-        console.say("Stopping; what was learnt is being saved. Ctrl-C again quits at once.")
+        console.say(f"Stopping; {kept}. Ctrl-C again quits at once.")
 
     before = signal.signal(signal.SIGINT, first)
     try:

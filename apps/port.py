@@ -1,16 +1,31 @@
-"""Flags of the commands that open a page: --view, --web, each with a port that may be left out."""
+"""Flags whose value may be left out: --view, --web and their ports, --turntable and its seconds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 
 def with_port(words: Sequence[str], flag: str, port: int) -> list[str]:
-    """The command line with the port that may be left out after a flag.
+    """The command line with the port that may be left out after a flag."""
+    return _filled(words, flag, str(port), lambda word: word.isdecimal())
 
-    argparse would take the next word for it, whatever that is.
-    """
+
+def with_value(words: Sequence[str], flag: str, value: float) -> list[str]:
+    """The command line with the number that may be left out after a flag."""
+    return _filled(words, flag, f"{value:g}", _is_number)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _filled(words: Sequence[str], flag: str, value: str, fits: Callable[[str], bool]) -> list[str]:
+    """argparse would take the next word for the value, whatever that is."""
     filled: list[str] = []
     for word, after in zip(words, [*words[1:], ""], strict=True):
         filled.append(word)
-        if word == flag and not after.isdecimal():
-            filled.append(str(port))
+        if word == flag and not fits(after):
+            filled.append(value)
     return filled

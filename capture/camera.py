@@ -67,6 +67,12 @@ class Camera:
             size_px=size_px,
         )
 
+    def fitted(self, longer_px: int) -> "Camera":
+        """The same camera for a picture whose longer side is so long."""
+        scale = longer_px / max(self.size_px)
+        width, height = (max(1, round(side * scale)) for side in self.size_px)
+        return self.resized((width, height))
+
     def turned(self, quarter_turns: int) -> "Camera":
         """The camera of the same pictures, turned by so many times 90° against the clock.
 

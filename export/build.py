@@ -230,9 +230,7 @@ def _package(
 
 def _fitted(camera: Camera, longest_px: int) -> Camera:
     """The camera for a picture whose longer side is at most so long."""
-    scale = min(1.0, longest_px / max(camera.size_px))
-    width, height = (max(1, round(size * scale)) for size in camera.size_px)
-    return camera.resized((width, height))
+    return camera.fitted(min(longest_px, max(camera.size_px)))
 
 
 def _check_graph(

@@ -1,5 +1,8 @@
 """The player: poses and cameras in, pictures out, with numpy and onnxruntime alone."""
 
+from collections import deque
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -21,13 +24,28 @@ CLOSE = 2
 ALIKE = 0.999
 """… on at least this share of the pixels."""
 MOST_SAMPLES = 256
+LARGEST_PX = 8192
 
 
 @final
 class Player:
-    """Draws an avatar in any pose, from any camera, in any size."""
+    """Draws an avatar in any pose, from any camera, in any size.
 
-    def __init__(self, package: AvatarPackage, *, tier: str = "hq", threads: int = 1) -> None:
+    One player may be used by several threads at once.
+
+    Attributes:
+        manifest: What the package says about itself: joints, tiers, golden frames, licence.
+        provider: onnxruntime's execution provider that really draws.
+    """
+
+    def __init__(
+        self,
+        package: AvatarPackage,
+        *,
+        tier: str = "hq",
+        threads: int = 1,
+        provider: str = "cpu",
+    ) -> None:
         """A player of a package that has been read (or is about to be written)."""
         self.manifest: Manifest = package.manifest
         self._rules = package.manifest.tiers[tier].rules
@@ -35,38 +53,57 @@ class Player:
         self._tables = {
             name: array.tobytes() for name, array in initialisers(package.tables[tier]).items()
         }
-        self._session = _session(package.graphs[tier], self._tables, threads)
+        self.provider = provider_named(provider)
+        self._session = _session(package.graphs[tier], self._tables, threads, self.provider)
         canonical = self._body_from_rest(self.manifest.canonical_rotations)
         self._rest_from_canonical = np.linalg.inv(canonical)
 
     @classmethod
-    def load(cls, path: Path | str, *, tier: str = "hq", threads: int = 1) -> "Player":
+    def load(
+        cls,
+        path: Path | str,
+        *,
+        tier: str = "hq",
+        threads: int = 1,
+        provider: str = "cpu",
+    ) -> "Player":
         """Reads a package.
 
         Args:
             path: The `.iavatar` file.
-            tier: Which quality.
-            threads: More than one seldom pays: frames are better spread over processes.
+            tier: Which quality: "hq", or "lite" where the package has it.
+            threads: Of one picture; more than one seldom pays: see `render_all`.
+            provider: onnxruntime's execution provider, "cpu", "cuda", "openvino", …
 
         Raises:
-            BadInput: If the file is no sound package, or has no such tier.
+            BadInput: If the file is no sound package, or has no such tier, or there is no such
+                provider here.
         """
-        return cls(read_package(Path(path), tier=tier), tier=tier, threads=threads)
+        package = read_package(Path(path), tier=tier)
+        return cls(package, tier=tier, threads=threads, provider=provider)
 
     def render(
-        self, pose: BodyPose, camera: Camera, samples: int | None = None
+        self,
+        pose: BodyPose,
+        camera: Camera,
+        size: int | tuple[int, int] | None = None,
+        samples: int | None = None,
     ) -> UInt8[np.ndarray, "height width 4"]:
         """The avatar's picture with straight alpha.
 
         Args:
             pose: In the camera's world.
-            camera: Without lens distortion; its size is the picture's.
-            samples: Along each ray and layer; the package's own choice if None.
+            camera: Without lens distortion.
+            size: Longer side, or width and height, of the picture in pixels: the camera's own field
+                of view, scaled; the camera's own size if None.
+            samples: Along 5 cm of a ray; the tier's own choice if None.
 
         Raises:
-            BadInput: If the camera's lens bends, or there are no samples.
+            BadInput: If the camera's lens bends, or there are no samples or no pixels.
         """
         samples = self._rules.samples if samples is None else samples
+        if size is not None:
+            camera = camera.fitted(size) if isinstance(size, int) else camera.resized(size)
         if camera.distortion:
             raise BadInput(
                 "The camera has lens distortion, but the player draws pinhole pictures. "
@@ -75,6 +112,10 @@ class Player:
         if not 1 <= samples <= MOST_SAMPLES:
             raise BadInput(f"{samples} samples were asked for; 1 to {MOST_SAMPLES} can be drawn.")
         width, height = camera.size_px
+        if not (0 < width <= LARGEST_PX and 0 < height <= LARGEST_PX):
+            raise BadInput(
+                f"Pictures of {width}x{height} px cannot be drawn; 1 to {LARGEST_PX} a side can."
+            )
         lens = [*camera.focal_px, *camera.center_px]
         inputs = {
             "bones": self.bones(pose, camera).reshape(24, 12),
@@ -84,6 +125,43 @@ class Player:
             "samples": np.array(samples, dtype=np.int64),
         }
         return np.asarray(self._session.run(["rgba"], inputs)[0])
+
+    def render_all(
+        self,
+        shots: Iterable[tuple[BodyPose, Camera]],
+        *,
+        workers: int = 1,
+        samples: int | None = None,
+    ) -> Generator[UInt8[np.ndarray, "_ _ 4"], None, None]:
+        """Pictures of many shots, in their order, several at the same time.
+
+        The pictures do not depend on how many workers draw them. No more than a few are held back
+        until they are taken.
+
+        Args:
+            shots: Poses and cameras, as `render` takes them.
+            workers: Threads; onnxruntime leaves Python free while it draws.
+            samples: As in `render`.
+
+        Raises:
+            BadInput: As `render` does.
+        """
+        if workers == 1:
+            for pose, camera in shots:
+                yield self.render(pose, camera, samples=samples)
+            return
+        with ThreadPoolExecutor(workers) as beside:
+            drawn = deque[Future[UInt8[np.ndarray, "_ _ 4"]]]()
+            try:
+                for pose, camera in shots:
+                    drawn.append(beside.submit(self.render, pose, camera, samples=samples))
+                    if len(drawn) >= 2 * workers:
+                        yield drawn.popleft().result()
+                while drawn:
+                    yield drawn.popleft().result()
+            finally:
+                for picture in drawn:
+                    picture.cancel()
 
     def bones(self, pose: BodyPose, camera: Camera) -> Float32[np.ndarray, "24 3 4"]:
         """Camera-from-canonical matrices of the joints."""
@@ -98,22 +176,49 @@ class Player:
         return body_from_rest(self.manifest.rest_joints, self.manifest.parents, rotations)
 
 
-def _session(graph: bytes, tables: dict[str, bytes], threads: int) -> onnxruntime.InferenceSession:
+def provider_named(name: str) -> str:
+    """onnxruntime's own name of a provider: "cpu" is "CPUExecutionProvider".
+
+    Raises:
+        BadInput: If this onnxruntime has none of that name.
+    """
+    known = onnxruntime.get_available_providers()
+    for provider in known:
+        if name.lower() in (provider.lower(), provider.lower().removesuffix("executionprovider")):
+            return provider
+    short = ", ".join(provider.removesuffix("ExecutionProvider").lower() for provider in known)
+    raise BadInput(
+        f"onnxruntime {onnxruntime.__version__} has no provider {name!r} here; it has: {short}. "
+        "Others come with other builds of it, such as onnxruntime-gpu or onnxruntime-openvino."
+    )
+
+
+def _session(
+    graph: bytes, tables: dict[str, bytes], threads: int, provider: str
+) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3
+    options.log_severity_level = 4  # what fails is said below
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names, buffers = list(tables), list(tables.values())
     options.add_external_initializers_from_files_in_memory(
         names, buffers, [len(buffer) for buffer in buffers]
     )
+    wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # what it lacks, the CPU does
     try:
-        return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(graph, options, providers=wanted)
     except Exception as error:
         raise BadInput(
-            f"The package's graph does not run on onnxruntime {onnxruntime.__version__}: {error}"
+            f"The package's graph does not run on onnxruntime {onnxruntime.__version__} "
+            f"({provider}): {error}"
         ) from error
+    if session.get_providers()[0] != provider:
+        raise BadInput(
+            f"onnxruntime {onnxruntime.__version__} knows {provider} but could not start it here; "
+            "it would draw on the CPU instead. Are the drivers and libraries installed?"
+        )
+    return session
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,17 +256,21 @@ def premultiplied(
     return picture
 
 
-def verify(path: Path | str) -> list[Likeness]:
+def verify(path: Path | str, *, provider: str = "cpu") -> list[Likeness]:
     """Draws a package's golden frames again, on this machine.
+
+    Args:
+        path: The `.iavatar` file.
+        provider: onnxruntime's execution provider.
 
     Returns:
         For each golden frame, how far the new picture is from the stored one.
 
     Raises:
-        BadInput: If the file is no sound package.
+        BadInput: If the file is no sound package, or there is no such provider.
     """
     package = read_package(Path(path))
-    player = Player(package)
+    player = Player(package, provider=provider)
     return [
         Likeness.of(premultiplied(player.render(frame.pose, frame.camera)), premultiplied(stored))
         for frame, stored in zip(package.manifest.golden, package.golden, strict=True)

@@ -3,14 +3,18 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
+import onnxruntime
 import pytest
 from PIL import Image
 
+from apps import encoders
 from apps.follow import FollowingCamera
 from apps.novel import novel_motion
+from export.package import read_package, write_package
 from export.player import Player
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import BodyPose
@@ -66,8 +70,14 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
     assert [file.name for file in tmp_path.iterdir()] == ["frames"]
 
 
+@pytest.fixture
+def without_av(monkeypatch):
+    """As where the extra [video] is not installed."""
+    monkeypatch.setattr(encoders, "_has_av", lambda codec: False)
+
+
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, suffix):
+def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, suffix, without_av):
     out = tmp_path / f"clip{suffix}"
     outcome = call_play(
         package, "--poses", novel, "--out", out, "--size", SIZE, "--background", "#4080c0"
@@ -89,15 +99,15 @@ def test_a_gif_has_its_pictures_and_its_pace(call_play, package, novel, tmp_path
     out = tmp_path / "clip.gif"
     assert call_play(package, "--poses", novel, "--out", out, "--size", SIZE, "--fps", 20).code == 0
     with Image.open(out) as clip:
-        assert clip.n_frames == 12
+        assert clip.n_frames == 8  # 12 poses, 30 a second
         assert clip.info["duration"] == 50
         assert clip.size == (SIZE, SIZE)
 
 
 def test_odd_sizes_become_even_in_clips(call_play, package, novel, tmp_path):
     out = tmp_path / "clip.webm"
-    assert call_play(package, "--poses", novel, "--out", out, "--size", 95).code == 0
-    assert frames_of(out)[0].shape == (96, 96, 3)
+    assert call_play(package, "--poses", novel, "--out", out, "--size", "95x63").code == 0
+    assert frames_of(out)[0].shape == (64, 96, 3)
 
 
 def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
@@ -174,17 +184,46 @@ def test_the_benchmark_has_the_keys_that_were_agreed(call_play, package, tmp_pat
     found = json.loads(figures.read_text())
     assert " ".join(found) == (
         "format tier size frames pixels_covered cpu_ms_per_frame wall_ms_per_frame load_ms "
-        "reference_ms provider"
+        "reference_ms provider workers pictures_per_second"
     )
     assert found["size"] == SIZE
     assert 0.03 < found["pixels_covered"] < 0.6
     assert min(found[key] for key in ("cpu_ms_per_frame", "load_ms", "reference_ms")) > 0.0
 
 
-def test_golden_frames_look_the_same_here(call_play, package):
-    outcome = call_play(package, "--verify")
+def test_golden_frames_look_the_same_here(call_play, package, tmp_path):
+    outcome = call_play(package, "--verify", "--json", tmp_path / "verdict.json")
     assert outcome.code == 0
     assert "golden frame 0: same" in outcome.err
+    assert "verdict: same" in outcome.err
+    assert f"CPUExecutionProvider, onnxruntime {onnxruntime.__version__}" in outcome.err
+    found = json.loads((tmp_path / "verdict.json").read_text())
+    assert found["verdict"] == "same"
+    assert found["provider"] == "CPUExecutionProvider"
+    assert min(frame["close"] for frame in found["frames"]) >= 0.999
+
+
+def test_golden_frames_that_look_different_are_told_by_the_exit_code(call_play, package, tmp_path):
+    sound = read_package(package)
+    dark = tuple(np.where(frame > 128, frame - 100, frame) for frame in sound.golden[1:])
+    other = tmp_path / "avatar.iavatar"
+    write_package(replace(sound, golden=(sound.golden[0], *dark), graphs=_all(package)), other)
+    outcome = call_play(other, "--verify")
+    assert outcome.code == 2
+    assert "golden frame 0: same" in outcome.err
+    assert "golden frame 1: DIFFERENT" in outcome.err
+    assert f"verdict: DIFFERENT; {len(dark)} of {len(dark) + 1}" in outcome.err
+
+
+def _all(package):
+    return read_package(package, tier=None).graphs
+
+
+def test_a_provider_that_is_not_there_is_named(call_play, package):
+    for arguments in (["--verify"], ["--bench"], ["--out", "never.webm"]):
+        outcome = call_play(package, *arguments, "--provider", "abacus")
+        assert outcome.code == 2
+        assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
 
 
 def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
@@ -204,6 +243,19 @@ def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
         (["--out", "clip.avi"], ".avi"),
         (["--background", "no-such-colour"], "--background"),
         (["--size", "4"], "--size"),
+        (["--size", "640x"], "--size"),
+        (["--size", "99999x99"], "--size"),
+        (["--speed", "0"], "--speed"),
+        (["--workers", "0"], "--workers"),
+        (["--samples", "0"], "samples"),
+        (["--still", "12"], "0 to 11"),
+        (["--elevation", "91"], "--elevation"),
+        (["--zoom", "0"], "--zoom"),
+        (["--distance", "0.1"], "--distance"),
+        (["--close-up", "nose"], "left_hand"),
+        (["--turntable", "0"], "--turntable"),
+        (["--camera", "none.npz", "--orbit", "-20"], "leave out --orbit"),
+        (["--out", "clip.mp4", "--background", "transparent"], "no transparency"),
         (["--fps", "0"], "--fps"),
         (["--camera", "none.npz"], "none.npz"),
         (["--json", "figures.json"], "--bench"),
@@ -219,12 +271,12 @@ def test_wrong_wishes(call_play, package, novel, tmp_path, monkeypatch, argument
 
 def test_things_that_are_not_there(call_play, package, novel, tmp_path):
     none = tmp_path / "none"
-    assert "--poses" in call_play(package).complaint("ia-play")
+    assert "--poses" in call_play(package, "--still", 0).complaint("ia-play")
     assert "none.npz" in call_play(package, "--poses", f"{none}.npz").complaint("ia-play")
     assert "none.iavatar" in call_play(f"{none}.iavatar", "--poses", novel).complaint("ia-play")
 
 
-@pytest.mark.parametrize("name", ["clip.webm", "clip.mp4", "clip.gif", "frames"])
+@pytest.mark.parametrize("name", ["clip.webm", "clip.mp4", "clip.gif", "clip.webp", "frames"])
 def test_a_full_disk_leaves_nothing(package, novel, tmp_path, name):
     code = (
         "import resource, sys\n"

@@ -1,0 +1,82 @@
+"""Which pose each picture of a clip shows, so that a motion keeps its own pace."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from apps.rate import poses_a_second
+from preprocess.pose import BodyPose, Motion
+from preprocess.rotations import between
+
+MOST_FPS = 60.0
+"""Pictures a second if nobody says: motion capture of 120 poses a second shows every second one."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Timeline:
+    """Pictures at an even pace, and where in the motion each of them lies.
+
+    Attributes:
+        motion: What is shown.
+        rows: The poses of it that are valid, in order.
+        fps: Pictures a second.
+        places: For each picture, how far it is along `rows`; between two where it is no integer.
+    """
+
+    motion: Motion
+    rows: Int[np.ndarray, "valid"]
+    fps: float
+    places: Float[np.ndarray, "pictures"]
+
+    @classmethod
+    def of(cls, motion: Motion, *, fps: float | None, speed: float = 1.0) -> "Timeline":
+        """The pictures of a motion.
+
+        A motion without times is as fast as its pictures: one for each pose.
+
+        Args:
+            motion: With at least one valid pose.
+            fps: Pictures a second; the motion's own pace if None, if need be every second or third
+                pose of it.
+            speed: How many times faster than it was.
+        """
+        rows, rate = np.flatnonzero(motion.valid), poses_a_second(motion)
+        pace = fps or rate / float(np.ceil(rate / MOST_FPS - 1e-6))
+        step = speed if motion.times_s is None else speed * rate / pace
+        step = 1.0 if abs(step - 1.0) < 1e-3 else step
+        count = int((len(rows) - 1) / step + 1e-6) + 1
+        return cls(motion=motion, rows=rows, fps=pace, places=step * np.arange(count))
+
+    def __len__(self) -> int:
+        """How many pictures there are."""
+        return len(self.places)
+
+    def pose(self, picture: int) -> BodyPose:
+        """The pose of a picture: slerp between neighbours, straight lines for the root's place."""
+        before, share = self._before(picture)
+        first = self.motion[int(self.rows[before])]
+        if share < 1e-6:
+            return first
+        last = self.motion[int(self.rows[before + 1])]
+        turned = between(_rotations(first), _rotations(last), np.array([share]))[0]
+        way = last.root_translation - first.root_translation
+        return BodyPose(
+            root_rotation=turned[0],
+            root_translation=first.root_translation + share * way,
+            joint_rotations=turned[1:],
+        )
+
+    def row(self, picture: int) -> int:
+        """The row of the motion that is nearest to a picture."""
+        before, share = self._before(picture)
+        return int(self.rows[before + (share >= 0.5)])
+
+    def _before(self, picture: int) -> tuple[int, float]:
+        place = min(float(self.places[picture]), len(self.rows) - 1.0)
+        before = int(place + 1e-6)
+        return before, max(0.0, place - before)
+
+
+def _rotations(pose: BodyPose) -> Float[np.ndarray, "24 3"]:
+    return np.concatenate([pose.root_rotation[None], pose.joint_rotations])

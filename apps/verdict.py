@@ -1,0 +1,76 @@
+"""Whether a package looks here as it did where it was written."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import onnxruntime
+
+from export.player import ALIKE, CLOSE, Likeness, provider_named, verify
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What became of the golden frames.
+
+    Attributes:
+        frames: For each of them, how far it is from the stored one.
+        provider: onnxruntime's execution provider.
+    """
+
+    frames: tuple[Likeness, ...]
+    provider: str
+
+    @property
+    def same(self) -> bool:
+        """Whether all of them look the same; a package without any proves nothing."""
+        return bool(self.frames) and all(frame.alike for frame in self.frames)
+
+    def lines(self) -> list[str]:
+        """For the user."""
+        said = [
+            f"golden frame {number}: {'same' if frame.alike else 'DIFFERENT'} "
+            f"({frame.close:.2%} within {CLOSE}/255, largest difference {frame.largest:.0f}/255)"
+            for number, frame in enumerate(self.frames)
+        ]
+        where = f"{self.provider}, onnxruntime {onnxruntime.__version__}"
+        if not self.frames:
+            return [f"verdict: none; the package holds no golden frames ({where})."]
+        worst = max(frame.largest for frame in self.frames)
+        if self.same:
+            return [
+                *said,
+                f"verdict: same; {len(self.frames)} golden frames, worst difference "
+                f"{worst:.0f}/255 ({where})",
+            ]
+        bad = sum(not frame.alike for frame in self.frames)
+        return [
+            *said,
+            f"verdict: DIFFERENT; {bad} of {len(self.frames)} golden frames are not within "
+            f"{CLOSE}/255 on {ALIKE:.1%} of the pixels, worst difference {worst:.0f}/255 "
+            f"({where}). Update onnxruntime, try --provider cpu, or report it with these lines.",
+        ]
+
+    def to_json(self) -> str:
+        """For machines."""
+        content = {
+            "format": 1,
+            "verdict": "same" if self.same else "different",
+            "provider": self.provider,
+            "onnxruntime": onnxruntime.__version__,
+            "frames": [
+                {"largest": round(frame.largest, 3), "close": round(frame.close, 6)}
+                for frame in self.frames
+            ],
+        }
+        return json.dumps(content, indent=1) + "\n"
+
+
+def verdict_of(package: Path, *, provider: str) -> Verdict:
+    """Draws the golden frames of a package.
+
+    Raises:
+        BadInput: If the file is no sound package, or there is no such provider.
+    """
+    frames = tuple(verify(package, provider=provider))
+    return Verdict(frames=frames, provider=provider_named(provider))
