@@ -185,6 +185,7 @@ def _report(
         package=package,
         coverage=CoverageNote.of(learnt.coverage),
         extended=learnt.extended,
+        cameras=recording.solved,
     )
 
 

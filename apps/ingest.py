@@ -17,6 +17,7 @@ from apps.interrupt import asked_to_stop
 from apps.port import with_port
 from apps.recording import Recording
 from apps.run_folder import RunFolder
+from apps.solving.attempt import Attempt, attempted
 from apps.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
@@ -54,6 +55,19 @@ def ingest(given: IngestArguments, console: Console) -> int:
         console.warn(note)
     if not (given.resume and run.has_checkpoint()):
         first_look(recording, console, force=given.force)
+    with attempted(given.solve_job(recording), recording, run) as attempt:
+        return _learnt_and_delivered(given, recording, run, console, attempt, started)
+
+
+def _learnt_and_delivered(
+    given: IngestArguments,
+    recording: Recording,
+    run: RunFolder,
+    console: Console,
+    attempt: Attempt | None,
+    started: float,
+) -> int:
+    """All that comes once the input was found good."""
     with console.waiting("loading torch"):
         from apps.deliver import RunNote, deliver
         from apps.device import device_for
@@ -64,6 +78,8 @@ def ingest(given: IngestArguments, console: Console) -> int:
         threads = use_threads(given.threads)
     with console.waiting("compiling kernels (slow on the first run only)"):
         backend_for(device_for(given.device))  # a bad --device is said here, too
+    if attempt is not None:
+        recording = attempt.before(recording, console)
     trainer, recall, notes = _trainer(given, recording, run, console)
     _warm_up(trainer, console)
     viewer = _viewer(given, recording, run, console)
@@ -75,15 +91,21 @@ def ingest(given: IngestArguments, console: Console) -> int:
                 watchers=() if viewer is None else (viewer,),
             )  # fmt: skip
             learnt, taken = _taught(lesson, recall, recording, run, console)
+            if attempt is not None:
+                recording = attempt.after(recording, console, stop)
             startup = (learnt.meter.first_at or started) - started
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
             delivered = deliver(learnt, taken, recording, run, note, console)
             if given.json is not None:
                 write_text(given.json, delivered.report.to_json())
             code = _conclude(delivered, run, console, interrupted=stop.is_set())
+            if attempt is not None:
+                attempt.write(recording, run, console)
         if viewer is not None and code == DONE:
             console.say(f"The page stays at {viewer.page.address}. Ctrl-C ends it.")
             viewer.stay(lesson)
+        if code == DONE and attempt is not None and attempt.refused is not None:
+            raise Stop(f"{attempt.refused} The avatar was learnt without.", BAD_INPUT)
         return code
     except (OSError, KeyboardInterrupt) as error:
         error.add_note(run.what_is_kept())

@@ -1,6 +1,7 @@
 """What ia-ingest can be told; the text under each field is its --help."""
 
 import importlib.util
+import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +11,12 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.recording import Recording, RecordingPaths
 from apps.run_folder import RunFolder
+from apps.solving.job import SolveJob
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.growing import IDLE_S
+from preprocess.segmenter import segmenter_name
+from preprocess.stature import LEAST_CM, MOST_CM
 
 LEARNABLE_PX = 540
 """Longer side of the pictures that a minute is enough for."""
@@ -60,7 +64,12 @@ class IngestArguments:
     """The person is bright in the masks."""
     cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """A cameras.npz (intrinsic, extrinsic: one, or one a frame), a COLMAP model, a transforms.json,
-    Record3D's or Polycam's export; or `static`: never moved, and its focal length is unknown."""
+    Record3D's or Polycam's export; `static`: never moved, and its focal length is unknown; or
+    `solve`: the camera moves, and where it was is found from the pictures (a minute or two, with
+    pycolmap; docs/cameras.md). Poses are then taken to be in the camera of each frame."""
+    height_cm: Annotated[float | None, arg(metavar="CM", help_behavior_hint="")] = None
+    """How tall the person is, barefoot. Pictures alone cannot tell a tall person from a near one:
+    body, distances and solved cameras take their size from it."""
     body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Your own SMPL body, .npz or .pkl (nothing in it is executed); else the embedded body."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
@@ -122,6 +131,10 @@ class IngestArguments:
             )
         if self.realtime and (self.live or camera_address(self.video) is not None):
             raise BadInput("--realtime plays a recording; a live source has its own pace. Drop it.")
+        if self.height_cm is not None and not LEAST_CM <= self.height_cm <= MOST_CM:
+            raise BadInput(
+                f"--height-cm is {self.height_cm}; {LEAST_CM:.0f} to {MOST_CM:.0f} was expected."
+            )
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.mask_invert and self.no_mask_invert:
@@ -158,7 +171,19 @@ class IngestArguments:
             live=self.live,
             person=self.person,
             idle_s=self.idle_seconds,
+            height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
+
+    def solve_job(self, recording: Recording) -> SolveJob | None:
+        """What is to be solved, if cameras are; by the parts that were found."""
+        if self.cameras != "solve":
+            return None
+        found = recording.paths
+        named = self.wanted()
+        if segmenter_name(named.masks) is None:
+            named = replace(named, masks=found.masks)
+        named = replace(named, video=found.video, poses=found.poses)
+        return SolveJob(paths=named, seed=self.seed, threads=self.threads or os.cpu_count() or 1)
 
     def recording(self) -> Recording:
         """Opens what the arguments name."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from preprocess.poses.place import placed
 from preprocess.refit import refit_to_masks
 from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.shape import shaped_for
+from preprocess.stature import as_tall, farther
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,13 +41,15 @@ class RecordingPaths:
     Attributes:
         video: Video file, folder of pictures, or capture folder.
         poses, masks: Files or folders, or None.
-        cameras: A file, "static", or None.
+        cameras: A file, "static", "solve" (poses are then in the camera of each frame, and so is
+            all the rest until cameras were solved), or None.
         body: A body file; None for the embedded body.
         frames: Which frames are wanted.
         mask_invert: Whether the person is dark in the masks; None finds out.
         live: Whether `video` is a folder that grows; a camera is live without it.
         person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Of a live source: how long nothing new may come.
+        height_m: How tall the person is; None if only the poses tell.
     """
 
     video: Path
@@ -58,6 +62,7 @@ class RecordingPaths:
     live: bool = False
     person: str | None = None
     idle_s: float = IDLE_S
+    height_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,6 +81,7 @@ class Recording:
         live: Poses and masks of a live source, which come while it runs; `motion` is what had come
             when it was opened.
         segment: What estimates the masks, if nothing holds them.
+        solved: What the report says of cameras that were solved.
     """
 
     paths: CapturePaths
@@ -88,6 +94,7 @@ class Recording:
     notes: tuple[str, ...]
     live: LiveParts | None = None
     segment: Segmenter | None = None
+    solved: dict[str, Any] | None = None
 
     @classmethod
     def open(
@@ -126,6 +133,8 @@ class Recording:
         if paths.cameras is None and motion.intrinsic is None and motion.lens is None:
             cameras = focal_from_masks(cameras, motion, shaped, source, masks)
         shaped, motion, fitted = refit_to_masks(motion, shaped, cameras, source, masks)
+        if wanted.height_m is not None:
+            shaped, motion = _grown(shaped, motion, cameras, source, wanted.height_m)
         estimated = named or (OURS if masks is None and not source.has_alpha else None)
         recording = cls(
             paths=paths,
@@ -147,6 +156,11 @@ class Recording:
         cls, wanted: RecordingPaths, camera: str | None, size_px: int | None
     ) -> "Recording":
         """The same of a live source, whose first picture and first pose are waited for."""
+        if wanted.cameras == "solve" or wanted.height_m is not None:
+            raise BadInput(
+                "--cameras solve and --height-cm need a recording; of a live source the camera "
+                "stands still (--cameras static), and nobody knows its poses yet."
+            )
         named = segmenter_name(wanted.masks)
         given_masks = wanted.masks if named is None else None
         paths = find_live_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
@@ -239,6 +253,23 @@ class Recording:
         longer = max(camera.size_px)
         shrinking = min(1.0, (self.size_px or longer) / longer)
         return depth / (max(camera.focal_px) * shrinking)
+
+
+def _grown(
+    shaped: ShapedBody, motion: Motion, cameras: CameraTrack, source: Source, height_m: float
+) -> tuple[ShapedBody, Motion]:
+    """Body and motion of a person whose height is known.
+
+    Raises:
+        BadInput: If given cameras move: then their world has a size already.
+    """
+    if cameras.moves:
+        raise BadInput(
+            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
+            "size of its own. Leave one of them out."
+        )
+    taller = as_tall(shaped, height_m)
+    return taller, farther(Claim.of(motion, cameras, source), shaped, taller)
 
 
 def _notes(

@@ -246,7 +246,7 @@ class ExtendedNote:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """All of it. `package` is None if none was written."""
+    """All of it. `package` is None if none was written, `cameras` if none were solved."""
 
     command: dict[str, Any]
     recipe: dict[str, Any]
@@ -260,6 +260,7 @@ class Report:
     held_out_refined: HeldOutNote | None = None
     coverage: CoverageNote | None = None
     extended: ExtendedNote | None = None
+    cameras: dict[str, Any] | None = None
     format: int = FORMAT
 
     def to_json(self) -> str:
@@ -267,6 +268,7 @@ class Report:
         content = _plain(dataclasses.asdict(self))
         order = ("format", "command", "recipe", "machine", "frames", "training", "held_out")
         order += ("held_out_refined", "curve", "stream", "package", "coverage", "extended")
+        order += ("cameras",)
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 

@@ -38,6 +38,16 @@ class RunFolder:
         """The folder from which training can go on."""
         return self.path / "checkpoint"
 
+    @property
+    def cameras(self) -> Path:
+        """Cameras that were solved here; the folder of the same name without ending made them."""
+        return self.path / "cameras.npz"
+
+    @property
+    def poses(self) -> Path:
+        """The poses in the world of the solved cameras."""
+        return self.path / "poses.npz"
+
     def holds_a_run(self) -> bool:
         """Whether any part of a run is there."""
         return any(p.exists() for p in (self.package, self.report, self.page, self.checkpoint))
@@ -70,7 +80,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         if resume:
             return
-        for file in (self.package, self.report, self.page):
+        for file in (self.package, self.report, self.page, self.cameras, self.poses):
             file.unlink(missing_ok=True)
         if self.checkpoint.is_dir():
             shutil.rmtree(self.checkpoint)

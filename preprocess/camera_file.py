@@ -50,7 +50,8 @@ def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = N
 
     The .npz holds intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each; optional:
     height and width (of the pictures that the matrices belong to), distortion (OpenCV's
-    coefficients). Cameras of another size and the same shape are scaled to `size_px`.
+    coefficients), valid (N: whether a frame has a camera of its own). Cameras of another size and
+    the same shape are scaled to `size_px`.
 
     Args:
         path: File or folder.
@@ -97,7 +98,24 @@ def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = N
             f"The cameras in {path.name} belong to {stored_px[0]}x{stored_px[1]} px and were "
             f"scaled to the video's {size_px[0]}x{size_px[1]}."
         )
-    return CameraTrack(cameras=cameras, source=path.name, note=note)
+    return CameraTrack(
+        cameras=cameras, source=path.name, note=note, missing=_missing(arrays, count, path)
+    )
+
+
+def write_cameras(path: Path, track: CameraTrack) -> None:
+    """Writes cameras in the keys that `read_cameras` reads; all have the first one's lens."""
+    first, rows = track.cameras[0], range(len(track.cameras))
+    extrinsics = np.stack([camera.camera_from_world for camera in track.cameras])
+    np.savez(
+        path,
+        intrinsic=first.intrinsic,
+        extrinsic=extrinsics if track.moves else extrinsics[0],
+        width=first.size_px[0],
+        height=first.size_px[1],
+        distortion=np.array(first.distortion),
+        valid=np.array([row not in track.missing for row in rows]),
+    )
 
 
 def upright_cameras(
@@ -231,6 +249,18 @@ def _rigid(
             f"by {off:.2g}. Expected OpenCV axes (x right, y down, z forward) and no scale."
         )
     return transforms
+
+
+def _missing(
+    arrays: dict[str, Shaped[np.ndarray, "..."]], count: int, path: Path
+) -> frozenset[int]:
+    """Frames without a camera of their own, if the file says so."""
+    if "valid" not in arrays or count == 1:
+        return frozenset()
+    valid = arrays["valid"].reshape(-1)
+    if len(valid) != count or valid.dtype.kind not in "biu":
+        raise BadInput(f"`valid` in {path} holds {len(valid)} values for {count} cameras.")
+    return frozenset(np.flatnonzero(valid == 0).tolist())
 
 
 def _stored_size(

@@ -48,13 +48,14 @@ def find_capture(
         video: Video file, folder of pictures, or native capture folder.
         poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
         masks: Folder or file of masks.
-        cameras: Camera file, or "static" for a static camera that nobody described.
+        cameras: Camera file; "static" for a static camera that nobody described; "solve" for a
+            moving one, for which no file is looked for either.
 
     Raises:
         BadInput: If something that was named, or the poses, is not there.
     """
-    if str(cameras) == "solve":
-        raise BadInput("--cameras solve is not built yet; give a cameras.npz, or leave it out.")
+    if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
+        cameras = "static"
     named = [Path(p) for p in (video, poses, masks) if p is not None]
     if cameras is not None and str(cameras) != "static":
         named.append(Path(cameras))

@@ -73,7 +73,6 @@ def test_what_is_named_must_be_there(make, missing):
         find_capture(*named)
 
 
-def test_solving_cameras_is_not_built_yet(make):
-    root = make("video.mp4", "poses.npz")
-    with pytest.raises(BadInput, match="not built"):
-        find_capture(root, cameras="solve")
+def test_cameras_that_are_to_be_solved_are_looked_for_nowhere(make):
+    root = make("video.mp4", "poses.npz", "cameras.npz")
+    assert find_capture(root, cameras="solve").cameras is None

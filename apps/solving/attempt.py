@@ -1,0 +1,121 @@
+"""When a run's cameras are solved: before it learns, or beside it where it needs only the lens.
+
+An avatar is learnt from poses in the camera of each frame; where that camera stood matters only to
+the world around it. So with a stated K and masks at hand training does not wait. Without K the
+lens must be found first; without masks they are estimated, which must know that the camera moves.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import final
+
+from apps.console import Console
+from apps.recording import Recording
+from apps.run_folder import RunFolder
+from apps.solving.job import SolveJob
+from apps.solving.joining import joined, write_solved
+from apps.solving.solving import Solving
+from capture.errors import BadInput
+
+MOST_OFF = 0.02
+"""Of a stated focal length, before it is said that the pictures tell another one."""
+
+
+@final
+class Attempt:
+    """The cameras of one run, sooner or later.
+
+    Attributes:
+        beside: Whether the run learns meanwhile.
+        refused: Why there are none, if a run has learnt without them.
+    """
+
+    def __init__(self, solving: Solving, *, beside: bool) -> None:
+        """Takes over a process that has begun."""
+        self._solving, self.beside = solving, beside
+        self.refused: str | None = None
+
+    def before(self, recording: Recording, console: Console) -> Recording:
+        """What the run learns from: the recording in its solved world, if it had to be waited for.
+
+        Raises:
+            BadInput: If the cameras cannot be solved with certainty.
+        """
+        if self.beside:
+            return recording
+        try:
+            solved = self._solving.wait(console)
+            assert solved is not None  # nobody can stop it here
+            found = joined(recording, solved)
+        except KeyboardInterrupt as error:
+            error.add_note("Stages of the cameras that were finished are kept: the same command "
+                           "goes on from there.")  # fmt: skip
+            raise
+        _say_new(recording, found, console)
+        return found
+
+    def after(self, recording: Recording, console: Console, stop: threading.Event) -> Recording:
+        """What the report is about, once the run has learnt beside the solving.
+
+        Cameras that are refused now cost nobody the avatar.
+        """
+        if not self.beside:
+            return recording
+        try:
+            solved = self._solving.wait(console, stop)
+            if solved is None:
+                return replace(recording, solved={"verdict": "stopped"})
+            found = joined(recording, solved)
+        except BadInput as refusal:
+            self.refused = str(refusal)
+            return replace(recording, solved={"verdict": "refused", "reason": str(refusal)})
+        _say_new(recording, found, console)
+        stated, true = recording.cameras[0].focal_px[0], found.cameras[0].focal_px[0]
+        if found.solved is not None and abs(true / stated - 1.0) > MOST_OFF:
+            console.warn(
+                f"The poses state a focal length of {stated:.0f} px, the pictures one of "
+                f"{true:.0f} px; the avatar was learnt with the former. Leave K out of the poses, "
+                "and it is learnt with the latter."
+            )
+        return found
+
+    def write(self, recording: Recording, run: RunFolder, console: Console) -> None:
+        """Writes what was solved beside the avatar.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        if recording.solved is None or recording.solved["verdict"] != "solved":
+            return
+        write_solved(recording, run)
+        console.made("cameras", run.cameras)
+        console.made("poses there", run.poses)
+
+
+@contextmanager
+def attempted(
+    job: SolveJob | None, recording: Recording, run: RunFolder
+) -> Iterator[Attempt | None]:
+    """Solving that begins now, if there is a job, and does not outlive the block.
+
+    Args:
+        job: What is to be solved; None if nothing is.
+        recording: The same capture, opened.
+        run: Where stages are kept.
+
+    Raises:
+        BadInput: If pycolmap is missing.
+    """
+    if job is None:
+        yield None
+        return
+    beside = recording.motion.intrinsic is not None and recording.segment is None
+    with Solving(job, run.path, gently=beside) as solving:
+        yield Attempt(solving, beside=beside)
+
+
+def _say_new(before: Recording, after: Recording, console: Console) -> None:
+    for note in after.notes[len(before.notes) :]:
+        console.say(note)

@@ -1,0 +1,61 @@
+"""Solved cameras joined to a recording, and written beside its avatar."""
+
+from dataclasses import replace
+from typing import Any
+
+from apps.recording import Recording
+from apps.run_folder import RunFolder
+from apps.whole import whole_file
+from preprocess.camera_file import write_cameras
+from preprocess.pose_file import write_motion
+from preprocess.solve.placing import Placed, place_in_world, told
+from preprocess.solve.solver import Solved
+
+
+def joined(recording: Recording, solved: Solved) -> Recording:
+    """The recording in the world of its solved cameras; as it was, if the camera stood still.
+
+    Args:
+        recording: With poses in the camera of each frame.
+        solved: What the pictures say.
+
+    Raises:
+        BadInput: If nothing tells the size of the world.
+    """
+    if solved.still:
+        note = (
+            f"The camera stood still (what is behind the person moved by {solved.moved:.2%} of the "
+            "picture), so there was nothing to solve."
+        )
+        return replace(
+            recording, notes=(*recording.notes, note), solved=told(solved, None, recording.source)
+        )
+    place = place_in_world(
+        solved, recording.motion, recording.cameras[0], recording.shaped, recording.source
+    )
+    found = told(solved, place, recording.source)
+    return replace(
+        recording,
+        cameras=place.cameras,
+        motion=place.motion,
+        solved=found,
+        notes=(*recording.notes, _in_words(found, place)),
+    )
+
+
+def write_solved(recording: Recording, run: RunFolder) -> None:
+    """cameras.npz and poses.npz of the run: the capture's own walk, to be played or reused."""
+    with whole_file(run.cameras) as path:
+        write_cameras(path, recording.cameras)
+    with whole_file(run.poses) as path:
+        write_motion(path, replace(recording.motion, intrinsic=None, camera_from_world=None))
+
+
+def _in_words(found: dict[str, Any], place: Placed) -> str:
+    frames, scale = found["frames"], found["scale"]
+    several = f"{frames['interpolated']} interpolated, " if frames["interpolated"] else ""
+    return (
+        f"Cameras: {frames['key']} key frames solved, {frames['placed']} placed between them, "
+        f"{several}{frames['missing']} missing; focal length {found['focal_px']:.0f} px; size by "
+        f"{' and '.join(scale['cues'])}, {place.floor_points} points of the floor seen."
+    )

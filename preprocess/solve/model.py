@@ -1,0 +1,93 @@
+"""Cameras and points as a mapper leaves them, in plain numbers: a world of unknown size."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from capture.camera import Camera
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """What structure from motion found.
+
+    Attributes:
+        frames: Number of the frame that each camera belongs to, ascending.
+        camera_from_world: Rigid transforms; the world's unit is anybody's guess.
+        focal_px: Focal length.
+        center_px: Principal point; the first pixel's centre is at (0.5, 0.5).
+        bend: First coefficient of radial distortion.
+        size_px: Width and height of the pictures.
+        points: What the cameras see.
+        seen_by, seen_point: Camera and point of each observation, as rows of the above.
+        pixels: Where it was seen.
+    """
+
+    frames: Int[np.ndarray, "cameras"]
+    camera_from_world: Float[np.ndarray, "cameras 4 4"]
+    focal_px: float
+    center_px: tuple[float, float]
+    bend: float
+    size_px: tuple[int, int]
+    points: Float[np.ndarray, "points 3"]
+    seen_by: Int[np.ndarray, "observations"]
+    seen_point: Int[np.ndarray, "observations"]
+    pixels: Float[np.ndarray, "observations 2"]
+
+    def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
+        """The lens, standing somewhere."""
+        return Camera(
+            focal_px=(self.focal_px, self.focal_px),
+            center_px=self.center_px,
+            size_px=self.size_px,
+            camera_from_world=camera_from_world,
+            distortion=(self.bend, 0.0, 0.0, 0.0) if self.bend else (),
+        )
+
+    def centers(self) -> Float[np.ndarray, "cameras 3"]:
+        """Where the cameras stand."""
+        turned, moved = self.camera_from_world[:, :3, :3], self.camera_from_world[:, :3, 3]
+        return -np.einsum("cba,cb->ca", turned, moved)
+
+    def residuals(self) -> Float[np.ndarray, "observations"]:
+        """How far from each observation its point is projected, in pixels."""
+        off = np.zeros(len(self.pixels))
+        for row, transform in enumerate(self.camera_from_world):
+            mine = self.seen_by == row
+            if mine.any():
+                drawn = self.camera(transform).project(self.points[self.seen_point[mine]])
+                off[mine] = np.linalg.norm(drawn - self.pixels[mine], axis=1)
+        return off
+
+    def seen_in(self, row: int) -> Int[np.ndarray, "seen"]:
+        """The observations of one camera."""
+        return np.flatnonzero(self.seen_by == row)
+
+    def without(self, doubtful: Bool[np.ndarray, "cameras"]) -> "Model":
+        """The same without some of the cameras, and what only they saw."""
+        kept = ~doubtful[self.seen_by]
+        row_of = np.cumsum(~doubtful) - 1
+        return replace(
+            self,
+            frames=self.frames[~doubtful],
+            camera_from_world=self.camera_from_world[~doubtful],
+            seen_by=row_of[self.seen_by[kept]],
+            seen_point=self.seen_point[kept],
+            pixels=self.pixels[kept],
+        )
+
+    def save(self, path: Path) -> None:
+        """As an .npz without objects."""
+        np.savez(path, allow_pickle=False, **vars(self))
+
+    @classmethod
+    def load(cls, path: Path) -> "Model":
+        """What `save` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files if key != "allow_pickle"}
+        x, y = (float(value) for value in arrays.pop("center_px"))
+        width, height = (int(value) for value in arrays.pop("size_px"))
+        focal, bend = float(arrays.pop("focal_px")), float(arrays.pop("bend"))
+        return cls(focal_px=focal, bend=bend, center_px=(x, y), size_px=(width, height), **arrays)

@@ -1,0 +1,91 @@
+"""A folder in which long work is done in stages: what is finished is not done again."""
+
+import json
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, final
+
+Told = Callable[[str, float], None]
+"""Called now and then with a stage's name and how much of it is done, in [0, 1]."""
+
+
+@final
+class Stages:
+    """Names the parts of the work, times them, and remembers which are done.
+
+    A stage writes to a name that passes (`.part`); its result takes its own name when it is whole.
+
+    Attributes:
+        folder: Where results lie.
+        costs: Of each finished stage: wall and core seconds, also from an earlier process.
+    """
+
+    def __init__(self, folder: Path, told: Told) -> None:
+        """Takes up what lies in the folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self._told = folder, told
+        self._notes = folder / "stages.json"
+        self.costs: dict[str, dict[str, float]] = {}
+        if self._notes.exists():
+            self.costs = json.loads(self._notes.read_text(encoding="utf-8"))
+
+    def result(self, name: str, make: Callable[[Path, Callable[[float], None]], None]) -> Path:
+        """The file or folder of a stage, made if it is not there yet.
+
+        Args:
+            name: Of the result.
+            make: Writes it to a path, telling how far it is.
+        """
+        path = self.folder / name
+        if path.exists() and name in self.costs:
+            return path
+        part = self.folder / f"part.{name}"
+        for old in (part, path):
+            _removed(old)
+        with self._timed(name):
+            make(part, lambda share: self._told(name, share))
+            part.rename(path)
+        return path
+
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        wall, core = time.perf_counter(), time.process_time()
+        self._told(name, 0.0)
+        yield
+        self._told(name, 1.0)
+        self.costs[name] = {
+            "wall_seconds": time.perf_counter() - wall,
+            "cpu_seconds": time.process_time() - core,
+            "peak_memory_mb": peak_memory_mb(),
+        }
+        part = self._notes.with_name("part.stages.json")
+        part.write_text(json.dumps(self.costs, indent=1), encoding="utf-8")
+        part.replace(self._notes)
+
+    def totals(self) -> dict[str, Any]:
+        """Of all stages, for the report."""
+        return {
+            "wall_seconds": sum(cost["wall_seconds"] for cost in self.costs.values()),
+            "cpu_seconds": sum(cost["cpu_seconds"] for cost in self.costs.values()),
+            "peak_memory_mb": max(
+                (cost["peak_memory_mb"] for cost in self.costs.values()), default=0.0
+            ),
+        }
+
+
+def peak_memory_mb() -> float:
+    """Of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+def _removed(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

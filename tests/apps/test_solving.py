@@ -1,0 +1,282 @@
+"""Tests for cameras that a run solves: its process, its folder, its report, its end."""
+
+import json
+import os
+import threading
+import time
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console as RichConsole
+
+from apps.console import Console
+from apps.recording import Recording, RecordingPaths
+from apps.solving import solving as solving_module
+from apps.solving.job import SolveJob
+from apps.solving.joining import joined
+from apps.solving.solving import Solving
+from apps.solving.worker import person_finder
+from apps.studio.writer import ShootConfig, shoot
+from capture.errors import BadInput
+from preprocess.camera_file import read_cameras, write_cameras
+from preprocess.pose_file import read_motion
+from preprocess.solve.gates import similarity
+from preprocess.solve.solver import Solved
+from preprocess.stature import height_of
+
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def walkaround(tmp_path_factory) -> Path:
+    """A phone is carried around the actor; where it was, only truth/ knows."""
+    folder = tmp_path_factory.mktemp("walkaround") / "capture"
+    shoot(folder, ShootConfig(frames=FRAMES, size=256, motion="walkaround", background="room"))
+    return folder
+
+
+def job_of(capture: Path, **paths) -> SolveJob:
+    named = RecordingPaths(
+        video=capture / "video.mp4", poses=capture / "poses.npz", masks=capture / "masks",
+        cameras="solve", **paths,
+    )  # fmt: skip
+    return SolveJob(paths=named, seed=0, threads=1)
+
+
+@pytest.fixture(scope="module")
+def solved_run(walkaround, tmp_path_factory) -> Path:
+    """A run's folder in which the process has solved the cameras."""
+    run = tmp_path_factory.mktemp("solved") / "run"
+    with Solving(job_of(walkaround), run) as solving:
+        assert solving.wait(quiet()) is not None
+        assert not solving.running
+    return run
+
+
+def quiet() -> Console:
+    return Console(RichConsole(file=StringIO()))
+
+
+def solved_of(run: Path) -> Solved:
+    return Solved.load(next((run / "cameras").iterdir()))
+
+
+def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
+    still = Recording.open(job_of(walkaround).paths)
+    found = joined(still, solved_of(solved_run))
+    true = read_cameras(walkaround / "truth" / "cameras.npz", still.source.size_px)
+    centers, truth = (
+        np.stack([camera.center_world for camera in track.cameras])
+        for track in (found.cameras, true)
+    )
+    scale, turn, shift = similarity(centers, truth)
+    assert np.linalg.norm(scale * centers @ turn.T + shift - truth, axis=1).max() < 0.03
+    assert scale == pytest.approx(1.0, abs=0.03)
+    assert np.degrees(np.arccos((turn @ [0.0, 1.0, 0.0])[1])) < 1.0  # y is up
+    np.testing.assert_allclose(centers[:, 1], truth[:, 1], atol=0.08)  # the floor is at 0
+    for row in (0, 6, 13):  # and each picture shows the body where it did
+        before, after = (
+            recording.cameras[row].project(
+                recording.shaped.with_pose(recording.motion[row]).joints()
+            )
+            for recording in (still, found)
+        )
+        np.testing.assert_allclose(before, after, atol=1.5)  # the focal length was solved, too
+    assert found.solved["verdict"] == "solved"
+    assert found.solved["frames"]["key"] == FRAMES
+    assert set(found.solved["scale"]["cues"]) <= {"ground", "in place"}
+
+
+def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
+    plain = Recording.open(job_of(walkaround).paths)
+    tall = height_of(plain.shaped)
+    taller = Recording.open(job_of(walkaround, height_m=1.1 * tall).paths)
+    assert height_of(taller.shaped) == pytest.approx(1.1 * tall)
+    for row in (0, 9):  # pictures cannot tell
+        np.testing.assert_allclose(
+            taller.cameras[0].project(taller.shaped.with_pose(taller.motion[row]).joints()),
+            plain.cameras[0].project(plain.shaped.with_pose(plain.motion[row]).joints()),
+            atol=1e-6,
+        )
+    one, other = (joined(recording, solved_of(solved_run)) for recording in (plain, taller))
+    ratio = other.solved["scale"]["metres_per_unit"] / one.solved["scale"]["metres_per_unit"]
+    assert ratio == pytest.approx(1.1, rel=1e-3)
+
+
+def test_the_same_job_is_not_solved_twice(walkaround, solved_run, monkeypatch):
+    monkeypatch.setattr(solving_module.subprocess, "Popen", None)
+    with Solving(job_of(walkaround), solved_run) as solving:
+        assert solving.wait(quiet()).marks.tolist() == solved_of(solved_run).marks.tolist()
+
+
+def test_another_job_has_another_folder(walkaround, tmp_path):
+    job = job_of(walkaround)
+    assert replace(job, threads=2).key() == job.key()  # threads change nothing
+    others = [
+        replace(job, seed=1),
+        replace(job, paths=replace(job.paths, frames=slice(0, 10, 2))),
+        replace(job, paths=replace(job.paths, masks=None)),
+    ]
+    assert len({job.key(), *(other.key() for other in others)}) == 4
+    copy = tmp_path / "poses.npz"
+    copy.write_bytes((walkaround / "poses.npz").read_bytes())
+    moved = replace(job, paths=replace(job.paths, poses=copy))
+    before = moved.key()
+    copy.write_bytes(copy.read_bytes() + b" ")
+    assert moved.key() != before
+    for one in (job, others[1]):
+        assert SolveJob.of(json.loads(json.dumps(one.content()))) == one
+
+
+def test_what_is_stopped_leaves_no_process_and_is_taken_up_again(walkaround, tmp_path):
+    stop = threading.Event()
+    with Solving(job_of(walkaround), tmp_path) as solving:
+        process = solving._process
+        while not (solving.folder / "key frames").exists() and process.poll() is None:
+            time.sleep(0.05)
+        stop.set()
+        assert solving.wait(quiet(), stop) is None
+        assert process.poll() is not None
+    assert (solving.folder / "key frames").exists()
+    assert not (solving.folder / "solved.json").exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(process.pid, 0)
+
+
+def test_the_process_ends_with_who_started_it(walkaround, tmp_path):
+    with Solving(job_of(walkaround), tmp_path) as solving:
+        process = solving._process
+        process.stdin.close()  # as the system does for a process that was killed
+        assert process.wait(timeout=30.0) == 130
+
+
+def test_a_process_that_breaks_is_said_with_its_log(walkaround, tmp_path):
+    with Solving(job_of(walkaround), tmp_path) as solving:
+        solving._process.kill()
+        with pytest.raises(BadInput, match=r"(?s)ended with -9.*log\.txt"):
+            solving.wait(quiet())
+
+
+def test_without_masks_the_posed_body_says_where_the_person_is(walkaround):
+    masked, posed = (
+        Recording.open(replace(job_of(walkaround).paths, masks=masks))
+        for masks in (walkaround / "masks", Path("segmenter:grabcut"))
+    )
+    frame = next(masked.source.frames())
+    mask = person_finder(masked)(frame, (160, 90))
+    around = person_finder(posed)(frame, (160, 90))
+    assert mask.sum() > 200
+    assert (around | ~mask).mean() > 0.998  # all of the person
+    assert around.sum() < 2.5 * mask.sum()
+
+
+def test_a_run_learns_beside_the_solving_and_tells_of_both(
+    walkaround, solved_run, call_ingest, tmp_path, without_baking
+):
+    out = tmp_path / "run"
+    (out / "cameras").parent.mkdir(parents=True)
+    (solved_run / "cameras").rename(out / "cameras")  # solved before: the same job
+    try:
+        outcome = call_ingest(
+            walkaround / "video.mp4", "--poses", walkaround / "poses.npz", "--cameras", "solve",
+            "--out", out, "--threads", 1,
+        )  # fmt: skip
+    finally:
+        (out / "cameras").rename(solved_run / "cameras")
+    assert outcome.code == 0, outcome.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["cameras"]["verdict"] == "solved"
+    assert report["cameras"]["gates"]["agreement"]["value"] < 0.01
+    assert report["cameras"]["cpu_seconds"] > 0.0
+    track = read_cameras(out / "cameras.npz", (256, 144))
+    motion = read_motion(out / "poses.npz")
+    assert len(track.cameras) == len(motion) == FRAMES
+    again = Recording.open(
+        RecordingPaths(
+            video=walkaround / "video.mp4", poses=out / "poses.npz",
+            cameras=str(out / "cameras.npz"), masks=walkaround / "masks",
+        )
+    )  # fmt: skip
+    heights = [again.shaped.with_pose(motion[row]).vertices()[:, 1].min() for row in range(FRAMES)]
+    assert np.abs(heights).max() < 0.06  # whoever stands on the floor stands on y = 0
+
+
+def test_cameras_that_are_refused_cost_nobody_the_avatar(
+    walkaround, call_ingest, tmp_path, without_baking, monkeypatch
+):
+    def refuse(self, console, stop=None):
+        raise BadInput("The cameras could not be solved with certainty: a reason.")
+
+    monkeypatch.setattr(Solving, "__init__", lambda self, job, run, gently: None)
+    monkeypatch.setattr(Solving, "wait", refuse)
+    monkeypatch.setattr(Solving, "stop", lambda self: None)
+    outcome = call_ingest(walkaround, "--cameras", "solve", "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert "a reason" in outcome.complaint()
+    assert "avatar was learnt" in outcome.complaint()
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["cameras"]["verdict"] == "refused"
+    assert (tmp_path / "run" / "avatar.iavatar").exists()
+    assert not (tmp_path / "run" / "cameras.npz").exists()
+
+
+def test_a_lens_that_nobody_knows_is_solved_first(
+    walkaround, call_ingest, changed, tmp_path, monkeypatch
+):
+    """And if that fails, nothing is learnt."""
+
+    def refuse(self, console, stop=None):
+        raise BadInput("The cameras could not be solved with certainty: a reason.")
+
+    monkeypatch.setattr(Solving, "__init__", lambda self, job, run, gently: None)
+    monkeypatch.setattr(Solving, "wait", refuse)
+    monkeypatch.setattr(Solving, "stop", lambda self: None)
+    poses = tmp_path / "poses.npz"
+    poses.write_bytes((walkaround / "poses.npz").read_bytes())
+    changed(poses, K=None)
+    outcome = call_ingest(
+        walkaround / "video.mp4", "--poses", poses, "--masks", walkaround / "masks",
+        "--cameras", "solve", "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert outcome.code == 2
+    assert "a reason" in outcome.complaint()
+    assert not (tmp_path / "run").exists()
+
+
+def test_cameras_are_read_as_they_were_written(walkaround, tmp_path):
+    true = read_cameras(walkaround / "truth" / "cameras.npz", (256, 144))
+    bent = [replace(camera, distortion=(-0.1, 0.0, 0.0, 0.0)) for camera in true.cameras]
+    track = replace(true, cameras=tuple(bent), missing=frozenset({3, 5}))
+    write_cameras(tmp_path / "cameras.npz", track)
+    again = read_cameras(tmp_path / "cameras.npz", (256, 144))
+    assert again.missing == {3, 5}
+    for one, other in zip(bent, again.cameras, strict=True):
+        assert one.distortion == other.distortion
+        np.testing.assert_array_equal(one.camera_from_world, other.camera_from_world)
+        np.testing.assert_array_equal(one.intrinsic, other.intrinsic)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--height-cm", 12), "--height-cm is 12"),
+        (("--height-cm", 900), "--height-cm is 900"),
+    ],
+)
+def test_heights_that_nobody_has_are_refused(walkaround, call_ingest, tmp_path, words, said):
+    outcome = call_ingest(walkaround, *words, "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert said in outcome.complaint()
+
+
+def test_a_height_contradicts_cameras_that_have_a_world(walkaround):
+    with pytest.raises(BadInput, match="--height-cm contradicts"):
+        Recording.open(
+            replace(
+                job_of(walkaround).paths, height_m=1.8,
+                cameras=str(walkaround / "truth" / "cameras.npz"),
+            )
+        )  # fmt: skip

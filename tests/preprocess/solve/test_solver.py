@@ -1,0 +1,157 @@
+"""Tests for the whole solution of a little room: right, refused, taken up again, or not needed."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.errors import BadInput
+from capture.source import open_source
+from preprocess.solve import mapping, solver
+from preprocess.solve.gates import similarity
+from preprocess.solve.solver import INTERPOLATED, KEY, PLACED, Settings, Solved, solve
+
+SIZE = (320, 240)
+FRAMES, KEYS = 24, 10
+
+
+def nobody(frame, size_px):
+    return np.zeros(size_px[::-1], dtype=bool)
+
+
+def filmed(folder, pictures):
+    folder.mkdir(exist_ok=True)
+    for index, rgb in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{index:03d}.png"), rgb[..., ::-1])
+    return open_source(folder)
+
+
+@pytest.fixture(scope="module")
+def walk(room, walked, tmp_path_factory):
+    """True cameras, their film, and its solution with the folder that it was made in."""
+    folder = tmp_path_factory.mktemp("walk")
+    cameras = walked(FRAMES, degrees=80, size_px=SIZE, focal_px=260.0)
+    source = filmed(folder / "film", [room.seen(camera) for camera in cameras])
+    told = []
+    settings = Settings(most_keys=KEYS)
+    solved = solve(source, nobody, folder / "work", settings, lambda *what: told.append(what))
+    return cameras, source, solved, folder / "work", told
+
+
+def test_cameras_of_a_walk_are_solved_to_millimetres(walk):
+    cameras, _, solved, _, _ = walk
+    assert not solved.still
+    assert (np.bincount(solved.marks, minlength=4)[[PLACED, KEY]] == [FRAMES - KEYS, KEYS]).all()
+    views = solved.camera_from_solved
+    centers = -np.einsum("cba,cb->ca", views[:, :3, :3], views[:, :3, 3])
+    true = np.stack([camera.center_world for camera in cameras])
+    scale, turn, shift = similarity(centers, true)
+    off = np.linalg.norm(scale * centers @ turn.T + shift - true, axis=1)
+    assert off.max() < 0.01
+    rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
+    angles = Rotation.from_matrix(rotations @ (views[:, :3, :3] @ turn.T).transpose(0, 2, 1))
+    assert np.degrees(angles.magnitude()).max() < 0.4  # 320 px see less than 960
+    assert solved.lens(SIZE).focal_px[0] == pytest.approx(260.0, rel=0.01)
+    assert solved.lens((640, 480)).focal_px[0] == pytest.approx(520.0, rel=0.01)
+    assert all(gate.passed for gate in solved.gates)
+    assert {gate.name for gate in solved.gates} >= {"agreement", "followed_px", "registered"}
+
+
+def test_every_stage_is_told_and_paid_for(walk):
+    *_, solved, _, told = walk
+    stages = list(dict.fromkeys(name for name, _ in told))
+    assert stages == [
+        "key frames", "features", "matches", "global mapping 0", "incremental mapping 0",
+        "frames between",
+    ]  # fmt: skip
+    assert all((name, 1.0) in told for name in stages)
+    assert solved.costs["cpu_seconds"] > 0.5
+    assert solved.costs["peak_memory_mb"] > 50.0
+
+
+def test_what_is_finished_is_not_done_again(walk, tmp_path, monkeypatch):
+    _, source, solved, work, _ = walk
+    shutil.copytree(work, tmp_path / "work")
+    for name in ("extract", "match", "map_globally", "map_incrementally"):
+        monkeypatch.setattr(mapping, name, None)  # calling it would be an error
+    monkeypatch.setattr(solver, "place_between", None)
+    again = solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
+    assert again.gates == solved.gates
+
+
+def test_a_stage_that_was_cut_off_is_done_anew(walk, tmp_path):
+    _, source, solved, work, _ = walk
+    shutil.copytree(work, tmp_path / "work")
+    (tmp_path / "work" / "frames between").rename(tmp_path / "work" / "part.frames between")
+    again = solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    np.testing.assert_allclose(again.camera_from_solved, solved.camera_from_solved, atol=1e-9)
+
+
+def test_a_solution_is_read_as_it_was_written(walk, tmp_path):
+    *_, solved, _, _ = walk
+    solved.save(tmp_path)
+    again = Solved.load(tmp_path)
+    np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
+    np.testing.assert_array_equal(again.marks, solved.marks)
+    np.testing.assert_array_equal(again.model.residuals(), solved.model.residuals())
+    assert again.gates == solved.gates
+    assert again.costs == solved.costs
+
+
+def test_a_frame_that_shows_nothing_is_interpolated(walk, tmp_path):
+    _, source, solved, work, _ = walk
+    shutil.copytree(work, tmp_path / "work")
+    lost = int(np.flatnonzero(solved.marks == PLACED)[4])
+    pictures = [frame.rgb for frame in source.frames()]
+    pictures[lost] = np.full_like(pictures[lost], 90)
+    spoilt = filmed(tmp_path / "film", pictures)
+    (tmp_path / "work" / "frames between").unlink()
+    again = solve(spoilt, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    assert again.marks[lost] == INTERPOLATED
+    assert (again.marks == INTERPOLATED).sum() == 1
+
+
+def test_pictures_that_have_nothing_to_do_with_each_other_are_refused(tmp_path, rng):
+    noise = [cv2.resize(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8), SIZE) for _ in range(10)]
+    with pytest.raises(BadInput, match="could not be solved with certainty"):
+        solve(filmed(tmp_path / "film", noise), nobody, tmp_path / "w", Settings(), lambda *w: None)
+
+
+def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch):
+    """Whichever of them is wrong: here the incremental one is bent."""
+    _, source, _, work, _ = walk
+    shutil.copytree(work, tmp_path / "work")
+    shutil.rmtree(tmp_path / "work" / "incremental mapping 0")
+    plain = mapping.map_incrementally
+
+    def bent(bench, out, seed, told):
+        model = plain(bench, out, seed, told)
+        lift = np.linspace(0.0, 0.3, len(model.frames))[:, None] * [0.0, 1.0, 0.0]
+        model.camera_from_world[:, :3, 3] += np.einsum(
+            "cab,cb->ca", model.camera_from_world[:, :3, :3], lift
+        )
+        return model
+
+    monkeypatch.setattr(mapping, "map_incrementally", bent)
+    monkeypatch.setattr(solver, "judged", lambda model, keys: [])  # each passes by itself
+    with pytest.raises(BadInput, match="contradict each other"):
+        solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+
+
+def test_a_tripod_needs_no_solution(room, walked, tmp_path, monkeypatch):
+    monkeypatch.setattr(mapping, "extract", None)
+    camera = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
+    source = filmed(tmp_path / "film", [room.seen(camera)] * 9)
+    solved = solve(source, nobody, tmp_path / "work", Settings(), lambda *what: None)
+    assert solved.still
+    solved.save(tmp_path / "work")
+    assert Solved.load(tmp_path / "work").still
+
+
+def test_a_missing_pycolmap_is_said(monkeypatch, tmp_path):
+    monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BadInput, match="pip install pycolmap"):
+        mapping.check_installed()
