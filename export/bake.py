@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Int32, UInt, UInt8, UInt16
+from jaxtyping import Bool, Int32, Shaped, UInt, UInt8, UInt16
 
 from avatar.rig import Rig
 from export.bake_skin import skin_of
@@ -28,8 +28,6 @@ FAINT_SHARE = 0.1
 """The hull's level is at most this share of what the densest percent of a field reaches."""
 MARGIN_M = 0.012
 """Bricks reach this far outside of the hull."""
-COARSE_M = 0.012
-"""Spacing at which a hull's surfels are counted before they are made."""
 VOXEL_SHARE = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 FINEST_M, COARSEST_M = 0.0038, 0.006
@@ -136,18 +134,12 @@ def _hull_that_fits(lattice: Lattice, config: BakeConfig) -> Hull:
     if visible.size == 0:
         raise ExportRefused(EMPTY)
     level = min(config.hull_density, FAINT_SHARE * float(np.percentile(visible, 99)))
-    spacing_m = max(config.surfel_spacing_m, _spacing_that_fits(lattice, level))
+    spacing_m = config.surfel_spacing_m
     while True:
         hull = find_hull(lattice, level=level, spacing_m=spacing_m)
         if 0 < len(hull.positions) < 1 << SURFEL_BITS:
             return hull
         spacing_m *= 1.02 * max(1.0, len(hull.positions) / (1 << SURFEL_BITS)) ** 0.5
-
-
-def _spacing_that_fits(lattice: Lattice, level: float) -> float:
-    """About the finest spacing whose surfels can be numbered, after a look at a coarse hull."""
-    coarse = find_hull(lattice, level=level, spacing_m=COARSE_M)
-    return 1.02 * COARSE_M * (len(coarse.positions) / (1 << SURFEL_BITS)) ** 0.5
 
 
 def _reach(rig: Rig) -> float:
@@ -200,22 +192,31 @@ def rounded(
 def _bricks(lattice: Lattice, reached: Bool[np.ndarray, "x y z"]) -> Bricks:
     """The visible part of the lattice near the hull, cut into bricks."""
     counts = np.array(lattice.density.shape) // BRICK
-    codes = density_codes(lattice.density)
-    codes = np.where(codes > 0, np.maximum(rounded(codes, DENSITY_STEP, 255), DENSITY_STEP), 0)
-    codes = codes.astype(np.uint8)
-    codes[~reached] = 0
+    places = np.flatnonzero(reached)
+    seen = density_codes(lattice.density.ravel()[places])
+    seen = np.where(seen > 0, np.maximum(rounded(seen, DENSITY_STEP, 255), DENSITY_STEP), 0)
+    codes = np.zeros(lattice.density.shape, dtype=np.uint8)
+    codes.ravel()[places] = seen
     visible = grown(codes > 0)
-    blocks = np.lib.stride_tricks.sliding_window_view(visible, (NODES,) * 3)
-    used = blocks[::BRICK, ::BRICK, ::BRICK].any(axis=(3, 4, 5))
+    blocks = _blocks(visible)
+    used = blocks.any(axis=(3, 4, 5))
     index = np.zeros(counts, dtype=np.int32)
     index[used] = np.arange(1, used.sum() + 1)
     voxels = np.zeros((used.sum() + 1, NODES, NODES, NODES, 4), dtype=np.uint8)
-    seen = blocks[::BRICK, ::BRICK, ::BRICK][used]
-    for channel in range(4):
-        values = codes if channel == 3 else rounded(lattice.rgb[..., channel], COLOR_STEP, 255)
-        cut = np.lib.stride_tricks.sliding_window_view(values, (NODES,) * 3)
-        voxels[1:, ..., channel] = cut[::BRICK, ::BRICK, ::BRICK][used] * seen
+    voxels[1:, ..., 3] = _blocks(codes)[used]
+    shown = blocks[used]
+    for channel in range(3):
+        values = _blocks(lattice.rgb[..., channel])[used]
+        voxels[1:, ..., channel] = rounded(values, COLOR_STEP, 255) * shown
     return Bricks(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
+
+
+def _blocks(
+    nodes: Shaped[np.ndarray, "x y z"],
+) -> Shaped[np.ndarray, "blocks_x blocks_y blocks_z 9 9 9"]:
+    """A lattice's blocks of 8 cells along each side; neighbours share a layer of nodes."""
+    blocks = np.lib.stride_tricks.sliding_window_view(nodes, (NODES,) * 3)
+    return blocks[::BRICK, ::BRICK, ::BRICK]
 
 
 def _within_reach(lattice: Lattice, hull: Hull) -> Bool[np.ndarray, "x y z"]:

@@ -23,7 +23,7 @@ from export.bake import BakeConfig, read, tables_of
 from export.codec import Layout
 from export.errors import ExportRefused
 from export.graph import build_graph
-from export.lattice import FieldAt, Lattice
+from export.lattice import FieldAt
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
 from export.package import AvatarPackage, PackageDraft
 from export.player import ALIKE, Likeness, Player, premultiplied
@@ -143,11 +143,13 @@ def export_field(
     # the field, and the renderer with it, is asked on this thread alone
     lattice = read(field_at, rig, occupied=occupied, config=config)
     with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
-        drawing = beside.submit(_drawing, lattice, rig, config, views, metrics)
+        baked = beside.submit(tables_of, lattice, rig, config)
         exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
-        package, hq = drawing.result()
+        tables = baked.result()
+        compressed = beside.submit(draft.add_tables, tables)
+        package = _package(tables, config.tiers, rig, views, metrics)
         others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
-        compressed = beside.submit(draft.add_drawing, package)
+        hq = Player(package)
         notes, warnings = {}, list[str]()
         for tier in config.tiers:
             player = hq if tier == "hq" else others[tier].result()
@@ -176,18 +178,6 @@ def export_field(
         largest_difference=max(note.largest_difference for note in notes.values()),
         warnings=tuple(warnings),
     )
-
-
-def _drawing(
-    lattice: Lattice,
-    rig: Rig,
-    config: BakeConfig,
-    views: Sequence[View],
-    metrics: Mapping[str, Any],
-) -> tuple[AvatarPackage, Player]:
-    """The package before its checks, and a player of its best tier."""
-    package = _package(tables_of(lattice, rig, config), config.tiers, rig, views, metrics)
-    return package, Player(package)
 
 
 def _package(

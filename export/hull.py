@@ -49,8 +49,7 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
             cuts into what is seen.
         spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
     """
-    logs = np.log(np.clip(lattice.density / np.float32(level), 1.0 / CONTRAST, CONTRAST))
-    logs = resampled(logs, spacing_m / lattice.voxel_m)
+    logs = resampled(_log_density(lattice, level), spacing_m / lattice.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
     inside = _largest_parts(logs > 0.0)
     nothing = np.float32(1e-3)
@@ -64,6 +63,15 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
         normals=normals,
         thickness=_thickness(lattice, positions, normals),
     )
+
+
+def _log_density(lattice: Lattice, level: float) -> Float32[np.ndarray, "x y z"]:
+    """Logarithm of the density over the level, within `CONTRAST`; most nodes are empty."""
+    logs = np.full(lattice.density.shape, -np.log(CONTRAST), dtype=np.float32)
+    places = np.flatnonzero(lattice.density > np.float32(level / CONTRAST))
+    dense = lattice.density.ravel()[places] / np.float32(level)
+    logs.ravel()[places] = np.log(np.clip(dense, 1.0 / CONTRAST, CONTRAST))
+    return logs
 
 
 def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:

@@ -61,8 +61,9 @@ def read_field(
         with torch.no_grad():
             colors, densities = field_at(points)
         i, j, k = nodes.T
-        density[i, j, k] = densities.numpy()
-        rgb[i, j, k] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
+        place = (i * counts[1] + j) * counts[2] + k
+        density.ravel()[place] = densities.numpy()
+        rgb.reshape(-1, 3)[place] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
     spread_colors(density > FAINTEST, rgb)
     return Lattice(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
 

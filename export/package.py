@@ -71,7 +71,7 @@ def write_package(package: AvatarPackage, path: Path) -> int:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
     with PackageDraft(path) as draft:
-        draft.add_drawing(package)
+        draft.add_tables(package.tables["hq"])
         return draft.finish(package)
 
 
@@ -79,7 +79,7 @@ def write_package(package: AvatarPackage, path: Path) -> int:
 class PackageDraft:
     """A package under a temporary name, which it loses unless it is finished.
 
-    What is drawn can go in, and be compressed, while it is still being checked.
+    The tables can go in, and be compressed, while what is drawn of them is still being checked.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,23 +105,23 @@ class PackageDraft:
         self._archive = zipfile.ZipFile(self._file, "w")
         return self
 
-    def add_drawing(self, package: AvatarPackage) -> None:
-        """Adds graphs and tables."""
-        for tier, graph in package.graphs.items():
-            self._add(graph_entry(tier), graph)
-        for name, stream in encode(package.tables["hq"]).items():
+    def add_tables(self, tables: Tables) -> None:
+        """Adds what all tiers draw."""
+        for name, stream in encode(tables).items():
             self._add(stream_entry(name), stream)
 
     def finish(self, package: AvatarPackage) -> int:
-        """Adds golden frames, preview and manifest, and gives the package its name.
+        """Adds graphs, golden frames, preview and manifest, and gives the package its name.
 
         Args:
-            package: Its graphs and tables are in already.
+            package: Its tables are in already.
 
         Returns:
             Its size in bytes.
         """
         assert self._temporary is not None
+        for tier, graph in package.graphs.items():
+            self._add(graph_entry(tier), graph)
         self._add(PREVIEW, package.preview)
         for number, frame in enumerate(package.golden):
             self._add(golden_entry(number), frame.tobytes())
