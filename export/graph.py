@@ -3,12 +3,15 @@
 import numpy as np
 import onnx
 
+from export.columns import taken
 from export.initialisers import initialisers
 from export.nodes import Graph, Value
-from export.raster import holes_filled, keys_behind, nearest_keys, pose_hull, splat
+from export.posing import pose_nodes
+from export.raster import FAR, Splats, Window, keys_behind, nearest_keys, splat
 from export.rules import DrawingRules
 from export.scene import Scene, View
-from export.shading import Before, Layer, shade
+from export.shading import Hull, Layer, rays, shade
+from export.surfels import pose_surfels
 from export.tables import Tables
 
 
@@ -17,7 +20,8 @@ def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
 
     Inputs: `bones` (24, 12), camera-from-canonical 3×4 matrices in metres; `camera` (4), focal
     lengths and centre in pixels; `height`, `width`, `samples`, int64 scalars. Output: `rgba`
-    (height, width, 4), uint8, straight alpha. Its tables stay outside (`initialisers`).
+    (height × width), int32: red, green, blue and straight alpha, one byte each, red the lowest.
+    Its tables stay outside (`initialisers`).
     """
     graph = Graph()
     scene = Scene(
@@ -28,31 +32,25 @@ def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
         view=_view(graph),
         samples=graph.input("samples", np.int64, []),
     )
-    picture = _picture(scene)
-    graph.output(_as_bytes(scene, picture), "rgba", ["height", "width", 4])
+    graph.output(_picture(scene), "rgba", ["pixels"])
     return graph.model()
 
 
-def _picture(scene: Scene) -> list[Value]:
-    """Premultiplied colour and alpha, a value per channel with one entry a pixel."""
-    graph, rules = scene.graph, scene.rules
-    pixels = graph.shape(scene.view.pixels)
-    hull = pose_hull(scene)
-    splats = splat(scene, hull)
-    keys = holes_filled(scene, nearest_keys(scene, splats))
-    first = shade(scene, hull, keys, graph.filled(pixels, np.True_), None)
-    empty = graph.filled(pixels, np.float32(0))
-    picture = [empty.scattered(first.pixel, channel) for channel in [*first.color, first.alpha]]
-    if rules.layers == 1:
-        return picture
-    passed = 1.0 - picture[3]
-    wanted = passed > rules.transmitted
-    limit = graph.filled(pixels, np.float32(1e6))
-    limit = limit.scattered(first.pixel, first.depth + rules.gap_m)
-    limit = graph.where(wanted, limit, 1e6)
-    before = Before(key=keys, end=empty.scattered(first.pixel, first.end))
-    second = shade(scene, hull, keys_behind(scene, splats, limit), wanted, before)
-    return _with_layer_behind(picture, second, passed)
+def _picture(scene: Scene) -> Value:
+    graph = scene.graph
+    posed = pose_nodes(scene)
+    hull = Hull(surfels=pose_surfels(scene, posed), posed=posed)
+    splats = splat(scene, hull.surfels)
+    window = splats.window
+    keys = nearest_keys(scene, splats)
+    covered = keys < FAR
+    pixel = graph.range((window.width * window.height).cast(np.int32)).compressed(covered)
+    ray = rays(scene.view, window, pixel)
+    first = shade(scene, hull, keys.compressed(covered), ray, None)
+    channels = [*first.color, first.light]
+    if scene.rules.layers == 2:
+        channels = _with_second(scene, hull, splats, pixel, first)
+    return _drawn(scene, window, pixel, channels)
 
 
 def _view(graph: Graph) -> View:
@@ -67,21 +65,59 @@ def _view(graph: Graph) -> View:
     )
 
 
-def _with_layer_behind(picture: list[Value], second: Layer, passed: Value) -> list[Value]:
-    """Adds what the first layer lets through."""
-    seen = passed.take(second.pixel)
-    return [
-        channel.scattered(second.pixel, behind * seen, reduction="add")
-        for channel, behind in zip(picture, [*second.color, second.alpha], strict=True)
+def _with_second(
+    scene: Scene, hull: Hull, splats: Splats, pixel: Value, first: Layer
+) -> list[Value]:
+    """Colour and light after both layers, one entry a ray of the first."""
+    graph, window = scene.graph, splats.window
+    wanted = first.light > scene.rules.transmitted
+    number = graph.range(graph.size(pixel).cast(np.int32)).compressed(wanted)
+    depth = (first.enter * first.ray[2]).take(number) + scene.rules.gap_m
+    keys = keys_behind(
+        scene, hull.posed, hull.surfels, splats, _cells(window, pixel.take(number)), depth
+    )
+    there = keys < FAR
+    keys, number = keys.compressed(there), number.compressed(there)
+    before = Layer(
+        ray=taken(first.ray, number),
+        canonical=taken(first.canonical, number),
+        camera=taken(first.camera, number),
+        color=first.color,
+        light=first.light.take(number),
+        enter=first.enter,
+        end=first.end.take(number),
+    )
+    second = shade(scene, hull, keys, before.ray, before)
+    color = [
+        c.scattered(number, behind * before.light, reduction="add")
+        for c, behind in zip(first.color, second.color, strict=True)
     ]
+    return [*color, first.light.scattered(number, before.light * second.light)]
 
 
-def _as_bytes(scene: Scene, picture: list[Value]) -> Value:
-    """Eight bits a channel, straight alpha: colour is divided by alpha."""
-    view = scene.view
-    *color, alpha = picture
-    inverse = alpha.maximum(1e-6).reciprocal()
-    channels = [*(channel * inverse for channel in color), alpha]
-    planes = [channel.reshaped(1, view.height, view.width) for channel in channels]
-    image = scene.graph.concatenated(planes).transposed(1, 2, 0)
-    return (image * 255.0 + 0.5).clipped(0.0, 255.0).cast(np.uint8)
+def _cells(window: Window, pixel: Value) -> Value:
+    """Cells of the buffer in which pixels of the window lie."""
+    width, stride = window.width.cast(np.int32), window.stride.cast(np.int32)
+    row = pixel // width
+    return (row + window.border) * stride + (pixel - row * width + window.border)
+
+
+def _drawn(scene: Scene, window: Window, pixel: Value, channels: list[Value]) -> Value:
+    """The whole picture, eight bits a channel, straight alpha: colour is divided by alpha."""
+    graph, view = scene.graph, scene.view
+    *color, light = channels
+    alpha = 1.0 - light
+    inverse = 255.0 / alpha.maximum(1e-6)
+    bytes_ = [
+        (value + 0.5).clipped(0.0, 255.0).cast(np.int32)
+        for value in [*(channel * inverse for channel in color), alpha * 255.0]
+    ]
+    red, green, blue, alpha = bytes_
+    alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte holds the sign
+    packed = red + green * (1 << 8) + blue * (1 << 16) + alpha * (1 << 24)
+    width = window.width.cast(np.int32)
+    row = pixel // width
+    column = pixel - row * width + window.left.cast(np.int32)
+    place = (row + window.top.cast(np.int32)) * view.width.cast(np.int32) + column
+    empty = graph.filled(graph.shape(view.pixels), np.int32(0))
+    return empty.scattered(place, packed)

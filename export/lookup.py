@@ -1,76 +1,73 @@
 """Nodes that read colour and density out of the bricks."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from export.columns import Vector
 from export.nodes import Graph, Value
+from export.scene import Scene
 from export.tables import BRICK, LOG_DENSITY, NODES, Bricks
 
 STRIDES = (NODES * NODES, NODES, 1)
 """Steps along x, y and z inside a brick."""
 FULL = 256
-"""Interpolation weights are integers that sum to this: two channels share a multiplication."""
+"""Weights of colours are integers that sum to this: two channels share a multiplication."""
+LOCAL_BITS = 10
+"""A voxel's place inside its brick takes so many bits, the brick's block the others."""
 
 
-def read_bricks(
-    graph: Graph, tables: dict[str, Value], bricks: Bricks, lattice: Vector
-) -> tuple[Vector, Value]:
-    """Tetrahedral interpolation at lattice coordinates (four corners instead of eight).
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cell:
+    """Tetrahedra that hold some points: values of the graph, one entry a point.
 
-    Args:
-        graph: The graph.
-        tables: The initialisers.
-        bricks: Their sizes.
-        lattice: (point - low) / voxel_m.
+    A cell is cut into six tetrahedra along its diagonal. The one that holds a point is walked
+    from the cell's lower to its upper corner along the axes in the order of their fractions.
 
-    Returns:
-        Colour × 255 × 256, and density in 1/m.
+    Attributes:
+        corners: Addresses of the four voxels on that way.
+        fractions: How far the point is along each of the three edges, the largest first.
     """
-    base, fraction = _cell(graph, tables, bricks, lattice)
-    red_blue = green_density = None
-    for place, weight in _corners(graph, base, fraction):
-        pair = tables["voxel_red_blue"].take(place) * weight
-        other = tables["voxel_green_density"].take(place) * weight
-        red_blue = pair if red_blue is None else red_blue + pair
-        green_density = other if green_density is None else green_density + other
-    assert red_blue is not None
-    assert green_density is not None
-    low, high = LOG_DENSITY
-    code = _upper(green_density)
-    density = (code * ((high - low) / (255.0 * FULL)) + low).exp()
-    density = graph.where(code > FULL / 2.0, density, 0.0)
-    return [_lower(red_blue), _lower(green_density), _upper(red_blue)], density
+
+    corners: list[Value]
+    fractions: Vector
 
 
-def _cell(
-    graph: Graph, tables: dict[str, Value], bricks: Bricks, lattice: Vector
-) -> tuple[Value, Vector]:
-    """Address of the voxel below a point, and how far the point is beyond it."""
-    counts = bricks.index.shape
-    inside = [
-        coordinate.clipped(0.0, count * BRICK - 1e-3)
-        for coordinate, count in zip(lattice, counts, strict=True)
-    ]
-    voxel = [coordinate.floor() for coordinate in inside]
-    brick = [(coordinate * (1.0 / BRICK)).floor() for coordinate in voxel]
-    number = (brick[0] * float(counts[1]) + brick[1]) * float(counts[2]) + brick[2]
-    local = None
-    for axis, stride in enumerate(STRIDES):
-        steps = (voxel[axis] - brick[axis] * float(BRICK)) * float(stride)
-        local = steps if local is None else local + steps
-    assert local is not None
-    base = tables["brick_offset"].take(number.cast(np.int32)) + local.cast(np.int32)
-    return base, [a - b for a, b in zip(inside, voxel, strict=True)]
+def cell_of(scene: Scene, lattice: Vector) -> Cell:
+    """The tetrahedra about lattice coordinates, (point - low) / voxel_m."""
+    graph, bricks = scene.graph, scene.tables.bricks
+    packed, fraction = None, []
+    for axis, coordinate in enumerate(lattice):
+        inside = coordinate.clipped(0.0, bricks.index.shape[axis] * BRICK - 1e-3)
+        voxel = inside.cast(np.int32)
+        fraction.append(inside - voxel.cast(np.float32))
+        part = graph.constant(_packed_places(bricks, axis)).take(voxel)
+        packed = part if packed is None else packed + part
+    assert packed is not None
+    base = packed + _offsets(scene).take(packed.shifted_right(LOCAL_BITS).cast(np.int32))
+    x, y, z = fraction
+    largest, smallest = x.maximum(y, z), x.minimum(y, z)
+    middle = (x + y + z) - largest - smallest
+    return Cell(corners=_way(graph, base, fraction), fractions=[largest, middle, smallest])
 
 
-def _corners(graph: Graph, base: Value, fraction: Vector) -> Sequence[tuple[Value, Value]]:
-    """The corners of the tetrahedron that holds a point, and their integer weights.
+def _packed_places(bricks: Bricks, axis: int) -> np.ndarray:
+    """For each voxel along an axis its part of the block's number and of the place inside."""
+    voxel = np.arange(bricks.index.shape[axis] * BRICK, dtype=np.int32)
+    blocks = int(np.prod(bricks.index.shape[axis + 1 :]))
+    packed = (voxel // BRICK * blocks << LOCAL_BITS) + voxel % BRICK * STRIDES[axis]
+    return packed.astype(np.int32)
 
-    Of a cell's six tetrahedra along its diagonal, the one whose path takes the axis of the
-    largest fraction first.
-    """
+
+def _offsets(scene: Scene) -> Value:
+    """What added to a packed place gives the voxel's address, for each block."""
+    offset = scene.columns["brick_offset"]
+    blocks = scene.graph.range(scene.graph.constant(np.int32(scene.tables.bricks.index.size)))
+    return offset - blocks * (1 << LOCAL_BITS)
+
+
+def _way(graph: Graph, base: Value, fraction: Vector) -> list[Value]:
+    """The corners of the tetrahedron: the axis of the largest fraction is taken first."""
     x, y, z = fraction
     sx, sy, sz = STRIDES
     x_over_y, x_over_z, y_over_z = x > y, x > z, y > z
@@ -85,20 +82,38 @@ def _corners(graph: Graph, base: Value, fraction: Vector) -> Sequence[tuple[Valu
         chosen(y_over_z, sx + sy, sx + sz),
         chosen(x_over_z, sx + sy, sy + sz),
     )
-    largest, smallest = x.maximum(y, z), x.minimum(y, z)
-    middle = (x + y + z) - largest - smallest
-    a, b, c = ((part * float(FULL) + 0.5).cast(np.int32) for part in (largest, middle, smallest))
+    return [base, base + first, base + last_two, base + (sx + sy + sz)]
+
+
+def density_in(scene: Scene, cell: Cell) -> Value:
+    """Density in 1/m: its logarithm is linear in a tetrahedron; below half a code is nothing."""
+    table = scene.columns["voxel_density"]
+    codes = [table.take(corner).cast(np.float32) for corner in cell.corners]
+    code = codes[0]
+    for i, fraction in enumerate(cell.fractions):
+        code = code + fraction * (codes[i + 1] - codes[i])
+    low, high = LOG_DENSITY
+    density = (code * ((high - low) / 255.0) + low).exp()
+    return scene.graph.where(code > 0.5, density, 0.0)
+
+
+def color_in(scene: Scene, cell: Cell) -> Vector:
+    """Red, green and blue in [0, 1]."""
+    parts = [(part * float(FULL) + 0.5).cast(np.int32) for part in cell.fractions]
+    a, b, c = parts
+    red_blue = green = None
+    for corner, weight in zip(cell.corners, (FULL - a, a - b, b - c, c), strict=True):
+        code = scene.columns["voxel_color"].take(corner)
+        pair, other = code.masked(0xFF00FF) * weight, code.masked(0xFF00) * weight
+        red_blue = pair if red_blue is None else red_blue + pair
+        green = other if green is None else green + other
+    assert red_blue is not None
+    assert green is not None
+    scale = 1.0 / (255.0 * FULL)
+    blue = red_blue.shifted_right(16)
+    red = red_blue - blue.cast(np.int32) * (1 << 16)
     return [
-        (base, FULL - a),
-        (base + first, a - b),
-        (base + last_two, b - c),
-        (base + (sx + sy + sz), c),
+        red.cast(np.float32) * scale,
+        green.cast(np.float32) * (scale / 256.0),
+        blue.cast(np.float32) * scale,
     ]
-
-
-def _lower(pair: Value) -> Value:
-    return pair.masked(0xFFFF).cast(np.float32)
-
-
-def _upper(pair: Value) -> Value:
-    return pair.shifted_right(16).cast(np.float32)

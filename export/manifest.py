@@ -14,7 +14,7 @@ from export.codec import Layout
 from export.rules import DrawingRules
 from preprocess.pose import BodyPose
 
-FORMAT = 2
+FORMAT = 3
 GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""
 JOINTS = (

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Matrix, Vector, adjugate, applied, dot, taken
-from export.lookup import FULL, read_bricks
+from export.columns import Vector, adjugate, dot, taken
+from export.lookup import cell_of, color_in, density_in
 from export.nodes import Value
-from export.posing import Posed, carried, determinant, sound
+from export.posing import Posed, carried, inverse_of, place_of
 from export.scene import Scene
 
-MOST_BLOCKS = 64
 NOTHING_LEFT_M = 1e-5
 
 
@@ -32,91 +31,154 @@ class Segment:
     direction: Vector
 
 
-def march(scene: Scene, posed: Posed, segment: Segment, *, steady: int) -> tuple[Vector, Value]:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Block:
+    """What a block of samples leaves behind: values of the graph, one entry a ray.
+
+    Attributes:
+        place: Where it ends along the ray, metres.
+        canonical: The same in canonical space.
+        light: What is let through.
+        color: What it adds, premultiplied.
+    """
+
+    place: Value
+    canonical: Vector
+    light: Value
+    color: Vector
+
+
+def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
     """Front-to-back compositing, a block of samples at a time.
 
     After each block the rays that have ended are put aside, and the others are led back to where
-    the skin says that they are: a step of Newton's method, which also turns them.
+    the skin says that they are: a step of Newton's method, which also turns them. The last block
+    takes all that is left of a ray.
 
     Args:
         scene: What is drawn.
         posed: The skin's nodes in the camera's frame.
         segment: The rays.
-        steady: So many blocks have steps of the usual length; then each has twice the last one's.
 
     Returns:
-        Premultiplied colour and alpha in [0, 1].
+        Premultiplied colour, and the light that is left, in [0, 1].
     """
-    graph, nothing = scene.graph, segment.begin * 0.0
-    count = graph.node("Size", nothing, dtype=np.int64)
-    zero, one = graph.constant(np.int64(0)), graph.constant(np.int64(1))
-    number = graph.node("Range", zero, count, one)
-    moving = [segment.begin, *segment.canonical, *segment.direction]
+    graph, rules = scene.graph, scene.rules
+    usual = rules.span_m / scene.samples.cast(np.float32)
+    block = sampled(scene, segment, segment.begin * 0.0 + 1.0, rules.block, usual)
+    number = graph.range(graph.size(segment.begin).cast(np.int32))
+    start = [block.light, *block.color, *_going_on(scene, number, segment, block)]
 
-    def block(turn: Value, state: list[Value]) -> tuple[Value, list[Value]]:
-        results, (number, *now) = state[:4], state[4:]
-        rays = taken(segment.ray, number)
-        end = segment.end.take(number)
-        doublings = (turn.cast(np.float32) - float(steady - 1)).maximum(0.0)
-        longest = scene.rules.span_m / scene.samples.cast(np.float32) * doublings.exp2()
-        now = _sampled(scene, now, end, longest)
-        light, place = now[7], now[0]
-        going = (light > scene.rules.ended) & (place < end - NOTHING_LEFT_M)
-        ended = graph.nonzero(graph.node("Not", going))
-        target = number.take(ended)
-        results = [
-            result.scattered(target, value.take(ended))
-            for result, value in zip(results, now[7:], strict=True)
+    def once(turn: Value, state: list[Value]) -> tuple[Value, list[Value]]:
+        (light, *color), number, before, values = state[:4], state[4], state[5], state[6:]
+        segment = _led_back(scene, posed, _segment(values))
+        doublings = (turn.cast(np.float32) - float(rules.steady - 2)).maximum(0.0)
+        last = turn > rules.blocks - 3
+        longest = graph.where(last, rules.longest_m, usual * doublings.exp2())
+        block = sampled(scene, segment, before, rules.block, longest)
+        light = light.scattered(number, block.light)
+        color = [
+            c.scattered(number, added, reduction="add")
+            for c, added in zip(color, block.color, strict=True)
         ]
-        left = graph.nonzero(going)
-        now, rays = taken(now, left), taken(rays, left)
-        some = graph.node("Size", left, dtype=np.int64) > 0
-        return some, [*results, number.take(left), *_led_back(scene, posed, rays, now)]
+        left = _going_on(scene, number, segment, block)
+        return graph.size(left[0]) > 0, [light, *color, *left]
 
-    start = [*[nothing] * 4, number, *moving, nothing + 1.0, *[nothing] * 3]
-    light, *color = graph.loop_while(MOST_BLOCKS, start, block)[:4]
-    return [component * (1.0 / (255.0 * FULL)) for component in color], 1.0 - light
+    light, *color = graph.loop_while(rules.blocks - 1, start, once)[:4]
+    return color, light
 
 
-def _sampled(scene: Scene, state: list[Value], end: Value, longest: Value) -> list[Value]:
-    """Goes on for a block of samples; the state is place, point, direction, light, colour."""
-    place, point, direction, carried_on = state[0], state[1:4], state[4:7], state[7:]
-    rules, bricks = scene.rules, scene.tables.bricks
-    step = ((end - place) * (1.0 / rules.block)).minimum(longest)
+def _going_on(scene: Scene, number: Value, segment: Segment, block: Block) -> list[Value]:
+    """Which rays go on: their numbers, the light that is left, and `_values` of their rest."""
+    graph = scene.graph
+    on = (block.light > scene.rules.ended) & (block.place < segment.end - NOTHING_LEFT_M)
+    chosen = graph.range(graph.size(on).cast(np.int32)).compressed(on)
+    rest = Segment(
+        ray=segment.ray,
+        begin=block.place,
+        end=segment.end,
+        canonical=block.canonical,
+        direction=segment.direction,
+    )
+    return taken([number, block.light, *_values(rest)], chosen)
+
+
+def _segment(values: list[Value]) -> Segment:
+    return Segment(
+        ray=values[:3],
+        begin=values[3],
+        end=values[4],
+        canonical=values[5:8],
+        direction=values[8:],
+    )
+
+
+def _values(segment: Segment) -> list[Value]:
+    return [
+        *segment.ray, segment.begin, segment.end, *segment.canonical, *segment.direction
+    ]  # fmt: skip
+
+
+def sampled(
+    scene: Scene, segment: Segment, light: Value, count: int, longest: Value | float
+) -> Block:
+    """A block of so many samples: density at each, colour once, at their mean."""
+    graph, bricks = scene.graph, scene.tables.bricks
+    step = ((segment.end - segment.begin) * (1.0 / count)).minimum(longest)
     scale = 1.0 / bricks.voxel_m
-    start = [(p - float(low)) * scale for p, low in zip(point, bricks.low, strict=True)]
-    slope = [component * step * scale for component in direction]
+    start = [
+        p * scale - float(low) * scale for p, low in zip(segment.canonical, bricks.low, strict=True)
+    ]
+    along_step = step * scale
+    slope = [d * along_step for d in segment.direction]
+    middles = graph.constant((np.arange(count, dtype=np.float32) + 0.5)[:, None])
+    lattice = [
+        (middles * b.reshaped(1, -1) + a.reshaped(1, -1)).reshaped(-1)
+        for a, b in zip(start, slope, strict=True)
+    ]
+    density = density_in(scene, cell_of(scene, lattice)).reshaped(count, -1)
+    passed = graph.split((density * -step.reshaped(1, -1)).exp(), count)
+    weight = mean = None
+    before = light
+    for turn, share in enumerate(passed):
+        light = before * share
+        seen = before - light
+        part = seen * (turn + 0.5)
+        weight = seen if weight is None else weight + seen
+        mean = part if mean is None else mean + part
+        before = light
+    assert weight is not None
+    assert mean is not None
+    middle = mean / weight.maximum(1e-9)
+    seen = color_in(
+        scene, cell_of(scene, [a + middle * b for a, b in zip(start, slope, strict=True)])
+    )
+    way = step * float(count)
+    return Block(
+        place=segment.begin + way,
+        canonical=[p + d * way for p, d in zip(segment.canonical, segment.direction, strict=True)],
+        light=light,
+        color=[c * weight for c in seen],
+    )
 
-    def sample(turn: Value, state: list[Value]) -> list[Value]:
-        light, *color = state
-        along = turn.cast(np.float32) + 0.5
-        lattice = [a + along * b for a, b in zip(start, slope, strict=True)]
-        sampled, density = read_bricks(scene.graph, scene.columns, bricks, lattice)
-        passed = (-(density * step)).exp()
-        weight = light * (1.0 - passed)
-        return [light * passed, *(a + b * weight for a, b in zip(color, sampled, strict=True))]
 
-    carried_on = scene.graph.loop(scene.graph.constant(np.int64(rules.block)), carried_on, sample)
-    way = step * float(rules.block)
-    point = [p + d * way for p, d in zip(point, direction, strict=True)]
-    return [place + way, *point, *direction, *carried_on]
-
-
-def _led_back(scene: Scene, posed: Posed, ray: Vector, state: list[Value]) -> list[Value]:
+def _led_back(scene: Scene, posed: Posed, segment: Segment) -> Segment:
     """Corrects canonical points and directions where the derivative can be inverted."""
     graph, rules = scene.graph, scene.rules
-    place, point, direction, others = state[0], state[1:4], state[4:7], state[7:]
-    camera, derivative = carried(scene, posed, point)
-    cofactors: Matrix = adjugate(derivative)
-    volume = determinant(derivative, cofactors)
-    trusted = sound(scene, volume)
-    inverse = graph.where(trusted, volume, 1.0).reciprocal()
-    off = [place * r - c for r, c in zip(ray, camera, strict=True)]
-    shift = [component * inverse for component in applied(cofactors, off)]
-    longest = rules.longest_correction_m
+    camera, derivative = carried(scene, posed, place_of(scene, segment.canonical))
+    inverse = inverse_of(scene, derivative, adjugate(derivative))
+    off = [segment.begin * r - c for r, c in zip(segment.ray, camera, strict=True)]
+    shift = inverse.applied(off)
     length = (dot(shift, shift) + 1e-20).sqrt()
-    share = graph.where(trusted, (longest / length).minimum(1.0), 0.0)
-    point = [p + s * share for p, s in zip(point, shift, strict=True)]
-    turned = [component * inverse for component in applied(cofactors, ray)]
-    direction = [graph.where(trusted, a, b) for a, b in zip(turned, direction, strict=True)]
-    return [place, *point, *direction, *others]
+    share = (rules.longest_correction_m / length).minimum(1.0)
+    turned = inverse.applied(segment.ray)
+    return Segment(
+        ray=segment.ray,
+        begin=segment.begin,
+        end=segment.end,
+        canonical=[p + s * share for p, s in zip(segment.canonical, shift, strict=True)],
+        direction=[
+            graph.where(inverse.trusted, a, b)
+            for a, b in zip(turned, segment.direction, strict=True)
+        ],
+    )

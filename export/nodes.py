@@ -133,6 +133,15 @@ class Value:
         """The smallest element, as a scalar."""
         return self._with_attributes("ReduceMin", keepdims=0)
 
+    def largest(self) -> "Value":
+        """The largest element, as a scalar."""
+        return self._with_attributes("ReduceMax", keepdims=0)
+
+    def summed(self, axis: int) -> "Value":
+        """The sum along one axis, which goes away."""
+        along = self.graph.constant(np.array([axis], dtype=np.int64))
+        return self.graph.node("ReduceSum", self, along, keepdims=0)
+
     def clipped(self, low: "Operand", high: "Operand") -> "Value":
         """Clamped to [low, high]."""
         return self._with("Clip", low, high)
@@ -144,6 +153,10 @@ class Value:
     def take_rows(self, rows: "Value") -> "Value":
         """`self[rows]` for tensors of more than one dimension."""
         return self.graph.node("Gather", self, rows, dtype=self.dtype, axis=0)
+
+    def compressed(self, condition: "Value") -> "Value":
+        """`self[condition]` for one-dimensional tensors."""
+        return self.graph.node("Compress", self, condition, axis=0)
 
     def row(self, index: int) -> "Value":
         """`self[index]`."""
@@ -255,6 +268,15 @@ class Graph:
         """Places (int64) where a one-dimensional condition holds."""
         return self.node("NonZero", condition, dtype=np.int64).reshaped(-1)
 
+    def range(self, count: Value) -> Value:
+        """0, 1, … count − 1, of the count's type; the count is a scalar."""
+        limits = [self.value(limit, count.dtype) for limit in (0, 1)]
+        return self.node("Range", limits[0], count, limits[1])
+
+    def size(self, value: Value) -> Value:
+        """How many elements a value has, int64 scalar."""
+        return self.node("Size", value, dtype=np.int64)
+
     def concatenated(self, values: Sequence[Value], axis: int = 0) -> Value:
         """Values one after the other."""
         return self.node("Concat", *values, axis=axis)
@@ -289,6 +311,15 @@ class Graph:
         The states' lengths may change from turn to turn.
         """
         return self._loop(self.constant(np.int64(most)), states, body)
+
+    def split(self, value: Value, parts: int, axis: int = 0) -> list[Value]:
+        """Equal pieces along an axis, which is as long as there are pieces and goes away."""
+        self._count += 1
+        names = [f"split_{self._count}_{i}" for i in range(parts)]
+        self._nodes.append(
+            helper.make_node("Split", [value.name], names, axis=axis, num_outputs=parts)
+        )
+        return [Value(self, name, value.dtype).reshaped(-1) for name in names]
 
     def _loop(
         self,

@@ -124,7 +124,8 @@ class Player:
             "width": np.array(width, dtype=np.int64),
             "samples": np.array(samples, dtype=np.int64),
         }
-        return np.asarray(self._session.run(["rgba"], inputs)[0])
+        packed = np.asarray(self._session.run(["rgba"], inputs)[0]).astype("<i4", copy=False)
+        return packed.view(np.uint8).reshape(height, width, 4)
 
     def render_all(
         self,
@@ -200,6 +201,7 @@ def _session(
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what fails is said below
+    options.enable_mem_reuse = False  # planning it takes longer than anything else at load
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names, buffers = list(tables), list(tables.values())
     options.add_external_initializers_from_files_in_memory(

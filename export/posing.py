@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Matrix, Vector, dot, moved
+from export.columns import Matrix, Vector, dot
 from export.nodes import Value
 from export.scene import Scene
 
@@ -16,50 +16,68 @@ class Posed:
     camera: Vector
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Place:
+    """Where points lie among the skin's nodes: values of the graph, one entry a point.
+
+    Attributes:
+        rows: Rows of the four lower nodes along z of the cell about the point, in C order; the
+            upper ones follow them.
+        fraction: How far the point is between the nodes along x, y, z.
+    """
+
+    rows: list[Value]
+    fraction: Vector
+
+
 def pose_nodes(scene: Scene) -> Posed:
     """Linear blend skinning of every node, straight into the camera's frame."""
-    columns = scene.columns
+    graph, columns = scene.graph, scene.columns
     blended = scene.view.bones.transposed(1, 0).matmul(columns["node_weights"])
-    matrix = [[blended.row(4 * i + j) for j in range(4)] for i in range(3)]
-    return Posed(camera=moved(matrix, [columns[f"node_{letter}"] for letter in "xyz"]))
+    positions = [columns[f"node_{letter}"] for letter in "xyz"]
+    ones = positions[0] * 0.0 + 1.0
+    homogeneous = graph.concatenated([p.reshaped(1, -1) for p in [*positions, ones]])
+    matrix = blended.reshaped(3, 4, -1)
+    return Posed(camera=graph.split((matrix * homogeneous).summed(1), 3))
 
 
-def carried(scene: Scene, posed: Posed, canonical: Vector) -> tuple[Vector, Matrix]:
+def nodes_per_m(scene: Scene) -> list[float]:
+    """Nodes lie half a step of the stored skin apart."""
+    return [2.0 / float(step) for step in scene.tables.skin.step_m]
+
+
+def place_of(scene: Scene, canonical: Vector) -> Place:
+    """Where canonical points lie among the nodes."""
+    skin = scene.tables.skin
+    counts = [2 * count - 1 for count in skin.index.shape]
+    number, fraction = None, []
+    for axis, (point, per_m) in enumerate(zip(canonical, nodes_per_m(scene), strict=True)):
+        place = point * per_m - float(skin.low[axis]) * per_m
+        place = place.clipped(0.0, counts[axis] - 1 - 1e-3)
+        below = place.cast(np.int32)
+        fraction.append(place - below.cast(np.float32))
+        number = below if number is None else number * counts[axis] + below
+    assert number is not None
+    steps = (0, counts[2], counts[1] * counts[2], (counts[1] + 1) * counts[2])
+    table = scene.columns["node"]
+    return Place(rows=[table.take(number + step) for step in steps], fraction=fraction)
+
+
+def carried(scene: Scene, posed: Posed, place: Place) -> tuple[Vector, Matrix]:
     """Where points are in the camera's frame, and how that changes with them.
 
     Trilinear between the eight nodes about each.
 
     Returns:
-        The points, and the derivative's rows.
+        The points, and the derivative's rows, metres a step between nodes.
     """
-    rows, fraction, per_m = _corners(scene, canonical)
+    rows = [row for lower in place.rows for row in (lower, lower + 1)]
     point, derivative = [], []
     for table in posed.camera:
-        value, slopes = _trilinear([table.take(row) for row in rows], fraction)
+        value, slopes = _trilinear([table.take(row) for row in rows], place.fraction)
         point.append(value)
-        derivative.append([slope * scale for slope, scale in zip(slopes, per_m, strict=True)])
+        derivative.append(slopes)
     return point, derivative
-
-
-def _corners(scene: Scene, canonical: Vector) -> tuple[list[Value], Vector, list[float]]:
-    """Rows of the eight nodes about points (z fastest), fractions between them, nodes a metre."""
-    skin = scene.tables.skin
-    counts = [2 * count - 1 for count in skin.index.shape]
-    per_m = [2.0 / float(step) for step in skin.step_m]
-    number, fraction = None, []
-    for axis, point in enumerate(canonical):
-        place = (point - float(skin.low[axis])) * per_m[axis]
-        place = place.clipped(0.0, counts[axis] - 1 - 1e-3)
-        below = place.floor()
-        fraction.append(place - below)
-        whole = below.cast(np.int32)
-        number = whole if number is None else number * counts[axis] + whole
-    assert number is not None
-    rows = []
-    for step in (0, counts[2], counts[1] * counts[2], (counts[1] + 1) * counts[2]):
-        row = scene.columns["node"].take(number + step)
-        rows += [row, row + 1]  # along z rows follow each other
-    return rows, fraction, per_m
 
 
 def _trilinear(corners: list[Value], fraction: Vector) -> tuple[Value, Vector]:
@@ -83,12 +101,34 @@ def _between(low: Value, high: Value, share: Value) -> Value:
     return low + share * (high - low)
 
 
-def determinant(matrix: Matrix, cofactors: Matrix) -> Value:
-    """Of 3×3 matrices, with their adjugates."""
-    return dot(matrix[0], [row[0] for row in cofactors])
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Inverse:
+    """The inverse of derivatives: values of the graph, one entry a point.
+
+    Attributes:
+        cofactors: Of the derivative per step between nodes.
+        scale: For each row of the cofactors, what makes it the inverse's, per metre; 0 where the
+            derivative cannot be inverted.
+        trusted: Where it can: the skin is neither folded over nor torn apart.
+    """
+
+    cofactors: Matrix
+    scale: Vector
+    trusted: Value
+
+    def applied(self, vector: Vector) -> Vector:
+        """The inverse times a vector."""
+        return [
+            dot(row, vector) * scale for row, scale in zip(self.cofactors, self.scale, strict=True)
+        ]
 
 
-def sound(scene: Scene, volume: Value) -> Value:
-    """Where a derivative may be inverted: the skin is neither folded over nor torn apart."""
+def inverse_of(scene: Scene, derivative: Matrix, cofactors: Matrix) -> Inverse:
+    """Inverts derivatives (metres a step between nodes), given their adjugates."""
+    per_m = nodes_per_m(scene)
+    volume = dot(derivative[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
     stretch = scene.rules.stretch
-    return (volume > 1.0 / stretch) & (volume < stretch)
+    trusted = (volume > 1.0 / stretch) & (volume < stretch)
+    one = scene.graph.where(trusted, volume, 1e30).reciprocal()
+    scale = [one * float(np.prod(per_m) / step) for step in per_m]
+    return Inverse(cofactors=cofactors, scale=scale, trusted=trusted)

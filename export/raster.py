@@ -1,105 +1,115 @@
-"""Nodes that pose the hull and find out which surfel each pixel sees."""
+"""Nodes that find out which surfel each pixel sees: a z-buffer of the part that the hull covers."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Matrix, Vector, adjugate, applied, dot
+from export.columns import adjugate, dot, taken
 from export.nodes import Value
-from export.posing import Posed, carried, determinant, pose_nodes, sound
+from export.posing import Place, Posed, carried, inverse_of
 from export.scene import Scene
+from export.surfels import Surfels
 from export.tables import DEPTH_STEPS, SURFEL_BITS
 
 FAR = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
+NOWHERE = 1e6
+"""Metres: deeper than anything."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Hull:
-    """The hull in one pose: values of the graph, one entry a surfel.
+class Window:
+    """The part of the picture that the hull may cover, and a buffer with a border around it.
 
     Attributes:
-        posed: What carried it.
-        surfel: Surfel numbers.
-        canonical, normal: Canonical positions and normals.
-        camera: Positions in the camera's frame.
-        inverse: Inverse of the derivative of that, 3×3.
-        from_eye: `inverse` times `camera`: the ray from the eye, seen in canonical space.
-        sound: Whether the derivative can be inverted.
+        left, top: Where it begins, pixels, int64.
+        width, height: At least 1, int64.
+        border: Pixels around it in the buffer, so that footprints never leave the buffer.
+        stride: Pixels in a row of the buffer, int64.
+        cells: Pixels in the buffer, int64; there is one more for what is not drawn.
     """
 
-    posed: Posed
-    surfel: Value
-    canonical: Vector
-    normal: Vector
-    camera: Vector
-    inverse: Matrix
-    from_eye: Vector
-    sound: Value
+    left: Value
+    top: Value
+    width: Value
+    height: Value
+    border: int
+    stride: Value
+    cells: Value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Splats:
-    """Surfels that may be seen, each once for every pixel of its footprint.
+    """Surfels on their way into a z-buffer: values of the graph, one entry a surfel.
 
     Attributes:
-        pixel: Which pixel; `View.pixels` for none.
+        window: Where it is.
+        side: Pixels along the edge of every surfel's footprint, int64 scalar.
+        cell: Upper left pixel of its footprint in the buffer; `Window.cells` for none.
         key: Depth code and surfel number, to be minimised.
-        depth: Metres along z; 0 for a surfel that the second layer leaves out.
+        depth: Metres along z.
     """
 
-    pixel: Value
+    window: Window
+    side: Value
+    cell: Value
     key: Value
     depth: Value
 
 
-def pose_hull(scene: Scene) -> Hull:
-    """Carries every surfel into the camera's frame, and inverts the map about it."""
-    columns, posed = scene.columns, pose_nodes(scene)
-    canonical = [columns[f"position_{letter}"] for letter in "xyz"]
-    camera, derivative = carried(scene, posed, canonical)
-    cofactors = adjugate(derivative)
-    volume = determinant(derivative, cofactors)
-    scale = volume.reciprocal()
-    inverse = [[entry * scale for entry in row] for row in cofactors]
-    return Hull(
-        posed=posed,
-        surfel=columns["surfel"],
-        canonical=canonical,
-        normal=[columns[f"normal_{letter}"] for letter in "xyz"],
-        camera=camera,
-        inverse=inverse,
-        from_eye=applied(inverse, camera),
-        sound=sound(scene, volume),
-    )
-
-
-def splat(scene: Scene, hull: Hull) -> Splats:
-    """Culls and projects the surfels and spreads them over their footprints."""
+def splat(scene: Scene, surfels: Surfels) -> Splats:
+    """Culls and projects the surfels."""
     graph, view, rules = scene.graph, scene.view, scene.rules
-    x, y, depth = hull.camera
+    x, y, depth = surfels.camera
     inverse = depth.maximum(rules.nearest_m).reciprocal()
-    u = view.focal[0] * x * inverse + view.center[0]
-    v = view.focal[1] * y * inverse + view.center[1]
-    facing = dot(hull.normal, hull.from_eye)
+    u = x * inverse * view.focal[0] + view.center[0]
+    v = y * inverse * view.focal[1] + view.center[1]
+    window = _window(scene, u, v)
+    reach = 0.5 * rules.largest_footprint_px
     width, height = view.width.cast(np.float32), view.height.cast(np.float32)
-    margin = float(rules.largest_footprint_px)
-    seen = hull.sound & (depth > rules.nearest_m) & (facing < depth * rules.behind)
-    seen = seen & (u > -margin) & (v > -margin)
-    seen = graph.nonzero(seen & (u < width + margin) & (v < height + margin))
-    key = depth_code(scene, depth) * (1 << SURFEL_BITS) + hull.surfel
-    u, v, depth, key, facing = (value.take(seen) for value in (u, v, depth, key, facing))
-    side = footprint(scene, depth)
-    deep_enough = graph.where(facing < depth * -rules.facing, depth, 0.0)
-    copies = graph.shape(side * side, 1)
+    seen = (depth > rules.nearest_m) & (u > -reach) & (v > -reach) & (u < width + reach)
+    seen = seen & (v < height + reach)
+    side = _footprint(scene, graph.where(seen, depth, NOWHERE).smallest())
+    middle = (side.cast(np.float32) - 1.0) * 0.5 - float(window.border)
+    column = (u - (window.left.cast(np.float32) + middle)).cast(np.int32)
+    row = (v - (window.top.cast(np.float32) + middle)).cast(np.int32)
+    cell = row * window.stride.cast(np.int32) + column
+    number = graph.range(graph.constant(np.int32(len(scene.tables.surfels))))
     return Splats(
-        pixel=_covered_pixels(scene, u, v, side),
-        key=_repeated(scene, key, copies),
-        depth=_repeated(scene, deep_enough, copies),
+        window=window,
+        side=side,
+        cell=graph.where(seen, cell, window.cells.cast(np.int32)),
+        key=_depth_code(scene, depth) * (1 << SURFEL_BITS) + number,
+        depth=depth,
     )
 
 
-def depth_code(scene: Scene, depth: Value) -> Value:
+def _window(scene: Scene, u: Value, v: Value) -> Window:
+    """About all points, whether they are seen or not."""
+    border, reach = 2 * scene.rules.largest_footprint_px + 2, 0.5 * scene.rules.largest_footprint_px
+
+    def extent(places: Value, size: Value) -> tuple[Value, Value]:
+        inside = places.clipped(-reach, size.cast(np.float32) + reach)
+        first = (inside.smallest() - reach).floor().cast(np.int64)
+        last = (inside.largest() + (reach + 1.0)).floor().cast(np.int64)
+        first = first.maximum(0).minimum(size - 1)
+        return first, last.minimum(size).maximum(first + 1) - first
+
+    left, width = extent(u, scene.view.width)
+    top, height = extent(v, scene.view.height)
+    stride = width + 2 * border
+    return Window(
+        left=left,
+        top=top,
+        width=width,
+        height=height,
+        border=border,
+        stride=stride,
+        cells=stride * (height + 2 * border),
+    )
+
+
+def _depth_code(scene: Scene, depth: Value) -> Value:
     """Depth as an integer of 14 bits, in a window about the pelvis."""
     tables, root = scene.tables, scene.view.bones.row(0)
     pelvis = root.row(11)
@@ -110,73 +120,113 @@ def depth_code(scene: Scene, depth: Value) -> Value:
     return steps.clipped(0.0, DEPTH_STEPS - 1.0).cast(np.int32)
 
 
-def footprint(scene: Scene, depth: Value) -> Value:
+def _footprint(scene: Scene, nearest: Value) -> Value:
     """Pixels along the edge of every surfel's footprint, an int64 scalar of at least 2.
 
     It follows the spacing of the surfels where they are nearest to the camera, so that one does
     not see through the hull in a close-up.
     """
-    graph, rules, focal = scene.graph, scene.rules, scene.view.focal
-    far = graph.constant(np.array([1e6], dtype=np.float32))  # so that there always is a smallest
-    nearest = graph.concatenated([depth, far]).smallest()
+    rules, focal = scene.rules, scene.view.focal
     spacing_px = focal[0].maximum(focal[1]) * scene.tables.surfels.spacing_m / nearest
     side = (spacing_px * rules.footprint_spacings + 0.999).floor()
     return side.clipped(2.0, float(rules.largest_footprint_px)).cast(np.int64)
 
 
-def _covered_pixels(scene: Scene, u: Value, v: Value, side: Value) -> Value:
-    """The pixels about (u, v), one place of the footprint after the other; `pixels` = outside."""
-    graph, view = scene.graph, scene.view
-    zero, one = graph.constant(np.int64(0)), graph.constant(np.int64(1))
-    corner = (side.cast(np.float32) - 1.0) * 0.5
-    offset = graph.node("Range", zero, side * side, one).reshaped(-1, 1)
-    down = offset // side
-    right = offset - down * side
-    x = (u - corner).floor().reshaped(1, -1) + right.cast(np.float32)
-    y = (v - corner).floor().reshaped(1, -1) + down.cast(np.float32)
-    width, height = view.width.cast(np.float32), view.height.cast(np.float32)
-    inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    pixel = y.cast(np.int32) * view.width.cast(np.int32) + x.cast(np.int32)
-    return graph.where(inside, pixel, view.pixels.cast(np.int32)).reshaped(-1)
-
-
-def _repeated(scene: Scene, value: Value, copies: Value) -> Value:
-    return scene.graph.node("Expand", value.reshaped(1, -1), copies).reshaped(-1)
-
-
 def nearest_keys(scene: Scene, splats: Splats) -> Value:
-    """The z-buffer: the least key of every pixel, in one scatter."""
-    return _z_buffer(scene, splats.pixel, splats.key)
+    """The least key of each of the window's pixels, row after row, with single holes filled."""
+    window = splats.window
+    buffer = _scattered(scene, window, splats.cell, splats.key)
+    buffer = _spread(scene, buffer.slices([0], [window.cells]), splats)
+    # footprints lie to the lower right of their cells, so what is spread begins so much later
+    begin = (window.stride + 1) * (1 - splats.side + window.border)
 
+    def shifted(by: Value | int) -> Value:
+        return buffer.slices([begin + by], [begin + by + window.stride * window.height])
 
-def keys_behind(scene: Scene, splats: Splats, limit: Value) -> Value:
-    """The z-buffer of what lies deeper than `limit` (metres a pixel) and faces the camera."""
-    graph = scene.graph
-    nothing = graph.constant(np.array([1e6], dtype=np.float32))
-    behind = splats.depth > graph.concatenated([limit, nothing]).take(splats.pixel)
-    chosen = graph.nonzero(behind)
-    return _z_buffer(scene, splats.pixel.take(chosen), splats.key.take(chosen))
-
-
-def _z_buffer(scene: Scene, pixel: Value, key: Value) -> Value:
-    graph, pixels = scene.graph, scene.view.pixels
-    empty = graph.filled(graph.shape(pixels + 1), FAR)  # one more, for what lands outside
-    return empty.scattered(pixel, key, reduction="min").slices([0], [pixels])
-
-
-def holes_filled(scene: Scene, keys: Value) -> Value:
-    """Fills single pixels that two opposite neighbours overtop."""
-    graph, view = scene.graph, scene.view
-    image = keys.reshaped(view.height, view.width)
-    border = graph.constant(np.array([1, 1, 1, 1], dtype=np.int64))
-    padded = graph.node("Pad", image, border, graph.constant(FAR))
-
-    def shifted(down: int, right: int) -> Value:
-        return padded.slices([down, right], [view.height + down, view.width + right])
-
-    across = shifted(1, 0).maximum(shifted(1, 2))
-    along = shifted(0, 1).maximum(shifted(2, 1))
+    keys = shifted(0)
+    across = shifted(-1).maximum(shifted(1))
+    along = shifted(-window.stride).maximum(shifted(window.stride))
     neighbours = across.minimum(along)
     steps = int(scene.rules.hole_m / (2.0 * scene.tables.reach_m) * DEPTH_STEPS)
-    hole = (image - (steps << SURFEL_BITS)) > neighbours
-    return graph.where(hole, neighbours, image).reshaped(-1)
+    hole = (keys - (steps << SURFEL_BITS)) > neighbours
+    keys = scene.graph.where(hole, neighbours, keys)
+    import os
+
+    if os.environ.get("FILL"):
+        far = [int(k) for k in os.environ["FILL"].split(",")]
+        sides = []
+        for step in (1, -1, window.stride, -window.stride):
+            some = [shifted(step * k) for k in far]
+            sides.append(some[0].minimum(*some[1:]))
+        around = sides[0].maximum(*sides[1:])
+        keys = scene.graph.where(keys < FAR, keys, around)
+    rows = keys.reshaped(-1, window.stride)
+    return rows.slices([0, 0], [window.height, window.width]).reshaped(-1)
+
+
+def _scattered(scene: Scene, window: Window, cell: Value, key: Value) -> Value:
+    empty = scene.graph.filled(scene.graph.shape(window.cells + 1), FAR)
+    return empty.scattered(cell, key, reduction="min")
+
+
+def _spread(scene: Scene, buffer: Value, splats: Splats) -> Value:
+    """The least of a footprint's cells right and below of each; the last ones are left out."""
+    stride = splats.window.stride
+    last = np.iinfo(np.int64).max
+
+    def once(_: Value, state: list[Value]) -> list[Value]:
+        cells = state[0]
+        cells = cells.slices([0], [-1]).minimum(cells.slices([1], [last]))
+        return [cells.slices([0], [-stride]).minimum(cells.slices([stride], [last]))]
+
+    return scene.graph.loop(splats.side - 1, [buffer], once)[0]
+
+
+def keys_behind(
+    scene: Scene, posed: Posed, surfels: Surfels, splats: Splats, cell: Value, limit: Value
+) -> Value:
+    """The least key of what lies deeper than a limit and faces the camera.
+
+    Args:
+        scene: What is drawn.
+        posed: The skin's nodes in the camera's frame.
+        surfels: All of them.
+        splats: The same, projected.
+        cell: Cells of the buffer.
+        limit: Of each, metres along z.
+
+    Returns:
+        A key for each of the cells.
+    """
+    graph, window, side = scene.graph, splats.window, splats.side
+    limits = graph.filled(graph.shape(window.cells + 1), np.float32(NOWHERE))
+    limits = limits.scattered(cell, limit)
+    lowest = _spread(scene, limits, splats)
+    lost = (side - 1) * (window.stride + 1)
+    lowest = graph.concatenated([lowest, graph.filled(graph.shape(lost), np.float32(NOWHERE))])
+    number = graph.range(graph.constant(np.int32(len(scene.tables.surfels))))
+    number = number.compressed(splats.depth > lowest.take(splats.cell))
+    number = number.compressed(_faces(scene, posed, surfels, number))
+    first, key, depth = (
+        value.take(number).reshaped(1, -1) for value in (splats.cell, splats.key, splats.depth)
+    )
+    offset = graph.range(side * side).reshaped(-1, 1)
+    down = offset // side
+    covered = first + (down * window.stride + (offset - down * side)).cast(np.int32)
+    copies = graph.shape(side * side, 1)
+    key, depth = (graph.node("Expand", v, copies).reshaped(-1) for v in (key, depth))
+    covered = covered.reshaped(-1)
+    behind = depth > limits.take(covered)
+    covered = graph.where(behind, covered, window.cells.cast(np.int32))
+    return _scattered(scene, window, covered, key).take(cell)
+
+
+def _faces(scene: Scene, posed: Posed, surfels: Surfels, number: Value) -> Value:
+    """Which of some surfels face the camera."""
+    place = surfels.place
+    place = Place(rows=taken(place.rows, number), fraction=taken(place.fraction, number))
+    camera, derivative = carried(scene, posed, place)
+    inverse = inverse_of(scene, derivative, adjugate(derivative))
+    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], number)
+    facing = dot(normal, inverse.applied(camera))
+    return inverse.trusted & (facing < camera[2] * -scene.rules.facing)

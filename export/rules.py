@@ -12,13 +12,14 @@ class DrawingRules:
         samples: Samples along `span_m` of a ray, unless the player asks for another number.
         span_m: Metres; samples lie `span_m / samples` apart, and closer where a ray ends.
         block: Samples between two corrections of a ray's canonical path.
-        steady: So many blocks have steps of that length, of the second layer one; each further
-            block has twice the steps of the one before it.
+        steady: So many blocks have steps of that length; each further block has twice the steps
+            of the one before it.
+        blocks: At most so many; the last one takes what is left of a ray.
+        second_block: Samples of a ray in the second layer, all at once.
         longest_correction_m: No correction is longer than this.
         ended: A ray ends where less than this share of the light is left.
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
         footprint_spacings: A footprint's size in surfel spacings at the nearest surfel's depth.
-        behind: Cosine up to which a surfel that faces away still covers what is behind it.
         lead_m, most_lead_m: How far in front of the hull a ray's segment begins, along the
             normal, and at most along the ray.
         slack_m: How far the segment's begin may lie from the surfel, along the ray.
@@ -42,14 +43,15 @@ class DrawingRules:
     span_m: float = 0.05
     block: int = 3
     steady: int = 3
+    blocks: int = 5
+    second_block: int = 6
     longest_correction_m: float = 0.01
     ended: float = 0.01
     largest_footprint_px: int = 16
     footprint_spacings: float = 1.1
-    behind: float = 0.35
-    lead_m: float = 0.005
+    lead_m: float = 0.004
     most_lead_m: float = 0.025
-    slack_m: float = 0.012
+    slack_m: float = 0.02
     grazing: float = 1.5
     steepest: float = 0.1
     longest_m: float = 0.15

@@ -4,117 +4,140 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Vector, dot, taken
-from export.march import Segment, march
+from export.columns import Vector, adjugate, dot, taken
+from export.march import Segment, march, sampled
 from export.nodes import Value
-from export.raster import FAR, Hull
+from export.posing import Place, Posed, carried, inverse_of
+from export.raster import Window
 from export.scene import Scene, View
+from export.surfels import Surfels
 from export.tables import SURFEL_BITS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layer:
-    """One depth layer: values of the graph, one entry a covered pixel.
+    """One depth layer: values of the graph, one entry a ray.
 
     Attributes:
-        pixel: Which pixel.
-        surfel: Which surfel it sees.
+        ray: Directions in the camera's frame, of length 1.
+        canonical, camera: Where the surfel that each ray sees is.
         color: Premultiplied.
-        alpha: In [0, 1].
-        depth: Where the ray enters the hull, metres along z.
-        end: Where it ends, metres along the ray.
+        light: What is let through, in [0, 1].
+        enter, end: Where the ray enters the hull and where it ends, metres along it.
     """
 
-    pixel: Value
-    surfel: Value
+    ray: Vector
+    canonical: Vector
+    camera: Vector
     color: Vector
-    alpha: Value
-    depth: Value
+    light: Value
+    enter: Value
     end: Value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Before:
-    """What a second layer has before it: values of the graph, one entry a pixel of the picture."""
+class Hull:
+    """What rays meet: the surfels, and the skin's nodes in the camera's frame."""
 
-    key: Value
-    end: Value
-
-
-def shade(scene: Scene, hull: Hull, keys: Value, wanted: Value, before: Before | None) -> Layer:
-    """Colour and alpha of every pixel that is `wanted` and covered.
-
-    The map from canonical space to the camera's is taken as linear about the surfel that the
-    pixel sees: its inverse carries the ray to where it enters the hull.
-    """
-    pixel = scene.graph.nonzero((keys < FAR) & wanted)
-    surfel = _surfel(keys.take(pixel))
-    inverse = [taken(row, surfel) for row in hull.inverse]
-    ray = _rays(scene.view, pixel)
-    direction = [dot(row, ray) for row in inverse]
-    from_eye = taken(hull.from_eye, surfel)
-    camera = taken(hull.camera, surfel)
-    enter, begin, end = _extent(scene, hull, surfel, direction, from_eye, dot(camera, ray))
-    if before is not None:
-        begin = _after(scene, hull, surfel, before, pixel, begin, end)
-    canonical = [
-        a - b + begin * c
-        for a, b, c in zip(taken(hull.canonical, surfel), from_eye, direction, strict=True)
-    ]
-    segment = Segment(ray=ray, begin=begin, end=end, canonical=canonical, direction=direction)
-    steady = scene.rules.steady if before is None else 1
-    color, alpha = march(scene, hull.posed, segment, steady=steady)
-    return Layer(
-        pixel=pixel, surfel=surfel, color=color, alpha=alpha, depth=enter * ray[2], end=end
-    )
+    surfels: Surfels
+    posed: Posed
 
 
-def _surfel(keys: Value) -> Value:
-    return keys.masked((1 << SURFEL_BITS) - 1)
-
-
-def _rays(view: View, pixel: Value) -> Vector:
-    """Unit directions through the pixels' centres in the camera's frame."""
-    number = pixel.cast(np.int32)
-    width = view.width.cast(np.int32)
-    row = number // width
-    column = number - row * width
-    x = (column.cast(np.float32) + 0.5 - view.center[0]) / view.focal[0]
-    y = (row.cast(np.float32) + 0.5 - view.center[1]) / view.focal[1]
+def rays(view: View, window: Window, pixel: Value) -> Vector:
+    """Unit directions in the camera's frame through the centres of the window's pixels (int32)."""
+    width = window.width.cast(np.int32)
+    row = pixel // width
+    column = pixel - row * width
+    x = column.cast(np.float32) + (window.left.cast(np.float32) + 0.5 - view.center[0])
+    y = row.cast(np.float32) + (window.top.cast(np.float32) + 0.5 - view.center[1])
+    x, y = x / view.focal[0], y / view.focal[1]
     scale = (x * x + y * y + 1.0).sqrt().reciprocal()
     return [x * scale, y * scale, scale]
 
 
+def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | None) -> Layer:
+    """Colour and light behind of rays.
+
+    The map from canonical space to the camera's is taken as linear about the surfel that a ray
+    sees: its inverse carries the ray to where it enters the hull.
+
+    Args:
+        scene: What is drawn.
+        hull: In its pose.
+        keys: What each ray sees.
+        ray: Directions.
+        before: What the same rays saw in the first layer, if this is the second.
+    """
+    graph, surfel = scene.graph, keys.masked((1 << SURFEL_BITS) - 1)
+    place = hull.surfels.place
+    place = Place(rows=taken(place.rows, surfel), fraction=taken(place.fraction, surfel))
+    camera, derivative = carried(scene, hull.posed, place)
+    inverse = inverse_of(scene, derivative, adjugate(derivative))
+    direction = inverse.applied(ray)
+    along = dot(camera, ray)
+    beside = inverse.applied([along * r - c for r, c in zip(ray, camera, strict=True)])
+    enter, begin, end = _extent(scene, surfel, direction, beside, along)
+    canonical = taken([scene.columns[f"position_{letter}"] for letter in "xyz"], surfel)
+    if before is not None:
+        begin = _after(scene, before, canonical, camera, begin, end)
+    end = graph.where(inverse.trusted, end, begin)  # a folded skin shows nothing
+    way = begin - along
+    start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
+    segment = Segment(ray=ray, begin=begin, end=end, canonical=start, direction=direction)
+    if before is None:
+        color, light = march(scene, hull.posed, segment)
+    else:
+        rules = scene.rules
+        block = sampled(scene, segment, begin * 0.0 + 1.0, rules.second_block, rules.longest_m)
+        color, light = block.color, block.light
+    return Layer(
+        ray=ray,
+        canonical=canonical,
+        camera=camera,
+        color=color,
+        light=light,
+        enter=enter,
+        end=end,
+    )
+
+
 def _extent(
-    scene: Scene, hull: Hull, surfel: Value, direction: Vector, from_eye: Vector, along: Value
+    scene: Scene, surfel: Value, direction: Vector, beside: Vector, along: Value
 ) -> tuple[Value, Value, Value]:
-    """Where rays enter the hull's tangent plane, and from where to where they are followed."""
+    """Where rays enter the hull's tangent plane, and from where to where they are followed.
+
+    `beside` is where each ray comes closest to its surfel, seen from that in canonical space,
+    `along` how far that is along the ray.
+    """
     graph, rules = scene.graph, scene.rules
-    normal = taken(hull.normal, surfel)
+    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], surfel)
     thickness = scene.columns["thickness"].take(surfel)
     falling = dot(normal, direction)
     shallow = -0.5 * rules.steepest
-    hit = dot(normal, from_eye) / falling.minimum(shallow)
-    enter = graph.where(falling < shallow, hit, along)
-    enter = enter.minimum(along + rules.slack_m).maximum(along - rules.slack_m)
+    hit = -dot(normal, beside) / falling.minimum(shallow)
+    hit = graph.where(falling < shallow, hit, 0.0).clipped(-rules.slack_m, rules.slack_m)
+    enter = along + hit
     cosine = (-falling).maximum(rules.steepest)
     lead = (rules.lead_m / cosine).minimum(rules.most_lead_m)
-    sine = 1.0 - falling * falling / dot(direction, direction)
+    sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
     length = (thickness * (sine * rules.grazing + 1.0) / cosine + lead).minimum(rules.longest_m)
     begin = enter - lead
     return enter, begin, begin + length
 
 
 def _after(
-    scene: Scene, hull: Hull, surfel: Value, before: Before, pixel: Value, begin: Value, end: Value
+    scene: Scene, before: Layer, canonical: Vector, camera: Vector, begin: Value, end: Value
 ) -> Value:
     """Where rays begin that must not see a second time what they have passed already."""
-    first, rules = _surfel(before.key.take(pixel)), scene.rules
+    rules = scene.rules
 
-    def apart(vector: Vector) -> Value:
-        between = [v.take(surfel) - v.take(first) for v in vector]
+    def apart(here: Vector, first: Vector) -> Value:
+        between = [a - b for a, b in zip(here, first, strict=True)]
         return dot(between, between).sqrt()
 
-    one_sheet = apart(hull.canonical) < apart(hull.camera) * rules.same_share + rules.same_m
-    later = begin.maximum(before.end.take(pixel)).minimum(end)
+    one_sheet = (
+        apart(canonical, before.canonical)
+        < apart(camera, before.camera) * rules.same_share + rules.same_m
+    )
+    later = begin.maximum(before.end).minimum(end)
     return scene.graph.where(one_sheet, later, begin)

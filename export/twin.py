@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from export.rules import DrawingRules
 from export.skin import finer_nodes
 from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
-from export.twin_march import PosedNodes, Rays, carried, march
+from export.twin_march import PosedNodes, Rays, carried, carried_in_tetrahedra, march, sampled
 
 FAR = 2**31 - 1
 
@@ -37,9 +37,13 @@ class Shot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Posed:
-    """The skin in the camera's frame, and the hull with the inverse of its derivative there."""
+    """The skin in the camera's frame, and the hull with the inverse of its derivative there.
+
+    `splatted` is a coarser `camera`, linear in tetrahedra.
+    """
 
     nodes: PosedNodes
+    splatted: Float32[np.ndarray, "surfels 3"]
     camera: Float32[np.ndarray, "surfels 3"]
     inverse: Float32[np.ndarray, "surfels 3 3"]
     sound: Bool[np.ndarray, "surfels"]
@@ -66,26 +70,28 @@ def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray,
     """Premultiplied colour and alpha in [0, 1]."""
     width, height = shot.size_px
     posed = _pose(tables, rules, shot)
-    pixel, key, deep_enough = _footprints(tables, rules, shot, posed)
-    buffer = np.full(width * height, FAR, dtype=np.int64)
-    np.minimum.at(buffer, pixel, key)
-    filled = _without_holes(buffer.reshape(height, width), tables, rules).ravel()
+    cell, key, deep_enough = _footprints(tables, rules, shot, posed)
+    cells = (height + 2, width + 2)  # one pixel of the picture's surroundings
+    buffer = np.full(cells, FAR, dtype=np.int64)
+    np.minimum.at(buffer.reshape(-1), cell, key)
+    filled = _without_holes(buffer, tables, rules).ravel()
     picture = np.zeros((width * height, 4), dtype=np.float32)
     covered = np.flatnonzero(filled < FAR)
     first = _shade(tables, rules, shot, posed, covered, filled[covered], None)
     picture[covered] = first.colors
     if rules.layers == 2:
         passed = 1.0 - picture[:, 3]
-        limit = np.full(width * height, 1e6, dtype=np.float32)
-        limit[covered] = first.depth + np.float32(rules.gap_m)
-        limit[passed <= rules.transmitted] = 1e6
-        behind = deep_enough > limit[pixel]
-        buffer = np.full(width * height, FAR, dtype=np.int64)
-        np.minimum.at(buffer, pixel[behind], key[behind])
-        again = np.flatnonzero(buffer < FAR)
+        limit = np.full((height, width), 1e6, dtype=np.float32)
+        limit.reshape(-1)[covered] = first.depth + np.float32(rules.gap_m)
+        limit.reshape(-1)[passed <= rules.transmitted] = 1e6
+        behind = deep_enough > np.pad(limit, 1, constant_values=1e6).reshape(-1)[cell]
+        buffer = np.full(cells, FAR, dtype=np.int64)
+        np.minimum.at(buffer.reshape(-1), cell[behind], key[behind])
+        keys = buffer[1:-1, 1:-1].ravel()
+        again = np.flatnonzero(keys < FAR)
         place = np.searchsorted(covered, again)
         before = _Before(surfel=_surfel(filled[again]), end=first.end[place])
-        second = _shade(tables, rules, shot, posed, again, buffer[again], before)
+        second = _shade(tables, rules, shot, posed, again, keys[again], before)
         picture[again] += second.colors * passed[again, None]
     return picture.reshape(height, width, 4)
 
@@ -101,6 +107,7 @@ def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
     inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
     return _Posed(
         nodes=there,
+        splatted=carried_in_tetrahedra(there, tables.surfels.positions),
         camera=camera,
         inverse=inverse.astype(np.float32),
         sound=sound,
@@ -114,19 +121,23 @@ def _surfel(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
 def _footprints(
     tables: Tables, rules: DrawingRules, shot: Shot, posed: _Posed
 ) -> tuple[Int64[np.ndarray, "splats"], Int64[np.ndarray, "splats"], Float32[np.ndarray, "splats"]]:
-    """Each visible surfel's pixels with its key, and its depth if it may form the second layer."""
-    (width, height), depth = shot.size_px, posed.camera[:, 2]
+    """Each visible surfel's cells with its key, and its depth if it may form the second layer.
+
+    Cells count the pixels of a picture with one more pixel on each side.
+    """
+    (width, height), depth = shot.size_px, posed.splatted[:, 2]
     safe = np.maximum(depth, np.float32(rules.nearest_m))[:, None]
-    place = posed.camera[:, :2] / safe * shot.focal + shot.center
+    place = posed.splatted[:, :2] / safe * shot.focal + shot.center
     from_eye = np.einsum("nij,nj->ni", posed.inverse, posed.camera)
     facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
-    margin = rules.largest_footprint_px
-    seen = posed.sound & (depth > rules.nearest_m) & (facing < depth * rules.behind)
-    seen &= (place > -margin).all(axis=1) & (place < np.array(shot.size_px) + margin).all(axis=1)
+    reach = 0.5 * rules.largest_footprint_px
+    seen = depth > rules.nearest_m
+    seen &= (place > -reach).all(axis=1) & (place < np.array(shot.size_px) + reach).all(axis=1)
     surfel = np.flatnonzero(seen)
     if len(surfel) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
-    depth, place, facing = depth[surfel], place[surfel], facing[surfel]
+    faces = posed.sound & (facing < -posed.camera[:, 2] * rules.facing)
+    depth, place = depth[surfel], place[surfel]
 
     spacing_px = shot.focal.max() * tables.surfels.spacing_m / depth.min()
     side = int(np.floor(spacing_px * rules.footprint_spacings + 0.999))
@@ -134,27 +145,23 @@ def _footprints(
     near = shot.bones[0, 2, :3] @ tables.pelvis + shot.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_STEPS - 1)
     key = (np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64) << SURFEL_BITS) | surfel
-    deep_enough = np.where(facing < -depth * rules.facing, depth, np.float32(0.0))
+    deep_enough = np.where(faces[surfel], depth, np.float32(0.0))
 
     first = np.floor(place - np.float32((side - 1) / 2)).astype(np.int64)
     steps = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2)
     column, row = np.moveaxis(first + steps, -1, 0)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = (column >= -1) & (column <= width) & (row >= -1) & (row <= height)
     shape = inside.shape
-    pixel = (row * width + column)[inside]
-    return pixel, np.broadcast_to(key, shape)[inside], np.broadcast_to(deep_enough, shape)[inside]
+    cell = ((row + 1) * (width + 2) + column + 1)[inside]
+    return cell, np.broadcast_to(key, shape)[inside], np.broadcast_to(deep_enough, shape)[inside]
 
 
 def _without_holes(
-    keys: Int64[np.ndarray, "height width"], tables: Tables, rules: DrawingRules
+    keys: Int64[np.ndarray, "rows columns"], tables: Tables, rules: DrawingRules
 ) -> Int64[np.ndarray, "height width"]:
-    padded = np.pad(keys, 1, constant_values=0)
-    across = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
-    along = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
-    # a border of zeros would fill; outside of the picture nothing overtops
-    across[:, [0, -1]] = FAR
-    along[[0, -1]] = FAR
-    neighbours = np.minimum(across, along)
+    across = np.maximum(keys[1:-1, :-2], keys[1:-1, 2:])
+    along = np.maximum(keys[:-2, 1:-1], keys[2:, 1:-1])
+    neighbours, keys = np.minimum(across, along), keys[1:-1, 1:-1]
     steps = int(rules.hole_m / (2.0 * tables.reach_m) * DEPTH_STEPS)
     return np.where(keys - (steps << SURFEL_BITS) > neighbours, neighbours, keys)
 
@@ -175,17 +182,18 @@ def _shade(
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    inverse = posed.inverse[surfel]
+    inverse, sound = posed.inverse[surfel], posed.sound[surfel]
+    along = (posed.camera[surfel] * ray).sum(axis=1)
     direction = np.einsum("nij,nj->ni", inverse, ray)
-    from_eye = np.einsum("nij,nj->ni", inverse, posed.camera[surfel])
+    nearest = ray * along[:, None] - posed.camera[surfel]
+    beside = np.einsum("nij,nj->ni", inverse, nearest)  # of the surfel, where the ray is closest
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
 
     falling = (normal * direction).sum(axis=1)
-    along = (posed.camera[surfel] * ray).sum(axis=1)
     shallow = np.float32(-0.5 * rules.steepest)
-    hit = (normal * from_eye).sum(axis=1) / np.minimum(falling, shallow)
-    enter = np.where(falling < shallow, hit, along)
-    enter = np.clip(enter, along - rules.slack_m, along + rules.slack_m)
+    hit = -(normal * beside).sum(axis=1) / np.minimum(falling, shallow)
+    hit = np.where(falling < shallow, hit, 0.0)
+    enter = along + np.clip(hit, -rules.slack_m, rules.slack_m)
     cosine = np.maximum(-falling, rules.steepest)
     lead = np.minimum(rules.lead_m / cosine, rules.most_lead_m)
     begin = enter - lead
@@ -198,8 +206,11 @@ def _shade(
         one_sheet = apart < in_camera * rules.same_share + rules.same_m
         later = np.minimum(np.maximum(begin, before.end), end)
         begin = np.where(one_sheet, later, begin)
-    start = surfels.positions[surfel] - from_eye + begin[:, None] * direction
-    steady = rules.steady if before is None else 1
+    end = np.where(sound, end, begin)  # a folded skin shows nothing
+    start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = Rays(ray, begin, end, start, direction)
-    colors = march(tables.bricks, rules, posed.nodes, rays, shot.samples, steady)
-    return _Seen(colors=colors, depth=enter * ray[:, 2], end=end)
+    if before is None:
+        colors = march(tables.bricks, rules, posed.nodes, rays, shot.samples)
+    else:
+        colors = sampled(tables.bricks, rays, np.ones(len(ray)), rules.second_block, np.inf).colors
+    return _Seen(colors=colors, depth=np.where(sound, enter, along) * ray[:, 2], end=end)

@@ -87,3 +87,29 @@ def test_equal_constants_are_stored_once():
     x = graph.input("x", np.float32, [1])
     graph.output((x + 2.0) * 2.0 - 2.0, "out", [1])
     assert len(graph.model().graph.initializer) == 1
+
+
+def test_what_a_condition_chooses_is_what_numpy_chooses():
+    graph = Graph()
+    x = graph.input("x", np.float32, [40])
+    numbers = np.random.default_rng(1).normal(size=40).astype(np.float32)
+    result = run(graph, graph.range(graph.size(x).cast(np.int32)).compressed(x > 0.3), x=numbers)
+    assert result.dtype == np.int32
+    np.testing.assert_array_equal(result, np.flatnonzero(numbers > 0.3))
+
+
+def test_pieces_of_a_split_make_up_its_sum_again():
+    graph = Graph()
+    x = graph.input("x", np.float32, [3, 5])
+    a, b, c = graph.split(x, 3)
+    numbers = np.random.default_rng(2).normal(size=(3, 5)).astype(np.float32)
+    result = run(graph, a + b + c - x.summed(0), x=numbers)
+    np.testing.assert_allclose(result, np.zeros(5), atol=1e-6)
+
+
+def test_smallest_and_largest_are_scalars():
+    graph = Graph()
+    x = graph.input("x", np.float32, [4])
+    result = run(graph, x.largest() - x.smallest(), x=np.array([3, -2, 5, 1], dtype=np.float32))
+    assert result.shape == ()
+    assert result == 7.0

@@ -49,7 +49,7 @@ def test_the_manifest_says_what_the_package_is(exported):
     with zipfile.ZipFile(exported.path) as archive:
         content = json.loads(archive.read("manifest.json"))
         assert set(archive.namelist()) - {"manifest.json"} == set(content["sha256"])
-    assert content["format"] == 2
+    assert content["format"] == 3
     assert len(content["joints"]) == len(content["rest_joints"]) == 24
     assert "metres" in content["units"]
     assert content["metrics"] == {"psnr": 30.0}
@@ -269,7 +269,7 @@ def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
     exec(text.split("```python\n")[1].split("```")[0], room)
     manifest, bricks, weights, places = room["read"](exported.path)
     tables = read_package(exported.path).tables["hq"]
-    assert manifest["format"] == 2
+    assert manifest["format"] == 3
     np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
     np.testing.assert_allclose(weights, tables.skin.weights[1:], atol=1e-6)
     np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)

@@ -8,8 +8,9 @@ import pytest
 from avatar.metrics import psnr
 from capture.errors import BadInput
 from export.player import Likeness, Player, premultiplied, verify
+from export.skin import finer_nodes
 from export.twin import Shot, draw
-from export.twin_march import read
+from export.twin_march import PosedNodes, carried, carried_in_tetrahedra, read
 from preprocess.pose import BodyPose
 
 
@@ -119,6 +120,15 @@ def test_bricks_give_linear_ramps_back(tables):
     rgb, density = read(one, points)
     np.testing.assert_allclose(rgb[:, 0] * 255, points @ [3, 7, 11] + 5, rtol=1e-4)
     assert np.ptp(density) < 1e-3 * density.max()
+
+
+def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
+    nodes = finer_nodes(tables.skin)
+    matrix = np.array([[0.9, 0.2, 0.1], [-0.3, 1.1, 0.0], [0.2, 0.1, 0.8]], dtype=np.float32)
+    posed = PosedNodes(nodes, nodes.positions @ matrix.T)
+    points = tables.surfels.positions
+    np.testing.assert_allclose(carried_in_tetrahedra(posed, points), points @ matrix.T, atol=1e-5)
+    np.testing.assert_allclose(carried(posed, points)[0], points @ matrix.T, atol=1e-5)
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):

@@ -86,9 +86,9 @@ function tables(columns) {
     node_weights: weightsOf(columns.node_weights, nodes),
     node: texture("r32i", rowsFor(columns.node.length), columns.node, 1),
     brick_offset: texture("r32i", rowsFor(columns.brick_offset.length), columns.brick_offset, 1),
-    voxels: voxelsOf(columns.voxel_red_blue, columns.voxel_green_density),
+    voxels: voxelsOf(columns.voxel_color, columns.voxel_density),
     nodes: rowsFor(nodes),
-    surfels: columns.surfel.length,
+    surfels: columns.thickness.length,
   };
 }
 
@@ -109,10 +109,10 @@ function weightsOf(weights, nodes) {
 }
 
 /** Red, green, blue and log-density in four bytes. */
-function voxelsOf(redBlue, greenDensity) {
-  const bytes = new Uint8Array(4 * redBlue.length);
+function voxelsOf(color, density) {
+  const bytes = new Uint8Array(4 * color.length);
   const words = new Uint32Array(bytes.buffer);
-  for (let i = 0; i < words.length; i++) words[i] = (redBlue[i] & 0xff00ff) | ((greenDensity[i] & 0xff00ff) << 8);
+  for (let i = 0; i < words.length; i++) words[i] = color[i] | (density[i] << 24);
   return texture("rgba8ui", rowsFor(words.length), bytes, 4);
 }
 

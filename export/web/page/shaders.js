@@ -1,7 +1,7 @@
 // The player's drawing rules as shaders: what the ONNX graph does with the same tables.
 //
-// Its parts have the names of the graph's (export/posing.py, raster.py, shading.py, march.py and
-// lookup.py); the golden frames of every package hold both to the same pictures.
+// Its parts have the names of the graph's (export/posing.py, surfels.py, raster.py, shading.py,
+// march.py and lookup.py); the golden frames of every package hold both to the same pictures.
 
 export const WIDTH_BITS = 12; // tables lie in textures of 4096 columns
 
@@ -37,7 +37,7 @@ function constants({ rules, layout, constants: fixed }) {
     const int SURFEL_MASK = (1 << SURFEL_BITS) - 1;`;
 }
 
-const WHOLE = new Set(["layers", "block", "steady", "largest_footprint_px"]);
+const WHOLE = new Set(["layers", "block", "steady", "blocks", "second_block", "largest_footprint_px"]);
 
 const COMMON = `#version 300 es
 precision highp float;
@@ -59,12 +59,18 @@ uniform isampler2D node;
 
 vec3 node_at(int row) { return texelFetch(node_camera, at(row), 0).xyz; }
 
-/** Where a canonical point is in the camera's frame; derivative has a column for each axis. */
-vec3 carried(vec3 point, out mat3 derivative) {
+/** The cell of the skin that a canonical point lies in, and how far from its lowest corner. */
+ivec3 cell_of(vec3 point, out vec3 fraction) {
   vec3 place = clamp((point - node_low) * nodes_per_m, vec3(0.0), vec3(node_counts - 1) - 1e-3);
   vec3 below = floor(place);
-  vec3 f = place - below;
-  ivec3 b = ivec3(below);
+  fraction = place - below;
+  return ivec3(below);
+}
+
+/** Where a canonical point is in the camera's frame; derivative has a column for each axis. */
+vec3 carried(vec3 point, out mat3 derivative) {
+  vec3 f;
+  ivec3 b = cell_of(point, f);
   int number = (b.x * node_counts.y + b.y) * node_counts.z + b.z;
   int across = node_counts.z, far_across = node_counts.y * node_counts.z;
   int r00 = texelFetch(node, at(number), 0).x, r01 = texelFetch(node, at(number + across), 0).x;
@@ -81,6 +87,24 @@ vec3 carried(vec3 point, out mat3 derivative) {
   derivative[1] = mix(y0, y1, f.x) * nodes_per_m.y;
   derivative[2] = mix(mix(z00, z01, f.y), mix(z10, z11, f.y), f.x) * nodes_per_m.z;
   return on0 + f.x * (on1 - on0);
+}
+
+vec3 corner_at(ivec3 b, ivec3 step) {
+  int number = ((b.x + step.x) * node_counts.y + b.y + step.y) * node_counts.z + b.z;
+  return node_at(texelFetch(node, at(number), 0).x + step.z); // along z rows follow each other
+}
+
+/** The same, linear in tetrahedra: from the lowest corner along the axis of the largest fraction. */
+vec3 carried_in_tetrahedra(vec3 point) {
+  vec3 f;
+  ivec3 b = cell_of(point, f);
+  bool xy = f.x > f.y, xz = f.x > f.z, yz = f.y > f.z;
+  ivec3 first = xy ? (xz ? ivec3(1, 0, 0) : ivec3(0, 0, 1)) : (yz ? ivec3(0, 1, 0) : ivec3(0, 0, 1));
+  ivec3 two = xy ? (yz ? ivec3(1, 1, 0) : ivec3(1, 0, 1)) : (xz ? ivec3(1, 1, 0) : ivec3(0, 1, 1));
+  float largest = max(f.x, max(f.y, f.z)), smallest = min(f.x, min(f.y, f.z));
+  float middle = (f.x + f.y + f.z) - largest - smallest;
+  return corner_at(b, ivec3(0)) * (1.0 - largest) + corner_at(b, first) * (largest - middle)
+    + corner_at(b, two) * (middle - smallest) + corner_at(b, ivec3(1)) * smallest;
 }
 
 bool sound(float volume) { return volume > 1.0 / stretch && volume < stretch; }
@@ -111,20 +135,24 @@ uniform sampler2D surfel_place; // and thickness
 uniform sampler2D surfel_normal;
 uniform float near; // where the depth window begins
 
-struct Seen { vec3 camera; vec2 uv; float facing; bool seen; };
+struct Seen { vec3 camera; vec2 uv; bool seen; };
 
 Seen project(int surfel) {
-  mat3 derivative;
   Seen s;
-  s.camera = carried(texelFetch(surfel_place, at(surfel), 0).xyz, derivative);
+  s.camera = carried_in_tetrahedra(texelFetch(surfel_place, at(surfel), 0).xyz);
   float depth = s.camera.z;
   s.uv = lens.xy * s.camera.xy / max(depth, nearest_m) + lens.zw;
-  vec3 from_eye = inverse(derivative) * s.camera;
-  s.facing = dot(texelFetch(surfel_normal, at(surfel), 0).xyz, from_eye);
-  float margin = float(largest_footprint_px);
-  s.seen = sound(determinant(derivative)) && depth > nearest_m && s.facing < depth * behind
-    && all(greaterThan(s.uv, vec2(-margin))) && all(lessThan(s.uv, vec2(size) + margin));
+  float reach = 0.5 * float(largest_footprint_px);
+  s.seen = depth > nearest_m && all(greaterThan(s.uv, vec2(-reach))) && all(lessThan(s.uv, vec2(size) + reach));
   return s;
+}
+
+bool faces(int surfel) {
+  mat3 derivative;
+  vec3 camera = carried(texelFetch(surfel_place, at(surfel), 0).xyz, derivative);
+  vec3 from_eye = inverse(derivative) * camera;
+  return sound(determinant(derivative))
+    && dot(texelFetch(surfel_normal, at(surfel), 0).xyz, from_eye) < camera.z * -facing;
 }
 `;
 
@@ -150,7 +178,11 @@ void main() {
   float side = clamp(floor(spacing_px * footprint_spacings + 0.999), 2.0, float(largest_footprint_px));
   float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
   key = (int(code) << SURFEL_BITS) | gl_VertexID;
-  deep_enough = s.facing < depth * -facing ? depth : 0.0;
+#ifdef BEHIND
+  deep_enough = faces(gl_VertexID) ? depth : 0.0;
+#else
+  deep_enough = 0.0;
+#endif
   // in the middle of the pixels that are meant, for GPUs round the places of points; and in a
   // picture with a border, so that points beyond its edge are not cut off with their footprints
   vec2 middle = floor(s.uv - 0.5 * (side - 1.0)) + 0.5 * side;
@@ -182,7 +214,7 @@ uniform isampler2D brick_offset;
 
 ivec4 voxel_at(int place) { return ivec4(texelFetch(voxels, at(place), 0)); }
 
-/** Colour × 255 × 256 and density in 1/m: tetrahedral interpolation with whole weights. */
+/** Colour in [0, 1] and density in 1/m: tetrahedral interpolation, of colours with whole weights. */
 vec4 read_bricks(vec3 lattice) {
   vec3 inside = clamp(lattice, vec3(0.0), vec3(brick_counts * BRICK) - 1e-3);
   ivec3 voxel = ivec3(floor(inside));
@@ -198,57 +230,68 @@ vec4 read_bricks(vec3 lattice) {
   float largest = max(f.x, max(f.y, f.z)), smallest = min(f.x, min(f.y, f.z));
   float middle = (f.x + f.y + f.z) - largest - smallest;
   int a = int(largest * float(FULL) + 0.5), b = int(middle * float(FULL) + 0.5), c = int(smallest * float(FULL) + 0.5);
-  ivec4 sum = voxel_at(base) * (FULL - a) + voxel_at(base + first) * (a - b)
-    + voxel_at(base + two) * (b - c) + voxel_at(base + sx + sy + sz) * c;
-  float code = float(sum.a);
-  float density = exp(code * ((LOG_DENSITY.y - LOG_DENSITY.x) / (255.0 * float(FULL))) + LOG_DENSITY.x);
-  return vec4(vec3(sum.rgb), code > float(FULL) / 2.0 ? density : 0.0);
+  ivec4 v0 = voxel_at(base), v1 = voxel_at(base + first), v2 = voxel_at(base + two), v3 = voxel_at(base + sx + sy + sz);
+  ivec3 color = v0.rgb * (FULL - a) + v1.rgb * (a - b) + v2.rgb * (b - c) + v3.rgb * c;
+  vec4 codes = vec4(v0.a, v1.a, v2.a, v3.a);
+  float code = codes.x + largest * (codes.y - codes.x) + middle * (codes.z - codes.y) + smallest * (codes.w - codes.z);
+  float density = exp(code * ((LOG_DENSITY.y - LOG_DENSITY.x) / 255.0) + LOG_DENSITY.x);
+  return vec4(vec3(color) / (255.0 * float(FULL)), code > 0.5 ? density : 0.0);
 }
 `;
 
 const MARCH = `
+/** Premultiplied colour and the light that is left of it after a block of samples. */
+vec4 sampled(vec3 point, vec3 direction, float stride, float light, int count) {
+  vec3 start = (point - brick_low) / voxel_m, slope = direction * (stride / voxel_m);
+  float weight = 0.0, mean = 0.0;
+  for (int k = 0; k < count; k++) {
+    float along = float(k) + 0.5;
+    float left = light * exp(-read_bricks(start + along * slope).a * stride);
+    weight += light - left;
+    mean += (light - left) * along;
+    light = left;
+  }
+  return vec4(read_bricks(start + mean / max(weight, 1e-9) * slope).rgb * weight, light);
+}
+
 /** Premultiplied colour and alpha along a piece of a ray. */
-vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction, int steady_blocks) {
+vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction) {
   float place = begin, light = 1.0;
   vec3 color = vec3(0.0);
-  for (int turn = 0; turn < 64; turn++) {
-    float longest = span_m / samples * exp2(max(float(turn - (steady_blocks - 1)), 0.0));
-    float stride = min((end - place) / float(block), longest);
-    vec3 start = (point - brick_low) / voxel_m, slope = direction * (stride / voxel_m);
-    for (int k = 0; k < block; k++) {
-      vec4 found = read_bricks(start + (float(k) + 0.5) * slope);
-      float passed = exp(-found.a * stride);
-      color += found.rgb * (light * (1.0 - passed));
-      light *= passed;
+  for (int turn = 0; turn < blocks; turn++) {
+    if (turn > 0) {
+      mat3 derivative;
+      vec3 off = place * ray - carried(point, derivative);
+      if (sound(determinant(derivative))) {
+        mat3 back = inverse(derivative);
+        vec3 shift = back * off;
+        point += shift * min(longest_correction_m / sqrt(dot(shift, shift) + 1e-20), 1.0);
+        direction = back * ray;
+      }
     }
+    float longest = span_m / samples * exp2(max(float(turn + 1 - steady), 0.0));
+    if (turn > 0 && turn == blocks - 1) longest = longest_m;
+    float stride = min((end - place) / float(block), longest);
+    vec4 found = sampled(point, direction, stride, light, block);
+    color += found.rgb;
+    light = found.a;
     float way = stride * float(block);
     place += way;
     point += direction * way;
     if (!(light > ended && place < end - 1e-5)) break;
-    mat3 derivative;
-    vec3 off = place * ray - carried(point, derivative);
-    if (sound(determinant(derivative))) {
-      mat3 back = inverse(derivative);
-      vec3 shift = back * off;
-      point += shift * min(longest_correction_m / sqrt(dot(shift, shift) + 1e-20), 1.0);
-      direction = back * ray;
-    }
   }
-  return vec4(color / (255.0 * float(FULL)), 1.0 - light);
+  return vec4(color, 1.0 - light);
 }
 `;
 
 const SHADE = `
 uniform isampler2D keys;
 
-int key_at(ivec2 pixel) {
-  bool outside = any(lessThan(pixel, ivec2(0))) || any(greaterThanEqual(pixel, size));
-  return outside ? FAR : texelFetch(keys, pixel + largest_footprint_px, 0).x;
-}
+int key_at(ivec2 pixel) { return texelFetch(keys, pixel + largest_footprint_px, 0).x; }
 
 vec3 ray_of(ivec2 pixel) { return normalize(vec3((vec2(pixel) + 0.5 - lens.zw) / lens.xy, 1.0)); }
 
-struct Entry { vec3 canonical, camera, from_eye, direction; float enter, begin, end; };
+struct Entry { vec3 canonical, camera, beside, direction; float along, enter, begin, end; bool there; };
 
 /** Where a pixel's ray enters the hull, and from where to where it is followed. */
 Entry entry_of(int surfel, vec3 ray) {
@@ -257,23 +300,24 @@ Entry entry_of(int surfel, vec3 ray) {
   vec4 table = texelFetch(surfel_place, at(surfel), 0);
   e.canonical = table.xyz;
   e.camera = carried(e.canonical, derivative);
-  mat3 back = inverse(derivative);
-  e.from_eye = back * e.camera;
+  e.there = sound(determinant(derivative));
+  mat3 back = e.there ? inverse(derivative) : mat3(0.0);
+  e.along = dot(e.camera, ray);
+  e.beside = back * (e.along * ray - e.camera);
   e.direction = back * ray;
   vec3 normal = texelFetch(surfel_normal, at(surfel), 0).xyz;
-  float along = dot(e.camera, ray);
   float falling = dot(normal, e.direction), shallow = -0.5 * steepest;
-  float hit = dot(normal, e.from_eye) / min(falling, shallow);
-  e.enter = clamp(falling < shallow ? hit : along, along - slack_m, along + slack_m);
+  float hit = -dot(normal, e.beside) / min(falling, shallow);
+  e.enter = e.along + clamp(falling < shallow ? hit : 0.0, -slack_m, slack_m);
   float cosine = max(-falling, steepest);
   float lead = min(lead_m / cosine, most_lead_m);
-  float sine = 1.0 - falling * falling / dot(e.direction, e.direction);
+  float sine = 1.0 - falling * falling / max(dot(e.direction, e.direction), 1e-12);
   e.begin = e.enter - lead;
   e.end = e.begin + min(table.w * (sine * grazing + 1.0) / cosine + lead, longest_m);
   return e;
 }
 
-vec3 start_of(Entry e) { return e.canonical - e.from_eye + e.begin * e.direction; }
+vec3 start_of(Entry e) { return e.canonical + e.beside + (e.begin - e.along) * e.direction; }
 `;
 
 const FIRST = `
@@ -293,7 +337,7 @@ void main() {
   int surfel = key & SURFEL_MASK;
   vec3 ray = ray_of(pixel);
   Entry e = entry_of(surfel, ray);
-  color = march(ray, e.begin, e.end, start_of(e), e.direction, steady);
+  if (e.there) color = march(ray, e.begin, e.end, start_of(e), e.direction); // else a folded skin
   bool wanted = layers > 1 && 1.0 - color.a > transmitted;
   extent = vec4(wanted ? e.enter * ray.z + gap_m : 1e6, e.end, float(surfel), 1.0);
 }`;
@@ -314,7 +358,9 @@ void main() {
     vec3 first = texelFetch(surfel_place, at(int(before.z)), 0).xyz;
     bool one_sheet = distance(e.canonical, first) < distance(e.camera, carried(first, unused)) * same_share + same_m;
     if (one_sheet) e.begin = min(max(e.begin, before.y), e.end);
-    color += (1.0 - color.a) * march(ray, e.begin, e.end, start_of(e), e.direction, 1);
+    float stride = (e.end - e.begin) / float(second_block);
+    vec4 found = sampled(start_of(e), e.direction, stride, 1.0, second_block);
+    if (e.there) color += (1.0 - color.a) * vec4(found.rgb, 1.0 - found.a);
   }
   rgba = clamp(vec4(color.rgb / max(color.a, 1e-6), color.a), 0.0, 1.0);
 }`;
@@ -328,7 +374,9 @@ void main() {
 const NOTHING = `layout(location = 0) out vec4 nothing;
 void main() { nothing = vec4(0.0); }`;
 
-/** Sources of the five passes, [vertex, fragment] each. */
+const behind = (source) => source.replace("es\n", "es\n#define BEHIND\n");
+
+/** Sources of the six passes, [vertex, fragment] each. */
 export function sources(note) {
   const head = COMMON + constants(note);
   const surfels = head + POSING + SURFEL;
@@ -338,7 +386,7 @@ export function sources(note) {
     nearest: [surfels + NEAREST, head + NOTHING],
     splat: [surfels + SPLAT, head + SPLATTED],
     first: [head + WHOLE_SCREEN, shading + FIRST],
-    behind: [surfels + SPLAT, head.replace("es\n", "es\n#define BEHIND\n") + SPLATTED],
+    behind: [behind(surfels + SPLAT), behind(head + SPLATTED)],
     second: [head + WHOLE_SCREEN, shading + SECOND],
   };
 }
