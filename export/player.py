@@ -124,8 +124,16 @@ class Player:
             "width": np.array(width, dtype=np.int64),
             "samples": np.array(samples, dtype=np.int64),
         }
-        packed = np.asarray(self._session.run(["rgba"], inputs)[0]).astype("<i4", copy=False)
-        return packed.view(np.uint8).reshape(height, width, 4)
+        try:
+            packed = np.asarray(self._session.run(["rgba"], inputs)[0])
+        except Exception as error:  # onnxruntime has no common class for what a graph can do
+            raise BadInput(f"The package's graph cannot draw this picture: {error}") from error
+        if packed.size != height * width or packed.dtype != np.int32:
+            raise BadInput(
+                f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
+                f"number for each of {width}x{height} px. It is damaged, or none of ours."
+            )
+        return packed.astype("<i4", copy=False).view(np.uint8).reshape(height, width, 4)
 
     def render_all(
         self,

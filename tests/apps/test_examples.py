@@ -46,3 +46,22 @@ def test_a_package_is_played_in_a_pose_of_our_own(run, tmp_path, capsys):
     # the person's left arm is up, so the right half of the picture has its highest pixel
     columns = np.flatnonzero(rgba[np.flatnonzero(rgba[..., 3].max(axis=1) > 127)[0], :, 3] > 127)
     assert columns.mean() > 270
+
+
+def test_an_avatar_is_drawn_from_all_sides(run, tmp_path, capsys):
+    example = load("3_turntable_with_workers.py")
+    example.main(run / "avatar.iavatar", tmp_path / "turn.webp")
+    assert "540x540 px" in capsys.readouterr().out
+    with Image.open(tmp_path / "turn.webp") as clip:
+        assert clip.n_frames == example.PICTURES
+        widths = []
+        for number in range(clip.n_frames):
+            clip.seek(number)
+            alpha = np.asarray(clip.convert("RGBA"))[..., 3] > 127
+            rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
+            assert rows[0] > 0
+            assert rows[-1] < example.SIZE - 1
+            widths.append(columns[-1] - columns[0])
+    # arms are away from the body: from the side the person is much narrower than from the front
+    assert widths[6] < 0.6 * widths[0]
+    assert abs(widths[12] - widths[0]) < 8

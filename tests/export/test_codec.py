@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from capture.errors import BadInput
 from export.bake_skin import weight_codes
-from export.codec import Layout, decode, encode
+from export.codec import Layout, cube_sums, decode, encode
 from export.tables import FULL_WEIGHT, LOG_DENSITY, Bricks, Skin, Surfels, Tables, density_codes
 
 
@@ -108,3 +108,13 @@ def test_density_codes_are_logarithmic_and_zero_is_empty():
     restored = np.exp(density_codes(density) / 255.0 * (high - low) + low)
     np.testing.assert_allclose(restored, density, rtol=0.5 * (high - low) / 255 * 1.02)
     assert density_codes(np.array([0.0, 0.4, 1e9])).tolist() == [0, 0, 255]
+
+
+def test_sums_of_cubes_are_cumulative_sums_along_three_axes(rng):
+    codes = rng.integers(0, 256, (4, 5, 8, 8, 8), dtype=np.uint8)
+    expected = codes
+    for axis in (-3, -2, -1):
+        expected = np.cumsum(expected, axis=axis, dtype=np.uint8)
+    np.testing.assert_array_equal(cube_sums(codes), expected)
+    full = np.full((1, 8, 8, 8), 255, dtype=np.uint8)
+    np.testing.assert_array_equal(cube_sums(full)[0, 7, 7, 7], np.uint8(255 * 512 % 256))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from onnx import TensorProto, helper, numpy_helper
 
 from avatar.config import TrainConfig
 from avatar.trainer import Trainer
@@ -273,3 +274,81 @@ def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
     np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
     np.testing.assert_allclose(weights, tables.skin.weights[1:], atol=1e-6)
     np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)
+
+
+def with_flag(path, name, offset, value):
+    """Writes two bytes of an entry's line in the zip's list of entries."""
+    content = bytearray(path.read_bytes())
+    place = content.rfind(name.encode()) - 46
+    assert content[place : place + 4] == b"PK\1\2"
+    content[place + offset : place + offset + 2] = value.to_bytes(2, "little")
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 1), (10, zipfile.ZIP_LZMA), (10, 99)])
+def test_encrypted_and_strangely_compressed_entries_are_refused(exported, tmp_path, offset, value):
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(exported.path.read_bytes())
+    with_flag(path, "preview.png", offset, value)
+    with pytest.raises(BadInput, match="encrypted or compressed in a way"):
+        read_package(path)
+
+
+def test_a_list_of_a_million_entries_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    line = b"PK\1\2" + bytes(24) + (1).to_bytes(2, "little") + bytes(16) + b"a"
+    directory = line * (1 << 20)
+    end = b"PK\5\6" + bytes(4) + b"\xff\xff" * 2 + len(directory).to_bytes(4, "little") + bytes(6)
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(directory + end)
+    built = []
+    monkeypatch.setattr(zipfile, "ZipInfo", lambda *a: built.append(a))
+    with pytest.raises(BadInput, match="longer than any package's"):
+        read_package(path)
+    assert not built
+
+
+def test_a_file_that_is_far_too_large_is_not_opened_as_a_zip(tmp_path):
+    path = tmp_path / "x.iavatar"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # a hole: it takes no room
+    with pytest.raises(BadInput, match="no package has"):
+        read_package(path)
+
+
+def graph_of(nodes, tensors=()):
+    output = helper.make_tensor_value_info("rgba", TensorProto.INT32, None)
+    kinds = {"bones": (1, [24, 12]), "camera": (1, [4])}
+    kinds |= dict.fromkeys(("height", "width", "samples"), (7, []))
+    inputs = [helper.make_tensor_value_info(n, kind, shape) for n, (kind, shape) in kinds.items()]
+    graph = helper.make_graph(nodes, "g", inputs, [output], tensors)
+    imports = [helper.make_opsetid("", 18)]
+    return helper.make_model(graph, opset_imports=imports, ir_version=9).SerializeToString()
+
+
+def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
+    exported, views, tmp_path, monkeypatch
+):
+    (tmp_path / "secret").write_bytes(bytes(range(16)))
+    monkeypatch.chdir(tmp_path)
+    for place in ("secret", f"../{tmp_path.name}/secret", str(tmp_path / "secret")):
+        stolen = TensorProto(name="stolen", data_type=TensorProto.INT32, dims=[4])
+        stolen.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", place), ("offset", "0"), ("length", "16")):
+            stolen.external_data.add(key=key, value=value)
+        graph = graph_of([helper.make_node("Identity", ["stolen"], ["rgba"])], [stolen])
+        with pytest.raises(BadInput, match="does not run"):
+            Player(replace(read_package(exported.path), graphs={"hq": graph}))
+
+
+def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, views):
+    size = numpy_helper.from_array(np.array([1 << 20, 1 << 20, 4]), "size")
+    endless = helper.make_node(
+        "ConstantOfShape", ["size"], ["rgba"], value=helper.make_tensor("v", 6, [1], [7])
+    )
+    one = numpy_helper.from_array(np.zeros(1, dtype=np.int32), "one")
+    small = helper.make_node("Identity", ["one"], ["rgba"])
+    for graph, message in ((graph_of([endless], [size]), "cannot draw"),
+                           (graph_of([small], [one]), "instead of one 32-bit number")):  # fmt: skip
+        player = Player(replace(read_package(exported.path), graphs={"hq": graph}))
+        with pytest.raises(BadInput, match=message):
+            player.render(*views["bent"])

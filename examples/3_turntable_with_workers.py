@@ -1,0 +1,62 @@
+"""Draws an avatar from all sides with the Player alone, several pictures at a time.
+
+    python examples/3_turntable_with_workers.py AVATAR [PICTURE]
+
+numpy, onnxruntime and Pillow are all it needs; torch is not imported. `ia-play AVATAR --turntable`
+does the same from the command line.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from capture.camera import Camera
+from export.player import Player
+from preprocess.pose import BodyPose
+
+PICTURES, SIZE, DISTANCE_M = 24, 270, 5.0
+
+
+def camera_at(angle: float, looked_at: np.ndarray) -> Camera:
+    """A camera that stands so far round the person and looks at a point (OpenCV axes)."""
+    forward = -np.array([np.sin(angle), 0.0, np.cos(angle)])
+    down = np.array([0.0, -1.0, 0.0])
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = np.stack([np.cross(down, forward), down, forward])
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ looked_at
+    camera_from_world[2, 3] += DISTANCE_M
+    return Camera(
+        focal_px=(2.0 * SIZE, 2.0 * SIZE),
+        center_px=(SIZE / 2, SIZE / 2),
+        size_px=(SIZE, SIZE),
+        camera_from_world=camera_from_world,
+    )
+
+
+def main(package: Path, moving: Path) -> None:
+    player = Player.load(package, tier="lite")  # "hq" is finer
+    standing = BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.zeros(3),
+        joint_rotations=player.manifest.canonical_rotations,
+    )
+    middle = player.manifest.rest_joints[0] - [0.0, 0.1, 0.0]
+    angles = np.linspace(0.0, 2.0 * np.pi, PICTURES, endpoint=False)
+    shots = [(standing, camera_at(float(angle), middle)) for angle in angles]
+
+    began = time.perf_counter()
+    pictures = list(player.render_all(shots, workers=2))  # in order, whoever draws them
+    seconds = time.perf_counter() - began
+    print(f"{len(pictures)} pictures of {SIZE} px, {len(pictures) / seconds:.0f} a second")
+
+    close = player.render(standing, shots[0][1], size=2 * SIZE, samples=16)  # one, larger and finer
+    print(f"and one of {close.shape[1]}x{close.shape[0]} px")
+    first, *others = [Image.fromarray(rgba) for rgba in pictures]  # straight alpha
+    first.save(moving, save_all=True, append_images=others, duration=80, loop=0)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "turntable.webp"))
