@@ -49,6 +49,10 @@ class TrainConfig:
     """Of the opacity in cells that should be empty; 0 turns the term off."""
     empty_points: int = 256
     """Points at which that opacity is measured in each step."""
+    variation_weight: float = 0.025
+    """Of the total variation of opacity; 0 turns the term off."""
+    variation_pairs: int = 128
+    """Pairs of points at which that variation is measured in each step."""
     occupancy_every: int = 16
     """Steps between updates of the occupancy."""
     refine_poses: bool = True
@@ -100,12 +104,13 @@ class TrainConfig:
             footprint_m: What one pixel covers on the body, metres.
             frames: How many frames there are, if that is known. Few of them, seen in poses that
                 are a little off, do not determine the finest detail: what they leave open would
-                be noise.
+                be noise, in which no pose can be refined. So detail is coarser, and surfaces are
+                asked to be smoother.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
-        if frames is not None:
-            footprint_m *= max(1.0, ENOUGH_FRAMES / max(frames, 1)) ** 0.5
+        too_few = 1.0 if frames is None else max(1.0, ENOUGH_FRAMES / max(frames, 1))
+        footprint_m *= too_few**0.5
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         wanted = 4.0 * 2.0 / finest_m**2
@@ -115,6 +120,7 @@ class TrainConfig:
             step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,
+            variation_weight=cls.variation_weight * too_few,
             seed=seed,
             hold_every=hold_every,
         )

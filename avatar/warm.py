@@ -28,7 +28,7 @@ def warm_up(trainer: Trainer) -> float:
     """
     began = time.perf_counter()
     rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
-    config = dataclasses.replace(trainer.config, rays=64, empty_points=16)
+    config = dataclasses.replace(trainer.config, rays=64, empty_points=16, variation_pairs=8)
     stand_in = Trainer(rig, config, device)
     camera = _camera_before(rig)
     stand_in.add(_frame(rig, camera))

@@ -41,6 +41,7 @@ LOSSES = [
     Variant(name="w/o alpha loss", changes={**GIVEN, "alpha_weight": 0.0}),
     Variant(name="w/o hard surface", changes={**GIVEN, "hard_weight": 0.0}),
     Variant(name="w/o occupancy-based regulariser", changes={**GIVEN, "empty_weight": 0.0}),
+    Variant(name="w/o total variation", changes={**GIVEN, "variation_weight": 0.0}),
     Variant(name="global sparsity instead", changes={**GIVEN, "empty_term": "global"}),
 ]
 CELLS = [

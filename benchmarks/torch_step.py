@@ -10,7 +10,7 @@ from avatar.kernels import reference
 from avatar.kernels.backend import Samples
 from avatar.levels import HashLevels
 from avatar.replay import Batch
-from avatar.step import EMPTY_STEP_M
+from avatar.step import OPACITY_M
 
 
 class TorchField:
@@ -29,7 +29,7 @@ class TorchField:
 def opacity_of(raw: Float32[Tensor, "points 4"]) -> Tensor:
     """Mean opacity of one centimetre at points that should be empty."""
     density = torch.exp(raw[:, 3].clamp(max=reference.MAX_LOG_DENSITY))
-    return (1.0 - torch.exp(-density * EMPTY_STEP_M)).mean()
+    return (1.0 - torch.exp(-density * OPACITY_M)).mean()
 
 
 def torch_step(

@@ -59,3 +59,12 @@ def test_what_contradicts_itself_is_refused_with_advice(choices, advice):
 )
 def test_what_goes_together_is_taken(choices):
     assert vars(TrainConfig(**choices)).items() >= choices.items()
+
+
+def test_the_fewer_the_frames_the_smoother_surfaces_are_asked_to_be():
+    weights = [
+        TrainConfig.within(60.0, footprint_m=0.004, frames=frames).variation_weight
+        for frames in (None, 120, 24, 12, 6)
+    ]
+    usual = TrainConfig().variation_weight
+    assert weights == pytest.approx([usual, usual, usual, 2.0 * usual, 4.0 * usual])

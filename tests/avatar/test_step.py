@@ -18,7 +18,8 @@ from avatar.trainer import Trainer
 
 CONFIG = TrainConfig(
     rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
-    empty_weight=0.3, hard_weight=0.1, most_samples=256,
+    empty_weight=0.3, hard_weight=0.1, variation_weight=0.2, variation_pairs=16,
+    most_samples=256,
 )  # fmt: skip
 
 
@@ -32,10 +33,10 @@ def trainer(rig, clip):
     return trainer
 
 
-def mean_loss(trainer, parameters, samples, empty, batch, background):
+def mean_loss(trainer, parameters, samples, empty, pairs, batch, background):
     """The whole loss of a step, differentiable, in whatever precision the parameters have."""
     table, first, first_bias, second, second_bias = parameters
-    points = torch.cat([samples.points, empty]).to(table.dtype)
+    points = torch.cat([samples.points, empty, pairs]).to(table.dtype)
     features = reference.encode(points, table, trainer.avatar.field.levels)
     hidden = torch.relu(features @ first + first_bias)
     raw = hidden @ second + second_bias
@@ -46,8 +47,12 @@ def mean_loss(trainer, parameters, samples, empty, batch, background):
         CONFIG.alpha_weight, CONFIG.hard_weight,
     ).mean()  # fmt: skip
     density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
-    emptiness = 1.0 - torch.exp(-density * step_module.EMPTY_STEP_M)
-    return loss + CONFIG.empty_weight * emptiness.mean()
+    opacity = 1.0 - torch.exp(-density * step_module.OPACITY_M)
+    loss = loss + CONFIG.empty_weight * opacity[: len(empty)].mean()
+    if len(pairs) == 0:
+        return loss
+    one, other = opacity[len(empty) :].chunk(2)
+    return loss + CONFIG.variation_weight * (one - other).abs().mean()
 
 
 def one_step(trainer, backend):
@@ -65,9 +70,13 @@ def one_step(trainer, backend):
     how = Marching(CONFIG.step_m, CONFIG.grace_m, CONFIG.most_samples)
     samples = backend.march(batch.rays, trainer.replay.cells, occupancy.grid, how)
     empty = occupancy.empty_points(CONFIG.empty_points, generator)
+    drawn = CONFIG.variation_pairs if len(samples.points) else 0
+    chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
+    apart = step_module.APART_M * torch.randn(drawn, 3, generator=generator)
+    pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
-    return grads, (samples, empty, batch, background)
+    return grads, (samples, empty, pairs, batch, background)
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
@@ -101,12 +110,13 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but that of emptiness."""
     trainer.avatar.occupancy.grid.occupied.zero_()
-    (_, first, *_), (samples, empty, batch, background) = one_step(trainer, NumbaBackend())
+    (_, first, *_), (samples, empty, pairs, batch, background) = one_step(trainer, NumbaBackend())
     assert isinstance(samples, Samples)
     assert len(samples.points) == 0
     assert torch.isfinite(first).all()
     assert len(batch.target) == CONFIG.rays == len(background)
     assert len(empty) == CONFIG.empty_points
+    assert len(pairs) == 0
 
 
 def test_the_learning_rate_falls_from_one_to_a_twentieth():
