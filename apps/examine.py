@@ -7,9 +7,9 @@ import numpy as np
 from apps.recording import Recording, RecordingPaths
 from capture.errors import BadInput
 from preprocess.doctor.claim import Claim
+from preprocess.doctor.cure import shifted
 from preprocess.doctor.diagnosis import GOOD, USABLE, Diagnosis, diagnose, mean
 from preprocess.doctor.evidence import FRAMES, Evidence, gather
-from preprocess.doctor.mistakes import shifted
 from preprocess.doctor.soundness import unsound
 from preprocess.observe import check_cameras, check_masks
 from preprocess.silhouette import SkinPoints

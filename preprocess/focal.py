@@ -7,9 +7,9 @@ from capture.source import Source
 from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
+from preprocess.doctor.cure import refocused
 from preprocess.doctor.diagnosis import FITTED_CHANGE, FITTED_GAIN, fit_factor, mean
 from preprocess.doctor.evidence import gather
-from preprocess.doctor.mistakes import refocused
 from preprocess.masks import Masks
 from preprocess.observe import check_masks
 from preprocess.pose import Motion

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from preprocess.doctor.claim import Claim
+from preprocess.doctor.cure import CAUSES, Cure, refocused, rescaled, shifted
 from preprocess.doctor.evidence import Evidence
-from preprocess.doctor.mistakes import CAUSES, Cure, cures, refocused, rescaled, shifted
+from preprocess.doctor.mistakes import cures
 from preprocess.doctor.view import standing
 
 GOOD, USABLE = 0.7, 0.5

@@ -8,8 +8,8 @@ from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from preprocess.doctor.claim import Claim
+from preprocess.doctor.cure import Cure
 from preprocess.doctor.evidence import Evidence
-from preprocess.doctor.mistakes import Cure
 from preprocess.silhouette import agreement, silhouette
 
 FRAMES = 6
