@@ -53,6 +53,7 @@ def report_page(
             _tiles(report),
             _section("How it learnt", _curve(report)),
             _section("What the camera has seen", _coverage(report, body_map)),
+            _section("Where the camera was", _cameras(report)),
             _section("Frames it was never trained on", _pairs(pairs)),
             _section("Poses that the video does not show", _novel(novel)),
             _section("Worth knowing", _warnings(report, warnings)),
@@ -112,6 +113,27 @@ def _curve(report: Report) -> str:
         '<i style="background:var(--whole)"></i>whole picture'
         f'<i style="background:var(--masked)"></i>inside the mask. {told}</p></div>'
     )
+
+
+def _cameras(report: Report) -> str:
+    """A sentence, if cameras were to be solved."""
+    found = report.cameras
+    if found is None:
+        return ""
+    told = {
+        "still": "The camera stood still; there was nothing to solve.",
+        "stopped": "Solving was stopped; the same command with --resume goes on.",
+        "refused": found.get("reason", ""),
+    }.get(found["verdict"])
+    if told is None:
+        frames, scale = found["frames"], found["scale"]
+        told = (
+            f"Solved from {frames['key']} key frames; {frames['placed']} were placed between "
+            f"them, {frames['interpolated']} interpolated, {frames['missing']} are missing. Focal "
+            f"length {found['focal_px']:.0f} px; the size of the room is told by "
+            f"{' and '.join(scale['cues'])}. cameras.npz and poses.npz hold the walk."
+        )
+    return f'<p class="legend">{escape(told)}</p>'
 
 
 def _coverage(report: Report, body_map: str) -> str:

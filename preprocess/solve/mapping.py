@@ -1,7 +1,8 @@
 """Structure from motion on key frames: pycolmap's features, matches and both of its mappers.
 
-Schönberger & Frahm 2016 (incremental), Pan et al. 2024 (global, GLOMAP). One thread in the mappers
-and fixed seeds: the same pictures give the same cameras.
+Schönberger & Frahm 2016 (incremental), Pan et al. 2024 (global, GLOMAP). One thread from the
+matches on, pictures registered in order, and fixed seeds: the same pictures give the same cameras,
+bit by bit, however many threads look for features.
 
 The database is COLMAP's alone while it works: it brings a SQLite of its own, and Python's in the
 same process would break its locks (seen: SIGBUS in the write-ahead log).
@@ -23,6 +24,10 @@ OVERLAP = 10
 """Each key frame is matched with so many after it, and with powers of two beyond."""
 ALL_PAIRS = 40
 """Of so few key frames every pair is matched, which closes loops."""
+MOST_MODELS, MOST_BEGINNINGS = 2, 50
+"""How often the incremental mapper begins anew, and with how many pairs at most: pictures without
+parallax would keep it busy for minutes."""
+LEAST_MATCHES = 15
 AT_ONCE = 4
 """Pictures that each thread looks at before progress is told."""
 
@@ -77,6 +82,12 @@ def extract(bench: Workbench, told: Told) -> None:
     options.max_image_size = max(width, height)
     options.sift.max_num_features = FEATURES
     names, step = _names(bench), AT_ONCE * bench.threads
+    with colmap.Database.open(bench.database):  # makes it
+        pass
+    colmap.import_images(
+        bench.database, bench.images, camera_mode=colmap.CameraMode.SINGLE, image_names=names,
+        options=reader,
+    )  # fmt: skip
     for first in range(0, len(names), step):
         told(first / len(names))
         colmap.extract_features(
@@ -84,25 +95,38 @@ def extract(bench: Workbench, told: Told) -> None:
             camera_mode=colmap.CameraMode.SINGLE, reader_options=reader,
             extraction_options=options, device=colmap.Device.cpu,
         )  # fmt: skip
-        reader.existing_camera_id = 1  # the rest is by the same camera
 
 
 def match(bench: Workbench, told: Told) -> None:
     """Matches features between pictures that were taken one soon after the other."""
     colmap = _colmap()
     options = colmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = bench.threads, False
+    options.num_threads, options.use_gpu = 1, False
     count = len(_names(bench))
     told(0.0)
     if count <= ALL_PAIRS:
         colmap.match_exhaustive(bench.database, matching_options=options, device=colmap.Device.cpu)
         return
     pairing = colmap.SequentialPairingOptions()
-    pairing.overlap, pairing.num_threads = OVERLAP, bench.threads
+    pairing.overlap, pairing.num_threads = OVERLAP, 1
     colmap.match_sequential(
         bench.database, matching_options=options, pairing_options=pairing,
         device=colmap.Device.cpu,
     )  # fmt: skip
+
+
+def parallax(database: Path) -> tuple[int, float]:
+    """How many pairs match, and what share no homography explains: 0 of a camera that only turns.
+
+    A plane, too, is seen by homographies; neither says where the camera was.
+    """
+    colmap = _colmap()
+    flat = colmap.TwoViewGeometryConfiguration
+    with colmap.Database.open(database) as base:
+        found = base.read_two_view_geometries()[1]
+    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= LEAST_MATCHES]
+    plain = {int(flat.PLANAR), int(flat.PANORAMIC), int(flat.PLANAR_OR_PANORAMIC)}
+    return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
 
 
 def map_globally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | None:
@@ -122,8 +146,8 @@ def map_incrementally(bench: Workbench, out: Path, seed: int, told: Told) -> Mod
     colmap = _colmap()
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
-    options.min_model_size = 3
-    options.extract_colors = False
+    options.min_model_size, options.max_num_models = 3, MOST_MODELS
+    options.init_num_trials, options.extract_colors = MOST_BEGINNINGS, False
     total, done = len(_names(bench)), 0
 
     def next_image() -> None:

@@ -19,7 +19,7 @@ from capture.errors import BadInput
 from capture.source import Source
 from preprocess.cameras.matching import bridged
 from preprocess.solve import mapping
-from preprocess.solve.gates import Gate, agreement, doubtful, judged
+from preprocess.solve.gates import LEAST_REGISTERED, Gate, agreement, doubtful, judged
 from preprocess.solve.keyframes import (
     MOST_KEYS,
     KeyFrame,
@@ -36,6 +36,8 @@ from preprocess.solve.stillness import Stillness, stillness
 
 SEEDS = (0, 1)
 """A pair of mappings that disagrees is made anew with the next seed."""
+LEAST_DEEP = 0.02
+"""Share of the matched pairs of pictures that must be more than one plane's, or a mere turn's."""
 MOST_BRIDGE_PX = 3.0
 """How far points that were followed may land from where a key frame's own camera sees them."""
 LEAST_BRIDGES = 0.5
@@ -143,10 +145,13 @@ def solve(
         return _standing(source, rest, keys, stages)
     height, width = keys[0].grey.shape
     bench = _bench(stages, (width, height), settings)
+    deep = _parallax(bench, len(keys))
+    if not deep.passed:
+        raise _refusal([deep])
     model, gates = _agreed(bench, len(keys), stages, settings.seed)
     model = _straightened(model)
     between = _between(source, model, keys, stages)
-    gates = [*gates, _followed(between, len(model.frames))]
+    gates = [deep, *gates, _followed(between, len(model.frames))]
     if not gates[-1].passed:
         raise _refusal([gates[-1]])
     cameras, marks = _every_frame(source, model, between)
@@ -202,6 +207,20 @@ def _bench(stages: Stages, size_px: tuple[int, int], settings: Settings) -> Work
     return replace(bench, database=stages.result("matches", matched))
 
 
+def _parallax(bench: Workbench, keys: int) -> Gate:
+    """Whether enough pairs of pictures show depth."""
+    pairs, share = mapping.parallax(bench.database)
+    if pairs < LEAST_REGISTERED * (keys - 1):
+        return Gate(
+            name="matched_pairs", value=float(pairs), bound=LEAST_REGISTERED * (keys - 1),
+            passed=False, words="the pictures have hardly anything in common",
+        )  # fmt: skip
+    return Gate(
+        name="pairs_with_parallax", value=share, bound=LEAST_DEEP, passed=share >= LEAST_DEEP,
+        words="the camera turns on the spot, or sees one flat wall, so that nothing shows depth",
+    )  # fmt: skip
+
+
 def _agreed(bench: Workbench, keys: int, stages: Stages, seed: int) -> tuple[Model, list[Gate]]:
     """The global model, once an incremental one agrees with it, and the gates it has passed.
 
@@ -250,8 +269,8 @@ def _mapped(kind: str, bench: Workbench, stages: Stages, seed: int) -> Model | N
 
 def _refusal(failed: list[Gate]) -> BadInput:
     """What went wrong, each kind once, and what can be done about it."""
-    words = list(dict.fromkeys(gate.words for gate in failed))[:3]
-    why = "; ".join(words) or "neither way of solving found any"
+    words = {gate.name: gate.words for gate in reversed(failed)}  # the first of each kind
+    why = "; ".join(list(words.values())[::-1][:3]) or "neither way of solving found any"
     return BadInput(
         f"The cameras could not be solved with certainty: {why}. Film with the surroundings in "
         "view (textured, not repeating, well lit), walking slowly and without sudden turns; or "

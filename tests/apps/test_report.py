@@ -169,6 +169,29 @@ def test_a_page_without_pictures_or_scores_is_whole_too():
     assert "n/a" in page
 
 
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, None),
+        ({"verdict": "still"}, "stood still"),
+        ({"verdict": "stopped"}, "--resume"),
+        ({"verdict": "refused", "reason": "tiles < tiles"}, "tiles &lt; tiles"),
+        (
+            {
+                "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground", "in place"]},
+                "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
+            },
+            "434 px; the size of the room is told by ground and in place",
+        ),
+    ],
+)  # fmt: skip
+def test_the_page_says_where_the_camera_was(found, said):
+    page = report_page(replace(report(), cameras=found), name="clip")
+    assert Tags(page).addresses == []
+    assert ("Where the camera was" in page) == (said is not None)
+    assert said is None or said in page
+
+
 def test_the_curve_goes_up_when_the_score_does():
     svg = ElementTree.fromstring(curve_svg((point(2.0, 24.0), point(5.0, 29.0), point(9.0, 29.0))))
     (line,) = svg.findall("polyline")

@@ -1,6 +1,8 @@
 """Tests for the whole solution of a little room: right, refused, taken up again, or not needed."""
 
+import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,10 +13,11 @@ from capture.errors import BadInput
 from capture.source import open_source
 from preprocess.solve import mapping, solver
 from preprocess.solve.gates import similarity
+from preprocess.solve.model import Model
 from preprocess.solve.solver import INTERPOLATED, KEY, PLACED, Settings, Solved, solve
 
 SIZE = (320, 240)
-FRAMES, KEYS = 24, 10
+FRAMES, KEYS = 20, 10
 
 
 def nobody(frame, size_px):
@@ -114,28 +117,45 @@ def test_a_frame_that_shows_nothing_is_interpolated(walk, tmp_path):
     assert (again.marks == INTERPOLATED).sum() == 1
 
 
-def test_pictures_that_have_nothing_to_do_with_each_other_are_refused(tmp_path, rng):
-    noise = [cv2.resize(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8), SIZE) for _ in range(10)]
-    with pytest.raises(BadInput, match="could not be solved with certainty"):
-        solve(filmed(tmp_path / "film", noise), nobody, tmp_path / "w", Settings(), lambda *w: None)
+def test_pictures_that_have_nothing_in_common_are_refused(tmp_path, rng):
+    noise = [rng.integers(0, 255, (12, 16, 3), dtype=np.uint8) for _ in range(8)]
+    source = filmed(tmp_path / "film", [cv2.resize(picture, (160, 120)) for picture in noise])
+    with pytest.raises(
+        BadInput, match="with certainty: the pictures have hardly anything in common"
+    ):
+        solve(source, nobody, tmp_path / "work", Settings(), lambda *what: None)
+
+
+def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_path, monkeypatch):
+    monkeypatch.setattr(mapping, "map_globally", None)  # before anything is mapped
+    here = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
+    pictures = []
+    for degrees in np.linspace(-14.0, 14.0, 8):
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+        view = turn @ here.camera_from_world
+        pictures.append(room.seen(replace(here, camera_from_world=view)))
+    with pytest.raises(BadInput, match="turns on the spot"):
+        solve(filmed(tmp_path / "film", pictures), nobody, tmp_path / "w", Settings(), lambda *w: 0)
 
 
 def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch):
-    """Whichever of them is wrong: here the incremental one is bent."""
+    """Whichever of them is wrong: here the incremental one is bent, with both seeds."""
     _, source, _, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
-    shutil.rmtree(tmp_path / "work" / "incremental mapping 0")
-    plain = mapping.map_incrementally
-
-    def bent(bench, out, seed, told):
-        model = plain(bench, out, seed, told)
-        lift = np.linspace(0.0, 0.3, len(model.frames))[:, None] * [0.0, 1.0, 0.0]
-        model.camera_from_world[:, :3, 3] += np.einsum(
-            "cab,cb->ca", model.camera_from_world[:, :3, :3], lift
-        )
-        return model
-
-    monkeypatch.setattr(mapping, "map_incrementally", bent)
+    costs = json.loads((tmp_path / "work" / "stages.json").read_text())
+    for seed in (0, 1):
+        for kind in ("global", "incremental"):
+            model = Model.load(work / f"{kind} mapping 0" / "model.npz")
+            if kind == "incremental":
+                lift = np.linspace(0.0, 0.3, len(model.frames))[:, None] * [0.0, 1.0, 0.0]
+                turned = model.camera_from_world[:, :3, :3]
+                model.camera_from_world[:, :3, 3] += np.einsum("cab,cb->ca", turned, lift)
+            name = f"{kind} mapping {seed}"
+            (tmp_path / "work" / name).mkdir(exist_ok=True)
+            model.save(tmp_path / "work" / name / "model.npz")
+            costs[name] = costs["matches"]
+    (tmp_path / "work" / "stages.json").write_text(json.dumps(costs))
     monkeypatch.setattr(solver, "judged", lambda model, keys: [])  # each passes by itself
     with pytest.raises(BadInput, match="contradict each other"):
         solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
