@@ -3,10 +3,11 @@
     python -m benchmarks.browser AVATAR [--rounds 5]
 
 Draws the same 24 pictures of 540 px natively and in headless Chromium (WebAssembly, one thread), in
-turns. A loaded machine lengthens wall time; so CPU time is given as well, of Chromium with all its
-processes. Shaders are not measured: without a GPU they would say nothing.
+turns, of both tiers. A loaded machine lengthens wall time; so CPU time is given as well,
+of Chromium with all its processes. Shaders are not measured: without a GPU they would say nothing.
 """
 
+import itertools
 import sys
 import tempfile
 import threading
@@ -27,6 +28,7 @@ from benchmarks.hardware import Hardware
 from benchmarks.marks import Mark, table
 from benchmarks.stopwatch import use_threads
 from export.player import Player
+from export.tiers import TIERS
 from export.web.site import site
 from preprocess.pose import Motion
 from tests.apps.browser import Browser, until
@@ -47,23 +49,26 @@ def main() -> int:
 def compare(package: Path, rounds: int) -> int:
     """Measures and prints."""
     use_threads(1)
-    player, motion = Player.load(package), novel_motion(FRAMES)
-    clip = clip_of(player, motion, tuple(range(FRAMES)), 16.0)
+    players = {tier: Player.load(package, tier=tier) for tier in TIERS}
+    motion = novel_motion(FRAMES)
+    clip = clip_of(players["hq"], motion, tuple(range(FRAMES)), 16.0)
     server = server_of(site(package, clip, name="benchmark", level=1), 8090)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    found: list[tuple[float, float, float]] = []
+    found: dict[str, list[tuple[float, float, float]]] = {tier: [] for tier in TIERS}
     with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
         browser.go(f"http://127.0.0.1:{server.server_port}/")
         until(lambda: browser.run("!!window.player"), 120.0)
         browser.run("document.querySelector('#play.playing')?.click()")
-        browser_ms(browser)  # the browser compiles again what it finds hot
-        for _ in range(rounds):
-            found.append((native_ms(player, motion), *browser_ms(browser)))
-            told = "native {:.1f} CPU-ms; browser {:.1f} wall, {:.1f} CPU".format(*found[-1])
-            print(told, file=sys.stderr, flush=True)
+        for tier in TIERS:
+            browser_ms(browser, tier)  # the browser compiles again what it finds hot
+        for _, (tier, player) in itertools.product(range(rounds), players.items()):
+            found[tier].append((native_ms(player, motion), *browser_ms(browser, tier)))
+            told = "native {:.1f} CPU-ms; browser {:.1f} wall, {:.1f} CPU"
+            print(f"{tier}: {told.format(*found[tier][-1])}", file=sys.stderr, flush=True)
     server.shutdown()
     server.server_close()
-    print("\n".join([*Hardware.here().lines(), "", *table(marks(np.array(found)))]))
+    rows = [row for tier in TIERS for row in marks(tier, np.array(found[tier]))]
+    print("\n".join([*Hardware.here().lines(), "", *table(rows)]))
     return 0
 
 
@@ -76,32 +81,40 @@ def native_ms(player: Player, motion: Motion) -> float:
     return 1000.0 * (time.process_time() - began) / FRAMES
 
 
-def browser_ms(browser: Browser) -> tuple[float, float]:
+def browser_ms(browser: Browser, tier: str) -> tuple[float, float]:
     """Wall time (median) and CPU time (mean) of a picture in the browser."""
     before = browser.cpu_seconds()
-    asked = f"player.measure({{size: {SIZE_PX}, frames: {FRAMES}}})"
+    asked = f"player.measure({{tier: '{tier}', size: {SIZE_PX}, frames: {FRAMES}}})"
     times = browser.run(asked, seconds=300.0)
     spent = browser.cpu_seconds() - before
     return float(np.median(times)), 1000.0 * spent / FRAMES
 
 
-def marks(found: Float[np.ndarray, "rounds 3"]) -> list[Mark]:
+def marks(tier: str, found: Float[np.ndarray, "rounds 3"]) -> list[Mark]:
     """The table's rows."""
     native, wall, cpu = np.median(found, axis=0)
     rounds = f"median of {len(found)} rounds of {FRAMES} pictures of {SIZE_PX} px"
     return [
-        Mark(name="native, CPU-ms a picture", value=native, beside=rounds),
-        Mark(name="browser, wall-ms a picture", value=wall, beside="as long as others let it wait"),
-        Mark(name="browser, CPU-ms a picture", value=cpu, beside="all of Chromium's processes"),
+        Mark(name=f"{tier}: native, CPU-ms a picture", value=native, beside=rounds),
         Mark(
-            name="browser's wall by native CPU",
+            name=f"{tier}: browser, wall-ms a picture",
+            value=wall,
+            beside="as long as others let it wait",
+        ),
+        Mark(
+            name=f"{tier}: browser, CPU-ms a picture",
+            value=cpu,
+            beside="all of Chromium's processes",
+        ),
+        Mark(
+            name=f"{tier}: browser's wall by native CPU",
             value=float(np.median(found[:, 1] / found[:, 0])),
             least="≤ 2",
             moonshot="≤ 1.3",
             beside="what was asked for, on a quiet machine",
         ),
         Mark(
-            name="browser's CPU by native CPU",
+            name=f"{tier}: browser's CPU by native CPU",
             value=float(np.median(found[:, 2] / found[:, 0])),
             beside="the same without waiting",
         ),
