@@ -99,7 +99,8 @@ def _cells(window: Window, pixel: Value) -> Value:
     """Cells of the buffer in which pixels of the window lie."""
     width, stride = window.width.cast(np.int32), window.stride.cast(np.int32)
     row = pixel // width
-    return (row + window.border) * stride + (pixel - row * width + window.border)
+    border = window.border.cast(np.int32)
+    return (row + border) * stride + (pixel - row * width + border)
 
 
 def _drawn(scene: Scene, window: Window, pixel: Value, channels: list[Value]) -> Value:

@@ -24,7 +24,7 @@ class Window:
     Attributes:
         left, top: Where it begins, pixels, int64.
         width, height: At least 1, int64.
-        border: Pixels around it in the buffer, so that footprints never leave the buffer.
+        border: Pixels around it in the buffer, so that footprints never leave it, int64.
         stride: Pixels in a row of the buffer, int64.
         cells: Pixels in the buffer, int64; there is one more for what is not drawn.
     """
@@ -33,7 +33,7 @@ class Window:
     top: Value
     width: Value
     height: Value
-    border: int
+    border: Value
     stride: Value
     cells: Value
 
@@ -64,13 +64,19 @@ def splat(scene: Scene, surfels: Surfels) -> Splats:
     inverse = depth.maximum(rules.nearest_m).reciprocal()
     u = x * inverse * view.focal[0] + view.center[0]
     v = y * inverse * view.focal[1] + view.center[1]
-    window = _window(scene, u, v)
-    reach = 0.5 * rules.largest_footprint_px
+    before = depth > rules.nearest_m
     width, height = view.width.cast(np.float32), view.height.cast(np.float32)
-    seen = (depth > rules.nearest_m) & (u > -reach) & (v > -reach) & (u < width + reach)
-    seen = seen & (v < height + reach)
-    side = _footprint(scene, graph.where(seen, depth, NOWHERE).smallest())
-    middle = (side.cast(np.float32) - 1.0) * 0.5 - float(window.border)
+
+    def within(reach: Value) -> Value:
+        beside = (u > -reach) & (v > -reach) & (u < width + reach) & (v < height + reach)
+        return before & beside
+
+    near = within(graph.constant(np.float32(0.5 * rules.largest_footprint_px)))
+    side = _footprint(scene, graph.where(near, depth, NOWHERE).smallest())
+    reach = side.cast(np.float32) * 0.5
+    seen = within(reach)
+    window = _window(scene, u, v, side)
+    middle = (side.cast(np.float32) - 1.0) * 0.5 - window.border.cast(np.float32)
     column = (u - (window.left.cast(np.float32) + middle)).cast(np.int32)
     row = (v - (window.top.cast(np.float32) + middle)).cast(np.int32)
     cell = row * window.stride.cast(np.int32) + column
@@ -84,12 +90,12 @@ def splat(scene: Scene, surfels: Surfels) -> Splats:
     )
 
 
-def _window(scene: Scene, u: Value, v: Value) -> Window:
+def _window(scene: Scene, u: Value, v: Value, side: Value) -> Window:
     """About all points, whether they are seen or not."""
-    border, reach = 2 * scene.rules.largest_footprint_px + 2, 0.5 * scene.rules.largest_footprint_px
+    border, reach = side * 2 + 2, side.cast(np.float32) * 0.5
 
     def extent(places: Value, size: Value) -> tuple[Value, Value]:
-        inside = places.clipped(-reach, size.cast(np.float32) + reach)
+        inside = places.maximum(-reach).minimum(size.cast(np.float32) + reach)
         first = (inside.smallest() - reach).floor().cast(np.int64)
         last = (inside.largest() + (reach + 1.0)).floor().cast(np.int64)
         first = first.maximum(0).minimum(size - 1)
@@ -97,7 +103,7 @@ def _window(scene: Scene, u: Value, v: Value) -> Window:
 
     left, width = extent(u, scene.view.width)
     top, height = extent(v, scene.view.height)
-    stride = width + 2 * border
+    stride = width + border * 2
     return Window(
         left=left,
         top=top,
@@ -105,7 +111,7 @@ def _window(scene: Scene, u: Value, v: Value) -> Window:
         height=height,
         border=border,
         stride=stride,
-        cells=stride * (height + 2 * border),
+        cells=stride * (height + border * 2),
     )
 
 
@@ -133,7 +139,11 @@ def _footprint(scene: Scene, nearest: Value) -> Value:
 
 
 def nearest_keys(scene: Scene, splats: Splats) -> Value:
-    """The least key of each of the window's pixels, row after row, with single holes filled."""
+    """The least key of each of the window's pixels, row after row.
+
+    Where the skin is stretched surfels lie farther apart than a footprint is wide: what two of them
+    on opposite sides, a footprint away, overtop by far is a hole, and filled.
+    """
     window = splats.window
     buffer = _scattered(scene, window, splats.cell, splats.key)
     buffer = _spread(scene, buffer.slices([0], [window.cells]), splats)
@@ -144,22 +154,13 @@ def nearest_keys(scene: Scene, splats: Splats) -> Value:
         return buffer.slices([begin + by], [begin + by + window.stride * window.height])
 
     keys = shifted(0)
-    across = shifted(-1).maximum(shifted(1))
-    along = shifted(-window.stride).maximum(shifted(window.stride))
+    row = splats.side * window.stride
+    across = shifted(-splats.side).maximum(shifted(splats.side))
+    along = shifted(-row).maximum(shifted(row))
     neighbours = across.minimum(along)
     steps = int(scene.rules.hole_m / (2.0 * scene.tables.reach_m) * DEPTH_STEPS)
     hole = (keys - (steps << SURFEL_BITS)) > neighbours
     keys = scene.graph.where(hole, neighbours, keys)
-    import os
-
-    if os.environ.get("FILL"):
-        far = [int(k) for k in os.environ["FILL"].split(",")]
-        sides = []
-        for step in (1, -1, window.stride, -window.stride):
-            some = [shifted(step * k) for k in far]
-            sides.append(some[0].minimum(*some[1:]))
-        around = sides[0].maximum(*sides[1:])
-        keys = scene.graph.where(keys < FAR, keys, around)
     rows = keys.reshaped(-1, window.stride)
     return rows.slices([0, 0], [window.height, window.width]).reshaped(-1)
 

@@ -28,7 +28,8 @@ class DrawingRules:
         longest_m: Longest segment, metres.
         stretch: Where the derivative's determinant is outside of (1/stretch, stretch), surfels are
             not drawn and paths not corrected.
-        hole_m: A pixel that opposite neighbours overtop by this much is a hole, and filled.
+        hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
+            filled.
         gap_m: Surfels of the second layer lie at least this far behind the first's.
         same_m, same_share: Where the two layers' surfels are no farther apart in canonical space
             than this, and so many times as far as in the camera's, they belong to one sheet: the
@@ -47,7 +48,7 @@ class DrawingRules:
     second_block: int = 6
     longest_correction_m: float = 0.01
     ended: float = 0.01
-    largest_footprint_px: int = 16
+    largest_footprint_px: int = 64
     footprint_spacings: float = 1.1
     lead_m: float = 0.004
     most_lead_m: float = 0.025

@@ -70,11 +70,12 @@ def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray,
     """Premultiplied colour and alpha in [0, 1]."""
     width, height = shot.size_px
     posed = _pose(tables, rules, shot)
-    cell, key, deep_enough = _footprints(tables, rules, shot, posed)
-    cells = (height + 2, width + 2)  # one pixel of the picture's surroundings
+    side = _side(tables, rules, shot, posed)
+    cell, key, deep_enough = _footprints(tables, rules, shot, posed, side)
+    cells = (height + 2 * side, width + 2 * side)  # the picture and its surroundings
     buffer = np.full(cells, FAR, dtype=np.int64)
     np.minimum.at(buffer.reshape(-1), cell, key)
-    filled = _without_holes(buffer, tables, rules).ravel()
+    filled = _without_holes(buffer, tables, rules, side).ravel()
     picture = np.zeros((width * height, 4), dtype=np.float32)
     covered = np.flatnonzero(filled < FAR)
     first = _shade(tables, rules, shot, posed, covered, filled[covered], None)
@@ -84,10 +85,10 @@ def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray,
         limit = np.full((height, width), 1e6, dtype=np.float32)
         limit.reshape(-1)[covered] = first.depth + np.float32(rules.gap_m)
         limit.reshape(-1)[passed <= rules.transmitted] = 1e6
-        behind = deep_enough > np.pad(limit, 1, constant_values=1e6).reshape(-1)[cell]
+        behind = deep_enough > np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
         buffer = np.full(cells, FAR, dtype=np.int64)
         np.minimum.at(buffer.reshape(-1), cell[behind], key[behind])
-        keys = buffer[1:-1, 1:-1].ravel()
+        keys = buffer[side:-side, side:-side].ravel()
         again = np.flatnonzero(keys < FAR)
         place = np.searchsorted(covered, again)
         before = _Before(surfel=_surfel(filled[again]), end=first.end[place])
@@ -118,30 +119,41 @@ def _surfel(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
     return key & ((1 << SURFEL_BITS) - 1)
 
 
+def _in_picture(
+    rules: DrawingRules, shot: Shot, posed: _Posed, reach: float
+) -> tuple[Float32[np.ndarray, "surfels 2"], Bool[np.ndarray, "surfels"]]:
+    """Where surfels land, in pixels, and which of them are no farther than that outside."""
+    depth = posed.splatted[:, 2]
+    safe = np.maximum(depth, np.float32(rules.nearest_m))[:, None]
+    place = posed.splatted[:, :2] / safe * shot.focal + shot.center
+    within = (place > -reach).all(axis=1) & (place < np.array(shot.size_px) + reach).all(axis=1)
+    return place, within & (depth > rules.nearest_m)
+
+
+def _side(tables: Tables, rules: DrawingRules, shot: Shot, posed: _Posed) -> int:
+    """Pixels along the edge of every footprint: a surfel spacing where they are nearest."""
+    _, near = _in_picture(rules, shot, posed, 0.5 * rules.largest_footprint_px)
+    if not near.any():
+        return 2
+    spacing_px = shot.focal.max() * tables.surfels.spacing_m / posed.splatted[near, 2].min()
+    side = int(np.floor(spacing_px * rules.footprint_spacings + 0.999))
+    return int(np.clip(side, 2, rules.largest_footprint_px))
+
+
 def _footprints(
-    tables: Tables, rules: DrawingRules, shot: Shot, posed: _Posed
+    tables: Tables, rules: DrawingRules, shot: Shot, posed: _Posed, side: int
 ) -> tuple[Int64[np.ndarray, "splats"], Int64[np.ndarray, "splats"], Float32[np.ndarray, "splats"]]:
     """Each visible surfel's cells with its key, and its depth if it may form the second layer.
 
-    Cells count the pixels of a picture with one more pixel on each side.
+    Cells count the pixels of a picture with a footprint's width around it.
     """
-    (width, height), depth = shot.size_px, posed.splatted[:, 2]
-    safe = np.maximum(depth, np.float32(rules.nearest_m))[:, None]
-    place = posed.splatted[:, :2] / safe * shot.focal + shot.center
+    width, height = shot.size_px
+    place, seen = _in_picture(rules, shot, posed, 0.5 * side)
+    surfel = np.flatnonzero(seen)
     from_eye = np.einsum("nij,nj->ni", posed.inverse, posed.camera)
     facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
-    reach = 0.5 * rules.largest_footprint_px
-    seen = depth > rules.nearest_m
-    seen &= (place > -reach).all(axis=1) & (place < np.array(shot.size_px) + reach).all(axis=1)
-    surfel = np.flatnonzero(seen)
-    if len(surfel) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
     faces = posed.sound & (facing < -posed.camera[:, 2] * rules.facing)
-    depth, place = depth[surfel], place[surfel]
-
-    spacing_px = shot.focal.max() * tables.surfels.spacing_m / depth.min()
-    side = int(np.floor(spacing_px * rules.footprint_spacings + 0.999))
-    side = int(np.clip(side, 2, rules.largest_footprint_px))
+    depth, place = posed.splatted[surfel, 2], place[surfel]
     near = shot.bones[0, 2, :3] @ tables.pelvis + shot.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_STEPS - 1)
     key = (np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64) << SURFEL_BITS) | surfel
@@ -149,19 +161,21 @@ def _footprints(
 
     first = np.floor(place - np.float32((side - 1) / 2)).astype(np.int64)
     steps = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2)
-    column, row = np.moveaxis(first + steps, -1, 0)
-    inside = (column >= -1) & (column <= width) & (row >= -1) & (row <= height)
+    column, row = np.moveaxis(first + steps + side, -1, 0)
+    inside = (column >= 0) & (column < width + 2 * side) & (row >= 0) & (row < height + 2 * side)
     shape = inside.shape
-    cell = ((row + 1) * (width + 2) + column + 1)[inside]
+    cell = (row * (width + 2 * side) + column)[inside]
     return cell, np.broadcast_to(key, shape)[inside], np.broadcast_to(deep_enough, shape)[inside]
 
 
 def _without_holes(
-    keys: Int64[np.ndarray, "rows columns"], tables: Tables, rules: DrawingRules
+    keys: Int64[np.ndarray, "rows columns"], tables: Tables, rules: DrawingRules, side: int
 ) -> Int64[np.ndarray, "height width"]:
-    across = np.maximum(keys[1:-1, :-2], keys[1:-1, 2:])
-    along = np.maximum(keys[:-2, 1:-1], keys[2:, 1:-1])
-    neighbours, keys = np.minimum(across, along), keys[1:-1, 1:-1]
+    """Without the surroundings; what two pixels a footprint away overtop by far is filled."""
+    here = slice(side, -side)
+    across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
+    along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
+    neighbours, keys = np.minimum(across, along), keys[here, here]
     steps = int(rules.hole_m / (2.0 * tables.reach_m) * DEPTH_STEPS)
     return np.where(keys - (steps << SURFEL_BITS) > neighbours, neighbours, keys)
 

@@ -92,6 +92,18 @@ def test_a_close_up_has_no_holes(player, stand_in, camera):
     assert chest.min() > 245
 
 
+@pytest.mark.parametrize("zoom", [3.0, 10.0, 24.0])
+def test_one_does_not_see_between_surfels_however_close(player, stand_in, camera, zoom):
+    view = camera(160, 160, distance_m=0.75)
+    (fx, fy), (x, y) = view.focal_px, view.center_px
+    close = replace(  # about the same pixel of the chest
+        view, focal_px=(fx * zoom, fy * zoom), center_px=(x, 45.0 + (y - 45.0) * zoom)
+    )
+    alpha = player.render(stand_in.canonical, close)[..., 3]
+    assert alpha[30:60, 65:95].min() > 245
+    assert (alpha > 245).mean() > 0.9
+
+
 def test_more_samples_converge(player, bent, camera):
     view = camera(96, 96)
     pictures = [premultiplied(player.render(bent, view, samples=n)) for n in (2, 8, 32, 128)]

@@ -156,6 +156,16 @@ bool faces(int surfel) {
 }
 `;
 
+/** Pixels along the edge of every footprint. */
+const SIDE = `
+uniform sampler2D nearest_depth;
+float footprint_side(float begin) {
+  float nearest = begin + texelFetch(nearest_depth, ivec2(0), 0).x * 2.0 * reach_m;
+  float spacing_px = max(lens.x, lens.y) * spacing_m / nearest;
+  return clamp(floor(spacing_px * footprint_spacings + 0.999), 2.0, float(largest_footprint_px));
+}
+`;
+
 /** Of all surfels that are seen the nearest one's depth, into one pixel's depth buffer. */
 const NEAREST = `
 void main() {
@@ -167,15 +177,13 @@ void main() {
 
 /** Each surfel's footprint into the z-buffer. */
 const SPLAT = `
-uniform sampler2D nearest_depth;
 flat out int key;
 flat out float deep_enough;
 void main() {
   Seen s = project(gl_VertexID);
   float depth = s.camera.z;
-  float nearest = near + texelFetch(nearest_depth, ivec2(0), 0).x * 2.0 * reach_m;
-  float spacing_px = max(lens.x, lens.y) * spacing_m / nearest;
-  float side = clamp(floor(spacing_px * footprint_spacings + 0.999), 2.0, float(largest_footprint_px));
+  float side = footprint_side(near);
+  bool seen = s.seen && all(greaterThan(s.uv, vec2(-0.5 * side))) && all(lessThan(s.uv, vec2(size) + 0.5 * side));
   float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
   key = (int(code) << SURFEL_BITS) | gl_VertexID;
 #ifdef BEHIND
@@ -189,7 +197,7 @@ void main() {
   vec2 border = vec2(largest_footprint_px);
   vec2 place = 2.0 * (middle + border) / (vec2(size) + 2.0 * border) - 1.0;
   gl_PointSize = side;
-  gl_Position = s.seen ? vec4(place, 2.0 * (code + 0.5) / float(DEPTH_STEPS) - 1.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+  gl_Position = seen ? vec4(place, 2.0 * (code + 0.5) / float(DEPTH_STEPS) - 1.0, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
 }`;
 
 const SPLATTED = `
@@ -326,8 +334,9 @@ layout(location = 1) out vec4 extent; // depth that the second layer must exceed
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int key = key_at(pixel);
-  int across = max(key_at(pixel + ivec2(-1, 0)), key_at(pixel + ivec2(1, 0)));
-  int along = max(key_at(pixel + ivec2(0, -1)), key_at(pixel + ivec2(0, 1)));
+  int side = int(footprint_side(near)); // two pixels so far away tell a hole
+  int across = max(key_at(pixel - ivec2(side, 0)), key_at(pixel + ivec2(side, 0)));
+  int along = max(key_at(pixel - ivec2(0, side)), key_at(pixel + ivec2(0, side)));
   int neighbours = min(across, along);
   int steps = int(hole_m / (2.0 * reach_m) * float(DEPTH_STEPS));
   if (key - (steps << SURFEL_BITS) > neighbours) key = neighbours;
@@ -384,9 +393,9 @@ export function sources(note) {
   return {
     nodes: [head + WHOLE_SCREEN, head + NODES],
     nearest: [surfels + NEAREST, head + NOTHING],
-    splat: [surfels + SPLAT, head + SPLATTED],
-    first: [head + WHOLE_SCREEN, shading + FIRST],
-    behind: [behind(surfels + SPLAT), behind(head + SPLATTED)],
+    splat: [surfels + SIDE + SPLAT, head + SPLATTED],
+    first: [head + WHOLE_SCREEN, shading + SIDE + FIRST],
+    behind: [behind(surfels + SIDE + SPLAT), behind(head + SPLATTED)],
     second: [head + WHOLE_SCREEN, shading + SECOND],
   };
 }
