@@ -88,7 +88,7 @@ class PlayArguments:
     """Pictures that are drawn at the same time; without it one for each core. The pictures do not
     depend on it."""
     provider: Annotated[str, arg(metavar="NAME", help_behavior_hint="")] = "cpu"
-    """onnxruntime's execution provider (cpu, cuda, openvino, …), where it is installed."""
+    """onnxruntime's execution provider (cpu, cuda, …), where it is installed."""
     web: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
     """Play it in a browser, http://127.0.0.1:PORT (8010 if PORT is left out): turn it, pause, seek.
     With --out FOLDER nothing is served; the page is written there, for any static host."""

@@ -73,7 +73,7 @@ class Player:
             path: The `.iavatar` file.
             tier: Which quality: "hq", or "lite" where the package has it.
             threads: Of one picture; more than one seldom pays: see `render_all`.
-            provider: onnxruntime's execution provider, "cpu", "cuda", "openvino", …
+            provider: onnxruntime's execution provider, "cpu", "cuda", …
 
         Raises:
             BadInput: If the file is no sound package, or has no such tier, or there is no such
@@ -127,7 +127,7 @@ class Player:
         try:
             packed = np.asarray(self._session.run(["rgba"], inputs)[0])
         except Exception as error:  # onnxruntime has no common class for what a graph can do
-            raise BadInput(f"The package's graph cannot draw this picture: {error}") from error
+            raise BadInput(f"The package's graph cannot draw this: {_shortened(error)}") from error
         if packed.size != height * width or packed.dtype != np.int32:
             raise BadInput(
                 f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
@@ -202,6 +202,12 @@ def provider_named(name: str) -> str:
     )
 
 
+def _shortened(error: Exception, most: int = 400) -> str:
+    """What onnxruntime says, without the pages that some providers add."""
+    said = " ".join(str(error).split())
+    return said if len(said) <= most else f"{said[: most // 2]} … {said[-most // 2 :]}"
+
+
 def _session(
     graph: bytes, tables: dict[str, bytes], threads: int, provider: str
 ) -> onnxruntime.InferenceSession:
@@ -221,7 +227,7 @@ def _session(
     except Exception as error:
         raise BadInput(
             f"The package's graph does not run on onnxruntime {onnxruntime.__version__} "
-            f"({provider}): {error}"
+            f"({provider}): {_shortened(error)}"
         ) from error
     if session.get_providers()[0] != provider:
         raise BadInput(
