@@ -1,8 +1,11 @@
-"""Masks without a segmenter: GrabCut, seeded by the posed body, with what was seen behind it.
+"""Masks without a segmenter: GrabCut, seeded by the posed body and by what it was seen to wear.
 
 GrabCut (Rother et al. 2004) tells person from background by two mixtures of colours and by edges.
-The posed body says where to look: well inside it is person, well outside background. If the camera
-stands still, pixels that were background in earlier frames also say what lies behind the person.
+Alone it leaks into backgrounds of the person's colours; so the posed body, with the clothes that
+earlier frames have shown on it (`Shell`), says where to look: only a narrow band around that shape
+is in doubt. If the camera stands still, pixels that were background in earlier frames also say what
+lies behind the person (`Behind`). The mask is the mean of cut and shape, weighted by how far they
+were found to be off.
 """
 
 from typing import NamedTuple, final
@@ -14,53 +17,81 @@ from jaxtyping import Bool, Float32, UInt8
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
+from preprocess.behind import Behind
 from preprocess.body import ShapedBody
 from preprocess.matte import softened
-from preprocess.outline import Outline
 from preprocess.pose import BodyPose
+from preprocess.shell import Around, Shell
 
-WORK_PX = 320
-"""Longer side of the pictures in which masks are found."""
+WORK_PX = 220
+"""Masks are found in pictures in which the person is about so large, or smaller."""
 
-SMALL_PX = 200
-"""Smaller pictures are enlarged twice: masks then know parts of a pixel."""
+SMALL_PX = 150
+"""Pictures of smaller persons are enlarged twice: masks then know parts of a pixel."""
 
-SURE = (0.01, 0.045)
-UNSURE = (0.02, 0.07)
-"""How far inside and outside the body's outline pixels are in doubt, in heights of the person:
-where poses are right, and where they are off."""
+NEARLY = 1.1
+"""A person who is little larger is not worth a smaller picture."""
 
-RIGHT, OFF = 0.03, 0.08
-"""Share of the body outside the masks of right poses, and of poses that are off by 2° and 1 cm."""
+JOINTS_SHARE = 0.87
+"""Of a standing person's height, how much lies between head joint and toes."""
 
-AROUND = 0.15
-"""How much of the background is looked at, in heights of the person."""
+OTHER_SIZE = 1.4
+"""The scale is chosen anew when the person has become so many times larger or smaller."""
+
+UNKNOWN_M, KNOWN_M, LEAST_OUTSIDE_M = 0.02, 0.008, 0.012
+"""How far inside and outside the shell pixels are in doubt, where nothing is known of it and where
+everything is; outside at least the last, or nothing would ever grow."""
+
+TOO_DEEP = 0.1
+"""Where more of the cut than this runs along the inner limit of what is in doubt, the pose is off
+and the limits must be wider."""
+WIDER_M, NARROWER_M, WIDEST_M = 0.012, 0.002, 0.05
+OUTSIDE_WIDER = 1.5
+"""By how much the limits follow from frame to frame; outside it counts so much more."""
+
+AROUND_M = 0.25
+"""How much of the background is looked at."""
+
+MARGIN_M = 0.04
+"""Background is what is at least so far from the person."""
 
 ROUNDS = 2
 
-LIKE_BEHIND, UNLIKE_BEHIND = 10.0, 40.0
-"""Colours nearer to what was seen behind the person are background, farther ones are person."""
-
-TRUSTED = 2.0
-"""How often a pixel must have been background before it says anything."""
-
-REMEMBERED = 20.0
-"""Over how many frames the background is averaged; light changes."""
-
-MOVED_PX = 0.5
-"""A camera that moved more than this in the picture sees another background."""
+CUT_OFF_M = 0.006
+"""How far the cut's border is off, for whatever reason."""
+SHELL_OFF_M, UNKNOWN_OFF_M = 0.002, 0.012
+"""How far the shell is off at the least, and how far as long as nothing is known of it."""
 
 LEAST_AGREEMENT = 0.4
-"""Masks that agree less with the body's outline (intersection over union) are not used."""
+"""Masks that agree less with the shell's shape (intersection over union) are not used."""
 
 
-class _Seeds(NamedTuple):
-    """What the body says about a picture."""
+class _Shape(NamedTuple):
+    """The shell in a picture.
 
-    body: Bool[np.ndarray, "height width"]
-    inside: Bool[np.ndarray, "height width"]
-    doubtful: Bool[np.ndarray, "height width"]
-    box: tuple[slice, slice]
+    Attributes:
+        fine: Its shape, finer than the picture.
+        covered: How much of each pixel it covers.
+        away: How far each pixel is outside of it, in pixels; inside negative.
+    """
+
+    fine: Float32[np.ndarray, "rows columns"]
+    covered: Float32[np.ndarray, "height width"]
+    away: Float32[np.ndarray, "height width"]
+
+
+class _Cut(NamedTuple):
+    """What GrabCut says about a picture.
+
+    Attributes:
+        person: Who is.
+        sure: Where what lies behind decided, 1, else 0.
+        doubt_m: How far inside and outside the shell pixels were in doubt.
+    """
+
+    person: Bool[np.ndarray, "height width"]
+    sure: Float32[np.ndarray, "height width"]
+    doubt_m: tuple[float, float]
 
 
 @final
@@ -70,18 +101,18 @@ class GrabCut:
     Attributes:
         name: How the report calls it.
         found: How many masks were made.
-        agreement: Their mean intersection over union with the body's outline; 0 of none.
+        agreement: Their mean intersection over union with the shape of body and clothes that was
+            expected; 0 of none.
     """
 
     name = "GrabCut"
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Nothing is known about the background yet."""
-        self._outline = Outline(shaped)
-        self._behind: Float32[np.ndarray, "height width 3"] | None = None
-        self._times: Float32[np.ndarray, "height width"] | None = None
-        self._camera: Camera | None = None
-        self._spilt = RIGHT
+        """Nothing is known about clothes and background yet."""
+        self._shaped, self._shell, self._behind = shaped, Shell(shaped), Behind()
+        self._tall_px: float | None = None
+        self._wider_m = 0.0
+        self._off_m = 0.012
         self.found, self.agreement = 0, 0.0
 
     def __call__(
@@ -92,110 +123,138 @@ class GrabCut:
         Raises:
             BadInput: If the body is not in the picture, or nothing that agrees with it is found.
         """
-        longer = max(frame.size_px)
-        scale = min(1.0, WORK_PX / longer) if longer >= SMALL_PX else 2.0
+        scale = self._scale_for(pose, camera)
         size_px = (max(1, round(frame.size_px[0] * scale)), max(1, round(frame.size_px[1] * scale)))
-        small = camera.resized(size_px)
-        rgb = frame.rgb
+        small, rgb = camera.resized(size_px), frame.rgb
         if size_px != frame.size_px:
             way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
             rgb = cv2.resize(rgb, size_px, interpolation=way)
-        seeds = self._seeds(pose, small)
-        self._remember_only_if_still(small)
-        person = self._cut(rgb, seeds)
-        agreement = float((person & seeds.body).sum() / max((person | seeds.body).sum(), 1))
+        around, shape = self._expected(pose, small)
+        self._behind.seen_by(small, rgb, shape.away > 2.0 * UNKNOWN_M * around.px_per_m)
+        cut = self._cut(rgb, around, shape)
+        expected = shape.away < 0.0
+        both, either = (cut.person & expected).sum(), (cut.person | expected).sum()
+        agreement = float(both / max(either, 1))
         if agreement < LEAST_AGREEMENT:
             raise BadInput(f"the estimated mask agrees by {agreement:.0%} only with the posed body")
-        self._learn_background(rgb, person | seeds.body)
-        spilt = float((seeds.body & ~person).sum() / seeds.body.sum())
-        self._spilt += 0.3 * (spilt - self._spilt)
+        alpha = softened(rgb, cut.person)
+        self._learn(rgb, cut, alpha, small, around, shape)
         self.found += 1
         self.agreement += (agreement - self.agreement) / self.found
-        alpha = softened(rgb, person)
-        if size_px != frame.size_px:
-            way = cv2.INTER_LINEAR if scale < 1.0 else cv2.INTER_AREA
-            alpha = cv2.resize(alpha, frame.size_px, interpolation=way)
-        return alpha
+        return self._mixed(alpha, cut.sure, shape, around.known, frame.size_px)
 
-    def _seeds(self, pose: BodyPose, camera: Camera) -> _Seeds:
-        body = self._outline.drawn(pose, camera)
-        rows, columns = np.nonzero(body)
-        if len(rows) < 16:
+    def _scale_for(self, pose: BodyPose, camera: Camera) -> float:
+        """How many times larger than the frame the picture is in which its mask is found."""
+        joints = self._shaped.with_pose(pose).joints()
+        depth = joints @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        if depth.min() > 0.0:
+            tall = float(np.ptp(camera.project(joints), axis=0).max()) / JOINTS_SHARE
+            before = self._tall_px
+            if before is None or not 1.0 / OTHER_SIZE < tall / before < OTHER_SIZE:
+                self._tall_px = tall
+        tall = max(self._tall_px or 0.0, 1.0)
+        if tall < SMALL_PX:
+            return 2.0
+        return 1.0 if tall < NEARLY * WORK_PX else WORK_PX / tall
+
+    def _expected(self, pose: BodyPose, camera: Camera) -> tuple[Around, _Shape]:
+        around = self._shell.around(pose, camera)
+        if around is None:
             raise BadInput("the posed body is not in the picture")
-        tall = max(int(rows.max() - rows.min()), int(columns.max() - columns.min()), 8)
-        drawn = body.astype(np.uint8)
-        doubt = float(np.clip((self._spilt - RIGHT) / (OFF - RIGHT), 0.0, 1.0))
-        inwards, outwards = (1.0 - doubt) * np.array(SURE) + doubt * np.array(UNSURE)
-        inside = cv2.erode(drawn, _disc(float(inwards * tall))) > 0
-        reach = max(2, round(outwards * tall))
-        near = cv2.dilate(drawn, _disc(float(reach))) > 0
-        margin = reach + max(8, round(AROUND * tall))
+        fine = self._shell.drawn(around, camera)
+        covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
+        shape = _Shape(fine=fine, covered=covered, away=_away(covered > 0.5))
+        if (shape.away < 0.0).sum() < 16:
+            raise BadInput("the posed body is not in the picture")
+        return around, shape
+
+    def _cut(self, rgb: UInt8[np.ndarray, "height width 3"], around: Around, shape: _Shape) -> _Cut:
+        """Who is person, among the pixels that the shell leaves in doubt."""
+        inwards = around.known * KNOWN_M + (1.0 - around.known) * UNKNOWN_M + self._wider_m
+        outwards = max(inwards, LEAST_OUTSIDE_M) + (OUTSIDE_WIDER - 1.0) * self._wider_m
+        away = shape.away / around.px_per_m
+        doubtful = (away < outwards) & (away > -inwards)
+        labels = np.full(away.shape, cv2.GC_BGD, np.uint8)
+        labels[doubtful] = np.where(away[doubtful] < 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
+        like, unlike = self._behind.compared(rgb, doubtful)
+        labels[like], labels[unlike] = cv2.GC_PR_BGD, cv2.GC_PR_FGD
+        labels[away <= -inwards] = cv2.GC_FGD
+        margin = int(AROUND_M * around.px_per_m) + 1
+        rows, columns = np.nonzero(away < outwards)
         box = (
             slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
             slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
         )
-        return _Seeds(body=body, inside=inside, doubtful=near & ~inside, box=box)
-
-    def _cut(
-        self, rgb: UInt8[np.ndarray, "height width 3"], seeds: _Seeds
-    ) -> Bool[np.ndarray, "height width"]:
-        labels = np.full(seeds.body.shape, cv2.GC_BGD, np.uint8)
-        labels[seeds.doubtful] = cv2.GC_PR_BGD
-        labels[seeds.doubtful & seeds.body] = cv2.GC_PR_FGD
-        like, unlike = self._compared(rgb, seeds.doubtful)
-        labels[like], labels[unlike] = cv2.GC_PR_BGD, cv2.GC_PR_FGD
-        labels[seeds.inside] = cv2.GC_FGD
-        part = np.ascontiguousarray(labels[seeds.box])
+        part = np.ascontiguousarray(labels[box])
         models = np.zeros((1, 65)), np.zeros((1, 65))
         if (part & 1).any() and not (part & 1).all():
             cv2.setRNGSeed(0)
-            bgr = np.ascontiguousarray(rgb[seeds.box][..., ::-1])
+            bgr = np.ascontiguousarray(rgb[box][..., ::-1])
             cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
-        person = np.zeros(seeds.body.shape, dtype=bool)
-        person[seeds.box] = (part & 1) > 0
-        return (person & ~like) | unlike
+        person = np.zeros(away.shape, dtype=bool)
+        person[box] = (part & 1) > 0
+        return _Cut(
+            person=(person & ~like) | unlike,
+            sure=(like | unlike).astype(np.float32),
+            doubt_m=(float(inwards), float(outwards)),
+        )
 
-    def _compared(
-        self, rgb: UInt8[np.ndarray, "height width 3"], doubtful: Bool[np.ndarray, "height width"]
-    ) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-        """Doubtful pixels that look like what was seen there before, and those that do not."""
-        if self._behind is None or self._times is None:
-            nothing = np.zeros(doubtful.shape, dtype=bool)
-            return nothing, nothing
-        known = doubtful & (self._times >= TRUSTED)
-        off = np.abs(rgb.astype(np.float32) - self._behind).max(axis=-1)
-        return known & (off < LIKE_BEHIND), known & (off > UNLIKE_BEHIND)
-
-    def _remember_only_if_still(self, camera: Camera) -> None:
-        """Forgets the background if the camera looks elsewhere."""
-        before, self._camera = self._camera, camera
-        if before is None or self._behind is None:
-            return
-        width, height = camera.size_px
-        corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-        same = before.size_px == camera.size_px
-        if same and not np.array_equal(before.camera_from_world, camera.camera_from_world):
-            far = camera.center_world + 5.0 * camera.directions(corners)
-            same = bool((np.abs(before.project(far) - corners) < MOVED_PX).all())
-        if not same:
-            self._behind = self._times = None
-
-    def _learn_background(
+    def _learn(
         self,
         rgb: UInt8[np.ndarray, "height width 3"],
-        person: Bool[np.ndarray, "height width"],
+        cut: _Cut,
+        alpha: Float32[np.ndarray, "height width"],
+        camera: Camera,
+        around: Around,
+        shape: _Shape,
     ) -> None:
-        if self._behind is None or self._times is None:
-            self._behind = np.zeros(rgb.shape, np.float32)
-            self._times = np.zeros(person.shape, np.float32)
-        margin = _disc(max(2.0, 0.02 * max(person.shape)))
-        free = cv2.dilate(person.astype(np.uint8), margin) == 0
-        self._times[free] += 1.0
-        share = 1.0 / np.minimum(self._times[free], REMEMBERED)
-        self._behind[free] += (rgb[free] - self._behind[free]) * share[:, None]
+        """How far poses are off, what the person wears, and what lies behind."""
+        from_cut, per_m = _away(cut.person), around.px_per_m
+        rim = (from_cut > 0.0) & (from_cut < 1.2)
+        deep = rim & (shape.away < 1.5 - cut.doubt_m[0] * per_m)
+        too_deep = deep.sum() > TOO_DEEP * max(rim.sum(), 1)
+        wider = self._wider_m + (WIDER_M if too_deep else -NARROWER_M)
+        self._wider_m = float(np.clip(wider, 0.0, WIDEST_M))
+        near = (np.abs(from_cut) < 0.8) & (np.abs(shape.away) < (cut.doubt_m[0] + 0.005) * per_m)
+        if near.any():
+            # the standard deviation of a normal error is 1.25 times its mean
+            off = 1.25 * float(np.abs(shape.away[near]).mean()) / per_m
+            self._off_m += 0.2 * (off - self._off_m)
+        self._shell.vote(around, camera, rgb, alpha, shape.away, cut.doubt_m)
+        margin = max(2.0, MARGIN_M * per_m)
+        self._behind.learn(rgb, (from_cut > margin) & (shape.away > margin))
+
+    def _mixed(
+        self,
+        alpha: Float32[np.ndarray, "height width"],
+        sure: Float32[np.ndarray, "height width"],
+        shape: _Shape,
+        known: float,
+        size_px: tuple[int, int],
+    ) -> Float32[np.ndarray, "_ _"]:
+        """The mean of cut and shell, each with the inverse of its variance, at the frame's size.
+
+        Where what lies behind decided, the shell has no say.
+        """
+        shell = max(self._off_m**2 - CUT_OFF_M**2, SHELL_OFF_M**2)
+        shell += (UNKNOWN_OFF_M * (1.0 - known)) ** 2
+        weight = np.float32(CUT_OFF_M**2 / (CUT_OFF_M**2 + shell)) * (np.float32(1.0) - sure)
+        covered = shape.covered
+        if alpha.shape[::-1] != size_px:
+            smaller = alpha.shape[1] > size_px[0]
+            way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+            alpha, weight = (
+                cv2.resize(each, size_px, interpolation=way) for each in (alpha, weight)
+            )
+            finer = shape.fine.shape[1] >= size_px[0]
+            way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
+            covered = cv2.resize(shape.fine, size_px, interpolation=way)
+        return weight * covered + (np.float32(1.0) - weight) * alpha
 
 
-def _disc(radius: float) -> UInt8[np.ndarray, "side side"]:
-    whole = max(1, round(radius))
-    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * whole + 1, 2 * whole + 1))
-    return np.asarray(shape, dtype=np.uint8)
+def _away(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
+    hard = shape.astype(np.uint8)
+    outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
+    inside = cv2.distanceTransform(hard, cv2.DIST_L2, 5)
+    return np.asarray(outside - inside + np.where(shape, 0.5, -0.5), dtype=np.float32)

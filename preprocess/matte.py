@@ -7,14 +7,21 @@ from jaxtyping import Bool, Float32, UInt8
 NEAR_PX = 1.0
 """From how far around a border pixel the colours of person and background come (a Gaussian's σ)."""
 
-EDGE_PX = 0.6
+EDGE_PX = 0.5
 """How wide the edge of a picture is: the σ of the lens and the pixel."""
 
-APART = 60.0
-"""Colours less far apart than this tell nothing; there the mask is only smoothed."""
+APART = 20.0, 45.0
+"""Colours less far apart than the first tell nothing; there the mask is only smoothed. From the
+second on they tell all they can."""
 
 TRUST = 0.5
 """How far colours are believed against the smoothed mask: thin stripes and hair deceive them."""
+
+MARGIN_PX = 8
+"""So far around the person pixels are looked at."""
+
+MIXED = 30.0
+"""A pixel whose colour is this far from all mixtures of both is believed half as much."""
 
 
 def softened(
@@ -24,9 +31,20 @@ def softened(
 
     A pixel of the border is a mixture I = a F + (1 - a) B of the mean colours of person and
     background beside it, so a is the projection of I - B on F - B. It is averaged with the mask
-    seen through a lens.
+    seen through a lens, and counts less where F and B are alike or I is no mixture of them.
     """
     hard = person.astype(np.uint8)
+    left, top, width, height = cv2.boundingRect(hard)
+    around = np.s_[max(top - MARGIN_PX, 0) : top + height + MARGIN_PX,
+                   max(left - MARGIN_PX, 0) : left + width + MARGIN_PX]  # fmt: skip
+    alpha = hard.astype(np.float32)
+    alpha[around] = _softened(rgb[around], np.ascontiguousarray(hard[around]))
+    return alpha
+
+
+def _softened(
+    rgb: UInt8[np.ndarray, "height width 3"], hard: UInt8[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width"]:
     square = np.ones((3, 3), np.uint8)
     inside, touched = cv2.erode(hard, square), cv2.dilate(hard, square)
     border = (touched > 0) & (inside == 0)
@@ -37,9 +55,11 @@ def softened(
     apart = front - back
     squared = (apart**2).sum(axis=-1)
     share = ((picture - back) * apart).sum(axis=-1) / np.maximum(squared, np.float32(1.0))
-    mixed = TRUST * np.clip(share, 0.0, 1.0) + (1.0 - TRUST) * smooth
-    tells = has_front & has_back & (squared > APART**2)
-    alpha = np.where(tells, mixed, smooth)
+    beside = np.abs(picture - back - share[..., None] * apart).max(axis=-1)
+    low, high = APART[0] ** 2, APART[1] ** 2
+    trust = TRUST * np.clip((squared - low) / (high - low), 0.0, 1.0)
+    trust *= np.clip(1.5 - beside / MIXED, 0.0, 1.0) * (has_front & has_back)
+    alpha = trust * np.clip(share, 0.0, 1.0) + (1.0 - trust) * smooth
     return np.where(border, alpha, hard).astype(np.float32)
 
 

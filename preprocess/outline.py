@@ -4,7 +4,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, UInt8
 
 from capture.camera import Camera
 from preprocess.body import ShapedBody
@@ -19,7 +19,7 @@ FRACTION_BITS = 4
 
 @final
 class Outline:
-    """Draws one person's body as a filled shape.
+    """Draws one person's body, or what has its triangles, as a filled shape.
 
     OpenCV fills many polygons at once by the even-odd rule; so each call gets the triangles of one
     limb that look towards the camera, or away from it: these do not lie over each other.
@@ -34,22 +34,37 @@ class Outline:
 
     def drawn(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
         """The pixels that the body covers; none if it comes too near or behind the camera."""
+        return self.filled(self._shaped.with_pose(pose).vertices(), camera) > 0
+
+    def filled(
+        self, vertices: Float[np.ndarray, "vertices 3"], camera: Camera
+    ) -> UInt8[np.ndarray, "height width"]:
+        """The pixels that the body's triangles cover, their corners elsewhere: 1, else 0.
+
+        Args:
+            vertices: In the world, metres.
+            camera: If any of them is too near to it or behind it, nothing is drawn.
+        """
         width, height = camera.size_px
         picture = np.zeros((height, width), dtype=np.uint8)
-        vertices = self._shaped.with_pose(pose).vertices()
         depth = vertices @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
         if depth.min() < NEAR_M:
-            return picture > 0
+            return picture
         pixels = (camera.project(vertices) - 0.5) * (1 << FRACTION_BITS)
         corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
         for faces in self._limbs:
             triangles = corners[faces].astype(np.int64)
             a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
             towards = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
+            low = np.clip((triangles.min(axis=(0, 1)) >> FRACTION_BITS) - 1, 0, (width, height))
+            high = np.clip((triangles.max(axis=(0, 1)) >> FRACTION_BITS) + 3, 0, (width, height))
+            part = picture[low[1] : high[1], low[0] : high[0]]
+            triangles -= low << FRACTION_BITS
             for side in (towards, ~towards):
-                filled = np.zeros_like(picture)
+                filled = np.zeros(part.shape, dtype=np.uint8)
                 polygons = list(triangles[side].astype(np.int32))
-                if polygons:
+                if polygons and part.size:
                     cv2.fillPoly(filled, polygons, 1, cv2.LINE_8, FRACTION_BITS)
-                picture |= filled
-        return cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+                part |= filled
+        closed = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        return np.asarray(closed, dtype=np.uint8)

@@ -10,11 +10,13 @@ from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess import segmenter
-from preprocess.grabcut import GrabCut
+from preprocess.behind import Behind
+from preprocess.grabcut import GrabCut, _away
 from preprocess.kinematics import rotation_matrices
 from preprocess.outline import Outline
 from preprocess.pose import BodyPose
 from preprocess.segmenter import make_segmenter, segmenter_name
+from preprocess.shell import Shell
 
 SIZE = (160, 200)
 
@@ -106,17 +108,95 @@ def test_what_was_seen_behind_the_person_helps_where_poses_are_off(shaped, camer
     assert last > alone - 0.01
 
 
-def test_a_camera_that_moves_forgets_what_lay_behind(shaped, camera, film):
-    find = GrabCut(shaped)
-    for index, yaw in enumerate((0.0, 1.0, 2.0)):
-        frame, pose, _ = film(yaw, index)
-        find(frame, pose, camera)
-    assert find._behind is not None
+def test_a_camera_that_moves_forgets_what_lay_behind(camera, rng):
+    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
+
+    def remembers(now: Camera, picture: np.ndarray) -> bool:
+        before = Behind()
+        for _ in range(3):
+            before.seen_by(camera, wall, free)
+            before.learn(wall, free)
+        before.seen_by(now, picture, free)
+        return before.known
+
+    assert not behind.known
+    noise = np.clip(wall + rng.normal(0.0, 3.0, wall.shape), 0, 255).astype(np.uint8)
+    assert remembers(camera, noise)
     turned = camera.camera_from_world.copy()
     turned[:3] = rotation_matrices(np.array([0.0, 0.02, 0.0])) @ turned[:3]
-    moved = replace(camera, camera_from_world=turned)
-    find._remember_only_if_still(moved)
-    assert find._behind is None
+    assert not remembers(replace(camera, camera_from_world=turned), wall)
+    assert not remembers(camera, np.roll(wall, 4, axis=1))  # it moved, and nobody said so
+
+
+def test_what_lay_behind_tells_who_stands_before_it(camera, rng):
+    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
+    for _ in range(3):
+        behind.learn(wall, free)
+    person = np.zeros(SIZE[::-1], dtype=bool)
+    person[50:90, 40:60] = True
+    picture = np.where(person[..., None], np.uint8(255) - wall, wall)
+    contrast = np.abs(picture.astype(int) - wall).max(axis=-1) > 40
+    like, unlike = behind.compared(picture, free)
+    np.testing.assert_array_equal(unlike, person & contrast)
+    assert like[~person].all()
+
+
+@pytest.mark.parametrize("thick_m", [0.0, 0.02, 0.04])
+def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
+    """Masks of a body that is thicker by so much all over; the person turns once."""
+    large = camera.resized((480, 600))
+    outline, shell = Outline(shaped), Shell(shaped)
+    for yaw in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
+        pose = standing(shaped, float(yaw))
+        around = shell.around(pose, large)
+        assert around is not None
+        true = outline.filled(around.skin + thick_m * around.normals, large).astype(np.float32)
+        expected = shell.drawn(around, large)
+        covered = cv2.resize(expected, large.size_px, interpolation=cv2.INTER_AREA) > 0.5
+        away = _away(covered)
+        rgb = np.where(true[..., None] > 0.0, np.uint8(200), np.uint8(20))
+        shell.vote(around, large, np.repeat(rgb, 3, axis=2), true, away, (0.1, 0.1))
+    around = shell.around(standing(shaped), large)
+    assert around is not None
+    assert around.known > 0.3
+    height = shaped.vertices[:, 1]
+    trunk = (height > -0.3) & (height < 0.2) & (np.abs(shaped.vertices[:, 0]) < 0.2)
+    assert np.median(np.abs(around.thickness[trunk] - thick_m)) < 0.004
+    drawn = cv2.resize(shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA)
+    true = outline.filled(around.skin + thick_m * around.normals, large)
+    assert agreement(drawn, true) > 0.96
+
+
+def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
+    """Where the mask goes on to the limit of what was in doubt, nothing was found there."""
+    pose = standing(shaped)
+    thickness = []
+    for limit in (0.02, 0.2):
+        shell = Shell(shaped)
+        for _ in range(4):
+            around = shell.around(pose, camera)
+            assert around is not None
+            leaked = Outline(shaped).filled(around.skin + 0.03 * around.normals, camera)
+            covered = cv2.resize(
+                shell.drawn(around, camera), camera.size_px, interpolation=cv2.INTER_AREA
+            )
+            rgb = np.repeat(leaked[..., None] * np.uint8(200), 3, axis=2)
+            away = _away(covered > 0.5)
+            shell.vote(around, camera, rgb, leaked.astype(np.float32), away, (limit, limit))
+        thickness.append(float(np.median(shell._thickness()[0][around.rim])))
+    assert thickness[0] < thickness[1] - 0.005
+
+
+def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
+    find = GrabCut(shaped)
+    found = []
+    for index, yaw in enumerate(np.linspace(0.0, 2.0 * np.pi, 16)):
+        frame, pose, true = film(float(yaw), index)
+        found.append(agreement(find(frame, pose, camera), true))
+    assert np.mean(found[-6:]) > np.mean(found[:3])
+    assert np.mean(found[-6:]) > 0.95
 
 
 def test_the_same_frames_give_the_same_masks(shaped, camera, film):
