@@ -15,6 +15,11 @@ def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def cross(a: Vector, b: Vector) -> Vector:
+    """Cross product."""
+    return [a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3] for k in range(3)]
+
+
 def applied(matrix: Matrix, vector: Vector) -> Vector:
     """Matrix times vector."""
     return [dot(row, vector) for row in matrix]

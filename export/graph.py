@@ -27,7 +27,9 @@ def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
     scene = Scene(
         graph=graph,
         tables=tables,
-        columns={name: graph.table(name, array) for name, array in initialisers(tables).items()},
+        columns={
+            name: graph.table(name, array) for name, array in initialisers(tables, rules).items()
+        },
         rules=rules,
         view=_view(graph),
         samples=graph.input("samples", np.int64, []),
@@ -46,7 +48,7 @@ def _picture(scene: Scene) -> Value:
     covered = keys < FAR
     pixel = graph.range((window.width * window.height).cast(np.int32)).compressed(covered)
     ray = rays(scene.view, window, pixel)
-    first = shade(scene, hull, keys.compressed(covered), ray, None)
+    first = shade(scene, hull, keys.take(pixel), ray, None)
     channels = [*first.color, first.light]
     if scene.rules.layers == 2:
         channels = _with_second(scene, hull, splats, pixel, first)

@@ -3,13 +3,15 @@
 import numpy as np
 from jaxtyping import Shaped
 
-from export.skin import finer_nodes
+from export.rules import DrawingRules
+from export.skin import nodes_of
 from export.tables import NODES, Tables
 
 
-def initialisers(tables: Tables) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Every table of the graph by its name."""
-    surfels, bricks, nodes = tables.surfels, tables.bricks, finer_nodes(tables.skin)
+def initialisers(tables: Tables, rules: DrawingRules) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Every table of the graph that draws by these rules, by its name."""
+    surfels, bricks = tables.surfels, tables.bricks
+    nodes = nodes_of(tables.skin, rules.nodes_per_step)
     voxels = bricks.voxels.reshape(-1, 4)
     red, green, blue = (voxels[:, channel].astype(np.int32) for channel in range(3))
     columns = {

@@ -44,11 +44,14 @@ def cell_of(scene: Scene, lattice: Vector) -> Cell:
         part = graph.constant(_packed_places(bricks, axis)).take(voxel)
         packed = part if packed is None else packed + part
     assert packed is not None
-    base = packed + _offsets(scene).take(packed.shifted_right(LOCAL_BITS).cast(np.int32))
+    # as floats: two bits of the place may be lost, but it never reaches the next block
+    block = (packed.cast(np.float32) * (1.0 / (1 << LOCAL_BITS))).cast(np.int32)
+    base = packed + _offsets(scene).take(block)
     x, y, z = fraction
     largest, smallest = x.maximum(y, z), x.minimum(y, z)
     middle = (x + y + z) - largest - smallest
-    return Cell(corners=_way(graph, base, fraction), fractions=[largest, middle, smallest])
+    corners = _way(graph, base, fraction, largest, smallest)
+    return Cell(corners=corners, fractions=[largest, middle, smallest])
 
 
 def _packed_places(bricks: Bricks, axis: int) -> np.ndarray:
@@ -66,22 +69,22 @@ def _offsets(scene: Scene) -> Value:
     return offset - blocks * (1 << LOCAL_BITS)
 
 
-def _way(graph: Graph, base: Value, fraction: Vector) -> list[Value]:
-    """The corners of the tetrahedron: the axis of the largest fraction is taken first."""
-    x, y, z = fraction
+def _way(
+    graph: Graph, base: Value, fraction: Vector, largest: Value, smallest: Value
+) -> list[Value]:
+    """The corners of the tetrahedron: the axis of the largest fraction is taken first.
+
+    Where two fractions are the same, the corner between them has no share.
+    """
+    x, y, _ = fraction
     sx, sy, sz = STRIDES
-    x_over_y, x_over_z, y_over_z = x > y, x > z, y > z
 
-    def chosen(condition: Value, yes: Value | int, no: Value | int) -> Value:
+    def chosen(here: Value, yes: Value | int, no: Value | int) -> Value:
         sides = [graph.value(side, np.int32) for side in (yes, no)]
-        return graph.where(condition, *sides)
+        return graph.where(here, *sides)
 
-    first = chosen(x_over_y, chosen(x_over_z, sx, sz), chosen(y_over_z, sy, sz))
-    last_two = chosen(
-        x_over_y,
-        chosen(y_over_z, sx + sy, sx + sz),
-        chosen(x_over_z, sx + sy, sy + sz),
-    )
+    first = chosen(x.equals(largest), sx, chosen(y.equals(largest), sy, sz))
+    last_two = chosen(x.equals(smallest), sy + sz, chosen(y.equals(smallest), sx + sz, sx + sy))
     return [base, base + first, base + last_two, base + (sx + sy + sz)]
 
 

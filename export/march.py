@@ -65,6 +65,8 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
     """
     graph, rules = scene.graph, scene.rules
     usual = rules.span_m / scene.samples.cast(np.float32)
+    scale = (scene.samples + (rules.samples - 1)) // rules.samples  # more samples, more blocks
+    blocks, steady = (scale * count for count in (rules.blocks, rules.steady))
     block = sampled(scene, segment, segment.begin * 0.0 + 1.0, rules.block, usual)
     number = graph.range(graph.size(segment.begin).cast(np.int32))
     start = [block.light, *block.color, *_going_on(scene, number, segment, block)]
@@ -72,8 +74,8 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
     def once(turn: Value, state: list[Value]) -> tuple[Value, list[Value]]:
         (light, *color), number, before, values = state[:4], state[4], state[5], state[6:]
         segment = _led_back(scene, posed, _segment(values))
-        doublings = (turn.cast(np.float32) - float(rules.steady - 2)).maximum(0.0)
-        last = turn > rules.blocks - 3
+        doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
+        last = turn > blocks - 3
         longest = graph.where(last, rules.longest_m, usual * doublings.exp2())
         block = sampled(scene, segment, before, rules.block, longest)
         light = light.scattered(number, block.light)
@@ -84,7 +86,7 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
         left = _going_on(scene, number, segment, block)
         return graph.size(left[0]) > 0, [light, *color, *left]
 
-    light, *color = graph.loop_while(rules.blocks - 1, start, once)[:4]
+    light, *color = graph.loop_while(blocks - 1, start, once)[:4]
     return color, light
 
 

@@ -83,6 +83,10 @@ class Value:
         """Greater."""
         return self._with("Greater", other, dtype=np.bool_)
 
+    def equals(self, other: "Operand") -> "Value":
+        """Where both are the same number."""
+        return self._with("Equal", other, dtype=np.bool_)
+
     def __and__(self, other: "Value") -> "Value":
         """Both, of truth values."""
         return self._with("And", other)
@@ -302,7 +306,7 @@ class Graph:
 
     def loop_while(
         self,
-        most: int,
+        most: Value,
         states: Sequence[Value],
         body: Callable[[Value, list[Value]], tuple[Value | None, list[Value]]],
     ) -> list[Value]:
@@ -310,7 +314,7 @@ class Graph:
 
         The states' lengths may change from turn to turn.
         """
-        return self._loop(self.constant(np.int64(most)), states, body)
+        return self._loop(most, states, body)
 
     def split(self, value: Value, parts: int, axis: int = 0) -> list[Value]:
         """Equal pieces along an axis, which is as long as there are pieces and goes away."""

@@ -51,7 +51,8 @@ class Player:
         self._rules = package.manifest.tiers[tier].rules
         # onnxruntime only borrows the tables: they must live as long as the session
         self._tables = {
-            name: array.tobytes() for name, array in initialisers(package.tables[tier]).items()
+            name: array.tobytes()
+            for name, array in initialisers(package.tables[tier], self._rules).items()
         }
         self.provider = provider_named(provider)
         self._session = _session(package.graphs[tier], self._tables, threads, self.provider)
@@ -216,6 +217,7 @@ def _session(
     options.inter_op_num_threads = 1
     options.log_severity_level = 4  # what fails is said below
     options.enable_mem_reuse = False  # planning it takes longer than anything else at load
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names, buffers = list(tables), list(tables.values())
     options.add_external_initializers_from_files_in_memory(

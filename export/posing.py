@@ -42,14 +42,14 @@ def pose_nodes(scene: Scene) -> Posed:
 
 
 def nodes_per_m(scene: Scene) -> list[float]:
-    """Nodes lie half a step of the stored skin apart."""
-    return [2.0 / float(step) for step in scene.tables.skin.step_m]
+    """Along x, y, z."""
+    return [scene.rules.nodes_per_step / float(step) for step in scene.tables.skin.step_m]
 
 
 def place_of(scene: Scene, canonical: Vector) -> Place:
     """Where canonical points lie among the nodes."""
     skin = scene.tables.skin
-    counts = [2 * count - 1 for count in skin.index.shape]
+    counts = [scene.rules.nodes_per_step * (count - 1) + 1 for count in skin.index.shape]
     number, fraction = None, []
     for axis, (point, per_m) in enumerate(zip(canonical, nodes_per_m(scene), strict=True)):
         place = point * per_m - float(skin.low[axis]) * per_m

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import adjugate, dot, taken
 from export.nodes import Value
-from export.posing import Place, Posed, carried, inverse_of
+from export.posing import Posed
 from export.scene import Scene
-from export.surfels import Surfels
+from export.surfels import Surfels, faces_camera
 from export.tables import DEPTH_STEPS, SURFEL_BITS
 
 FAR = np.int32(2**31 - 1)
@@ -207,7 +206,7 @@ def keys_behind(
     lowest = graph.concatenated([lowest, graph.filled(graph.shape(lost), np.float32(NOWHERE))])
     number = graph.range(graph.constant(np.int32(len(scene.tables.surfels))))
     number = number.compressed(splats.depth > lowest.take(splats.cell))
-    number = number.compressed(_faces(scene, posed, surfels, number))
+    number = number.compressed(faces_camera(scene, posed, surfels, number))
     first, key, depth = (
         value.take(number).reshaped(1, -1) for value in (splats.cell, splats.key, splats.depth)
     )
@@ -220,14 +219,3 @@ def keys_behind(
     behind = depth > limits.take(covered)
     covered = graph.where(behind, covered, window.cells.cast(np.int32))
     return _scattered(scene, window, covered, key).take(cell)
-
-
-def _faces(scene: Scene, posed: Posed, surfels: Surfels, number: Value) -> Value:
-    """Which of some surfels face the camera."""
-    place = surfels.place
-    place = Place(rows=taken(place.rows, number), fraction=taken(place.fraction, number))
-    camera, derivative = carried(scene, posed, place)
-    inverse = inverse_of(scene, derivative, adjugate(derivative))
-    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], number)
-    facing = dot(normal, inverse.applied(camera))
-    return inverse.trusted & (facing < camera[2] * -scene.rules.facing)

@@ -14,7 +14,10 @@ class DrawingRules:
         block: Samples between two corrections of a ray's canonical path.
         steady: So many blocks have steps of that length; each further block has twice the steps
             of the one before it.
-        blocks: At most so many; the last one takes what is left of a ray.
+        nodes_per_step: In how many parts, 1 or 2, a step of the skin is cut along each axis:
+            posed positions are taken as linear between the nodes.
+        blocks: At most so many; the last one takes what is left of a ray. Where the player asks for
+            more samples, steady and other blocks are so many times more.
         second_block: Samples of a ray in the second layer, all at once.
         longest_correction_m: No correction is longer than this.
         ended: A ray ends where less than this share of the light is left.
@@ -25,6 +28,7 @@ class DrawingRules:
         slack_m: How far the segment's begin may lie from the surfel, along the ray.
         grazing: How much longer a segment is where the ray grazes the hull (× sin²).
         steepest: Least cosine between ray and normal that lengthens a segment.
+        lengthened: A segment is at most so many times as long as the hull is thick there.
         longest_m: Longest segment, metres.
         stretch: Where the derivative's determinant is outside of (1/stretch, stretch), surfels are
             not drawn and paths not corrected.
@@ -44,6 +48,7 @@ class DrawingRules:
     span_m: float = 0.05
     block: int = 3
     steady: int = 3
+    nodes_per_step: int = 2
     blocks: int = 5
     second_block: int = 6
     longest_correction_m: float = 0.01
@@ -55,6 +60,7 @@ class DrawingRules:
     slack_m: float = 0.02
     grazing: float = 1.5
     steepest: float = 0.1
+    lengthened: float = 5.0
     longest_m: float = 0.15
     stretch: float = 10.0
     hole_m: float = 0.025

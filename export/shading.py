@@ -120,7 +120,8 @@ def _extent(
     cosine = (-falling).maximum(rules.steepest)
     lead = (rules.lead_m / cosine).minimum(rules.most_lead_m)
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
-    length = (thickness * (sine * rules.grazing + 1.0) / cosine + lead).minimum(rules.longest_m)
+    times = ((sine * rules.grazing + 1.0) / cosine).minimum(rules.lengthened)
+    length = (thickness * times + lead).minimum(rules.longest_m)
     begin = enter - lead
     return enter, begin, begin + length
 

@@ -1,4 +1,4 @@
-"""The skin at half its step: nodes so close that posed positions may be taken as linear between."""
+"""The skin's nodes, at its own step or half of it: posed positions are linear between them."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -6,15 +6,17 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
+from capture.errors import BadInput
 from export.tables import Skin
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinNodes:
-    """Nodes of a grid whose cells are half as long as the skin's.
+    """Nodes of a grid whose cells are as long as the skin's, or half as long.
 
     Linear blend skinning, Σ w_j(x) B_j x, carries each node to its posed place. Trilinear between
-    eight of these, it is at most some tenths of a millimetre from what the skin itself says.
+    eight of these, at half the skin's step, it is at most some tenths of a millimetre from what the
+    skin itself says.
 
     Attributes:
         low: Corner of the grid, canonical metres.
@@ -31,6 +33,37 @@ class SkinNodes:
     index: Int32[np.ndarray, "x y z"]
     positions: Float32[np.ndarray, "rows 3"]
     weights: Float32[np.ndarray, "24 rows"]
+
+
+def nodes_of(skin: Skin, per_step: int) -> SkinNodes:
+    """The skin's nodes, its steps cut into so many parts.
+
+    Raises:
+        BadInput: If that is neither 1 nor 2.
+    """
+    if per_step not in (1, 2):
+        raise BadInput(
+            f"The package cuts the skin's steps into {per_step} parts; 1 or 2 can be. "
+            "The file is damaged or none of ours."
+        )
+    return finer_nodes(skin) if per_step == 2 else stored_nodes(skin)
+
+
+@lru_cache(maxsize=1)
+def stored_nodes(skin: Skin) -> SkinNodes:
+    """Every node that is stored."""
+    place = np.argwhere(skin.index > 0)
+    weights = np.zeros((24, len(place) + 2), dtype=np.float32)
+    weights[:, :-1] = skin.weights.T
+    weights[0, -1] = 1.0
+    positions = np.pad(place, [(1, 1), (0, 0)]) * skin.step_m + skin.low
+    return SkinNodes(
+        low=skin.low,
+        step_m=skin.step_m,
+        index=skin.index,
+        positions=positions.astype(np.float32),
+        weights=weights,
+    )
 
 
 @lru_cache(maxsize=1)

@@ -1,10 +1,11 @@
 """Nodes that carry the hull's surfels into the camera's frame, cheaply: most are never seen."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
-from export.columns import Vector
+from export.columns import Vector, cross, dot, taken
 from export.nodes import Value
-from export.posing import Place, Posed, place_of
+from export.posing import Place, Posed, nodes_per_m, place_of
 from export.scene import Scene
 
 
@@ -14,10 +15,14 @@ class Surfels:
 
     Attributes:
         place: Where they lie among the skin's nodes, the same in all poses.
+        rows: Of the four nodes about each, and
+        normal: its normal per step along the edges between these, also the same in all poses.
         camera: Positions in the camera's frame, linear in tetrahedra.
     """
 
     place: Place
+    rows: list[Value]
+    normal: Vector
     camera: Vector
 
 
@@ -28,7 +33,7 @@ def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
     """
     columns = scene.columns
     place = place_of(scene, [columns[f"position_{letter}"] for letter in "xyz"])
-    rows, shares = _tetrahedra(scene, place)
+    rows, shares, normal = _tetrahedra(scene, place)
     camera = []
     for table in posed.camera:
         total = None
@@ -37,11 +42,27 @@ def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
             total = part if total is None else total + part
         assert total is not None
         camera.append(total)
-    return Surfels(place=place, camera=camera)
+    return Surfels(place=place, rows=rows, normal=normal, camera=camera)
 
 
-def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value]]:
-    """Rows of four nodes, and their shares in a surfel's position.
+def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) -> Value:
+    """Which of some surfels face the camera: n · J⁻¹ c, J the derivative in the tetrahedron.
+
+    J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
+    """
+    rules, rows = scene.rules, taken(surfels.rows, number)
+    corners = [[table.take(row) for table in posed.camera] for row in rows]
+    edges = [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
+    across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
+    volume = dot(edges[0], across[0])
+    camera = taken(surfels.camera, number)
+    facing = dot(taken(surfels.normal, number), [dot(vector, camera) for vector in across])
+    # the way along the edges turns left or right, so the volume may have either sign
+    return facing * volume < camera[2] * volume * volume * -rules.facing
+
+
+def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], Vector]:
+    """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
 
     The way from the lower to the upper corner of a cell takes the axis of the largest fraction
     first (as `lookup.Cell`).
@@ -60,4 +81,11 @@ def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value]]:
     largest, smallest = x.maximum(y, z), x.minimum(y, z)
     middle = (x + y + z) - largest - smallest
     shares = [1.0 - largest, largest - middle, middle - smallest, smallest]
-    return [low, first, second, along_both + 1], shares
+    nx, ny, nz = (
+        scene.columns[f"normal_{letter}"] * (1.0 / per_m)
+        for letter, per_m in zip("xyz", nodes_per_m(scene), strict=True)
+    )
+    one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
+    three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))
+    normal = [one, (nx + ny + nz) - one - three, three]
+    return [low, first, second, along_both + 1], shares, normal

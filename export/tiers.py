@@ -4,6 +4,16 @@ from export.rules import DrawingRules
 
 TIERS = {
     "hq": DrawingRules(),
-    "lite": DrawingRules(samples=4, steady=1, blocks=3, lead_m=0.001, ended=0.05, transmitted=0.15),
+    "lite": DrawingRules(
+        samples=5,
+        block=2,
+        steady=1,
+        blocks=2,
+        nodes_per_step=1,
+        lead_m=0.001,
+        ended=0.05,
+        lengthened=4.0,
+        transmitted=0.15,
+    ),
 }
 """How each is drawn; "hq" comes first."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from export.rules import DrawingRules
-from export.skin import finer_nodes
+from export.skin import nodes_of
 from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
 from export.twin_march import PosedNodes, Rays, carried, carried_in_tetrahedra, march, sampled
 
@@ -39,11 +39,13 @@ class Shot:
 class _Posed:
     """The skin in the camera's frame, and the hull with the inverse of its derivative there.
 
-    `splatted` is a coarser `camera`, linear in tetrahedra.
+    `splatted` is a coarser `camera`, linear in tetrahedra, and `facing` what is made of it: the
+    ray to each surfel along its normal in canonical space, negative where it faces the camera.
     """
 
     nodes: PosedNodes
     splatted: Float32[np.ndarray, "surfels 3"]
+    facing: Float32[np.ndarray, "surfels"]
     camera: Float32[np.ndarray, "surfels 3"]
     inverse: Float32[np.ndarray, "surfels 3 3"]
     sound: Bool[np.ndarray, "surfels"]
@@ -98,7 +100,7 @@ def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray,
 
 
 def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
-    nodes = finer_nodes(tables.skin)
+    nodes = nodes_of(tables.skin, rules.nodes_per_step)
     blended = (nodes.weights.T @ shot.bones.reshape(24, 12)).reshape(-1, 3, 4)
     node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
     there = PosedNodes(nodes, node_camera)
@@ -106,9 +108,14 @@ def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
     volume = np.linalg.det(derivative)
     sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
     inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
+    splatted, edges = carried_in_tetrahedra(there, tables.surfels.positions)
+    flat = np.abs(np.linalg.det(edges)) < 1e-12
+    from_eye = np.linalg.solve(np.where(flat[:, None, None], np.eye(3), edges), splatted[..., None])
+    facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye[..., 0])
     return _Posed(
         nodes=there,
-        splatted=carried_in_tetrahedra(there, tables.surfels.positions),
+        splatted=splatted,
+        facing=np.where(flat, 0.0, facing).astype(np.float32),
         camera=camera,
         inverse=inverse.astype(np.float32),
         sound=sound,
@@ -150,14 +157,12 @@ def _footprints(
     width, height = shot.size_px
     place, seen = _in_picture(rules, shot, posed, 0.5 * side)
     surfel = np.flatnonzero(seen)
-    from_eye = np.einsum("nij,nj->ni", posed.inverse, posed.camera)
-    facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
-    faces = posed.sound & (facing < -posed.camera[:, 2] * rules.facing)
     depth, place = posed.splatted[surfel, 2], place[surfel]
+    faces = posed.facing[surfel] < -depth * rules.facing
     near = shot.bones[0, 2, :3] @ tables.pelvis + shot.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_STEPS - 1)
     key = (np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64) << SURFEL_BITS) | surfel
-    deep_enough = np.where(faces[surfel], depth, np.float32(0.0))
+    deep_enough = np.where(faces, depth, np.float32(0.0))
 
     first = np.floor(place - np.float32((side - 1) / 2)).astype(np.int64)
     steps = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2)
@@ -212,7 +217,7 @@ def _shade(
     lead = np.minimum(rules.lead_m / cosine, rules.most_lead_m)
     begin = enter - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
-    length = thickness * (1.0 + rules.grazing * sine) / cosine
+    length = thickness * np.minimum((1.0 + rules.grazing * sine) / cosine, rules.lengthened)
     end = begin + np.minimum(length + lead, rules.longest_m)
     if before is not None:
         apart = np.linalg.norm(surfels.positions[surfel] - surfels.positions[before.surfel], axis=1)

@@ -53,18 +53,26 @@ def carried(
 
 def carried_in_tetrahedra(
     posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
-) -> Float32[np.ndarray, "points 3"]:
-    """Where canonical points are in the camera's frame, linear in the tetrahedra of `read`."""
+) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
+    """The same, linear in the tetrahedra of `read` instead of trilinear."""
     nodes = posed.nodes
     last = np.array(nodes.index.shape) - 1
     place = np.clip((points - nodes.low) / nodes.step_m, 0.0, last - 1e-3).astype(np.float32)
     base = np.floor(place).astype(np.int64)
     moved = np.zeros((len(points), 3), dtype=np.float32)
+    derivative = np.zeros((len(points), 3, 3), dtype=np.float32)
+    before = None
     for corner, share in _way(place - base):
         above = corner[:, 2]
         row = nodes.index[tuple((base + corner * np.array([1, 1, 0])).T)] + above
-        moved += posed.camera[row] * share[:, None]
-    return moved
+        there = posed.camera[row]
+        moved += there * share[:, None]
+        if before is not None:
+            axis = (corner - before[1]).argmax(axis=1)
+            step = (there - before[0]) / nodes.step_m[axis, None]
+            derivative[np.arange(len(points)), :, axis] = step
+        before = there, corner
+    return moved, derivative
 
 
 def _way(
@@ -117,11 +125,12 @@ def march(
     """Premultiplied colour and alpha: blocks of samples, a Newton step between them."""
     colors, light = np.zeros((len(rays.begin), 4), dtype=np.float32), np.ones(len(rays.begin))
     alive, rest = np.arange(len(light)), rays
-    for turn in range(rules.blocks):
+    scale = -(-samples // rules.samples)
+    for turn in range(rules.blocks * scale):
         if turn > 0:
             rest = _led_back(rules, posed, rest)
-        longest = rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady)
-        if turn > 0 and turn == rules.blocks - 1:
+        longest = rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
+        if turn > 0 and turn == rules.blocks * scale - 1:
             longest = rules.longest_m
         block = sampled(bricks, rest, light[alive], rules.block, longest)
         colors[alive] += block.colors

@@ -148,7 +148,8 @@ def _bytes(content: bytes) -> Shaped[np.ndarray, "bytes"]:
 
 
 def _tier(draft: _Draft, package: AvatarPackage, tier: str) -> dict[str, Any]:
-    tables, note = initialisers(package.tables[tier]), package.manifest.tiers[tier]
+    note = package.manifest.tiers[tier]
+    tables = initialisers(package.tables[tier], note.rules)
     return {
         "rules": asdict(note.rules),
         "layout": asdict(note.layout),

@@ -76,7 +76,7 @@ def test_a_loop_whose_states_shrink_ends_when_nothing_is_left():
         some = graph.node("Size", more, dtype=np.int64) > 0
         return some, [steps, place.take(more), left.take(more) * 0.5]
 
-    steps = graph.loop_while(50, [x * 0.0 - 1.0, place, x], halved)[0]
+    steps = graph.loop_while(graph.constant(np.int64(50)), [x * 0.0 - 1.0, place, x], halved)[0]
     numbers = np.array([0.5, 3.0, 100.0, 0.9, 1.5, 5e3], dtype=np.float32)
     expected = np.maximum(np.ceil(np.log2(numbers)), 0.0)
     np.testing.assert_array_equal(run(graph, steps, x=numbers), expected)

@@ -23,14 +23,16 @@ def on_white(picture):
     return np.clip(picture[..., :3] + 1 - picture[..., 3:], 0, 1)
 
 
+@pytest.mark.parametrize("tier", ["hq", "lite"])
 @pytest.mark.parametrize("posed", ["canonical", "bent"])
 @pytest.mark.parametrize(("size", "distance_m"), [((96, 120), 3.0), ((131, 77), 1.2)])
 def test_the_graph_draws_what_its_twin_draws(
-    player, tables, stand_in, bent, camera, posed, size, distance_m
+    exported, tables, stand_in, bent, camera, tier, posed, size, distance_m
 ):
+    player = Player.load(exported.path, tier=tier)
     pose = stand_in.canonical if posed == "canonical" else bent
     view = camera(*size, distance_m=distance_m)
-    rules = player.manifest.tiers["hq"].rules
+    rules = player.manifest.tiers[tier].rules
     shot = Shot(
         bones=player.bones(pose, view),
         focal=np.array(view.focal_px, np.float32),
@@ -139,8 +141,10 @@ def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
     matrix = np.array([[0.9, 0.2, 0.1], [-0.3, 1.1, 0.0], [0.2, 0.1, 0.8]], dtype=np.float32)
     posed = PosedNodes(nodes, nodes.positions @ matrix.T)
     points = tables.surfels.positions
-    np.testing.assert_allclose(carried_in_tetrahedra(posed, points), points @ matrix.T, atol=1e-5)
-    np.testing.assert_allclose(carried(posed, points)[0], points @ matrix.T, atol=1e-5)
+    for carry in (carried_in_tetrahedra, carried):
+        moved, derivative = carry(posed, points)
+        np.testing.assert_allclose(moved, points @ matrix.T, atol=1e-5)
+        np.testing.assert_allclose(derivative, np.broadcast_to(matrix, derivative.shape), atol=1e-4)
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):

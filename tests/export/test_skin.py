@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from capture.errors import BadInput
 from export.bake import rounded
-from export.skin import finer_nodes
+from export.skin import finer_nodes, nodes_of
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +68,18 @@ def test_rounding_codes_moves_none_by_more_than_a_step(step, largest):
     error = np.abs(near.astype(int) - codes.astype(int))
     assert error[: largest - step].max() <= step // 2
     assert error.max() < step
+
+
+def test_stored_nodes_are_the_skins_own(skin):
+    nodes = nodes_of(skin, 1)
+    np.testing.assert_array_equal(nodes.weights[:, :-1], skin.weights.T)
+    place = np.argwhere(nodes.index > 0)
+    rows = nodes.index[tuple(place.T)]
+    np.testing.assert_allclose(nodes.positions[rows], nodes.low + place * nodes.step_m, atol=1e-6)
+    both = (nodes.index[..., :-1] > 0) & (nodes.index[..., 1:] > 0)
+    assert (np.diff(nodes.index, axis=2)[both] == 1).all()
+
+
+def test_steps_cut_in_other_ways_are_refused(skin):
+    with pytest.raises(BadInput, match="7 parts"):
+        nodes_of(skin, 7)

@@ -50,7 +50,7 @@ def test_every_array_comes_back_as_it_was(files, exported, clip):
     package, told = read_package(exported.path), json.loads(files["avatar.json"])
     assert set(told["tiers"]) == set(package.manifest.tiers)
     tables = {entry["name"]: unpacked(files, entry) for entry in told["tiers"]["hq"]["tables"]}
-    expected = initialisers(package.tables["hq"])
+    expected = initialisers(package.tables["hq"], package.manifest.tiers["hq"].rules)
     assert tables.keys() == expected.keys()
     for name, array in expected.items():
         assert tables[name].dtype == array.dtype

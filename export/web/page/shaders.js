@@ -10,19 +10,21 @@ function constants({ rules, layout, constants: fixed }) {
   const float = (value) => (Number.isInteger(value) ? `${value}.0` : `${value}`);
   const vec3 = (values) => `vec3(${values.map(float).join(", ")})`;
   const ivec3 = (values) => `ivec3(${values.join(", ")})`;
-  const perNode = layout.skin_step_m.map((step) => 2 / step); // nodes lie half a step apart
-  const { samples: _, ...others } = rules; // a uniform
+  const parts = rules.nodes_per_step; // of a step of the skin
+  const perNode = layout.skin_step_m.map((step) => parts / step);
+  const { samples, ...others } = rules; // how many there are is a uniform
   const lines = Object.entries(others).map(([name, value]) =>
     Number.isInteger(value) && WHOLE.has(name)
       ? `const int ${name} = ${value};`
       : `const float ${name} = ${float(value)};`);
   return `
     ${lines.join("\n    ")}
+    const float usual_samples = ${float(samples)};
     const ivec3 brick_counts = ${ivec3(layout.brick_counts)};
     const vec3 brick_low = ${vec3(layout.brick_low)};
     const float voxel_m = ${float(layout.voxel_m)};
     const float spacing_m = ${float(layout.surfel_spacing_m)};
-    const ivec3 node_counts = ${ivec3(layout.skin_counts.map((count) => 2 * count - 1))};
+    const ivec3 node_counts = ${ivec3(layout.skin_counts.map((count) => parts * (count - 1) + 1))};
     const vec3 node_low = ${vec3(layout.skin_low)};
     const vec3 nodes_per_m = ${vec3(perNode)};
     const vec3 pelvis = ${vec3(layout.pelvis)};
@@ -95,7 +97,7 @@ vec3 corner_at(ivec3 b, ivec3 step) {
 }
 
 /** The same, linear in tetrahedra: from the lowest corner along the axis of the largest fraction. */
-vec3 carried_in_tetrahedra(vec3 point) {
+vec3 carried_in_tetrahedra(vec3 point, out mat3 derivative) {
   vec3 f;
   ivec3 b = cell_of(point, f);
   bool xy = f.x > f.y, xz = f.x > f.z, yz = f.y > f.z;
@@ -103,8 +105,13 @@ vec3 carried_in_tetrahedra(vec3 point) {
   ivec3 two = xy ? (yz ? ivec3(1, 1, 0) : ivec3(1, 0, 1)) : (xz ? ivec3(1, 1, 0) : ivec3(0, 1, 1));
   float largest = max(f.x, max(f.y, f.z)), smallest = min(f.x, min(f.y, f.z));
   float middle = (f.x + f.y + f.z) - largest - smallest;
-  return corner_at(b, ivec3(0)) * (1.0 - largest) + corner_at(b, first) * (largest - middle)
-    + corner_at(b, two) * (middle - smallest) + corner_at(b, ivec3(1)) * smallest;
+  vec3 c0 = corner_at(b, ivec3(0)), c1 = corner_at(b, first), c2 = corner_at(b, two), c3 = corner_at(b, ivec3(1));
+  vec3 along[3] = vec3[3](c1 - c0, c2 - c1, c3 - c2);
+  ivec3 order = first + 2 * (two - first) + 3 * (ivec3(1) - two); // which edge is along x, y, z
+  derivative[0] = along[order.x - 1] * nodes_per_m.x;
+  derivative[1] = along[order.y - 1] * nodes_per_m.y;
+  derivative[2] = along[order.z - 1] * nodes_per_m.z;
+  return c0 * (1.0 - largest) + c1 * (largest - middle) + c2 * (middle - smallest) + c3 * smallest;
 }
 
 bool sound(float volume) { return volume > 1.0 / stretch && volume < stretch; }
@@ -135,11 +142,11 @@ uniform sampler2D surfel_place; // and thickness
 uniform sampler2D surfel_normal;
 uniform float near; // where the depth window begins
 
-struct Seen { vec3 camera; vec2 uv; bool seen; };
+struct Seen { vec3 camera; vec2 uv; bool seen; mat3 derivative; };
 
 Seen project(int surfel) {
   Seen s;
-  s.camera = carried_in_tetrahedra(texelFetch(surfel_place, at(surfel), 0).xyz);
+  s.camera = carried_in_tetrahedra(texelFetch(surfel_place, at(surfel), 0).xyz, s.derivative);
   float depth = s.camera.z;
   s.uv = lens.xy * s.camera.xy / max(depth, nearest_m) + lens.zw;
   float reach = 0.5 * float(largest_footprint_px);
@@ -147,12 +154,9 @@ Seen project(int surfel) {
   return s;
 }
 
-bool faces(int surfel) {
-  mat3 derivative;
-  vec3 camera = carried(texelFetch(surfel_place, at(surfel), 0).xyz, derivative);
-  vec3 from_eye = inverse(derivative) * camera;
-  return sound(determinant(derivative))
-    && dot(texelFetch(surfel_normal, at(surfel), 0).xyz, from_eye) < camera.z * -facing;
+bool faces(int surfel, Seen s) {
+  vec3 from_eye = inverse(s.derivative) * s.camera;
+  return dot(texelFetch(surfel_normal, at(surfel), 0).xyz, from_eye) < s.camera.z * -facing;
 }
 `;
 
@@ -187,7 +191,7 @@ void main() {
   float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
   key = (int(code) << SURFEL_BITS) | gl_VertexID;
 #ifdef BEHIND
-  deep_enough = faces(gl_VertexID) ? depth : 0.0;
+  deep_enough = faces(gl_VertexID, s) ? depth : 0.0;
 #else
   deep_enough = 0.0;
 #endif
@@ -266,7 +270,8 @@ vec4 sampled(vec3 point, vec3 direction, float stride, float light, int count) {
 vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction) {
   float place = begin, light = 1.0;
   vec3 color = vec3(0.0);
-  for (int turn = 0; turn < blocks; turn++) {
+  int scale = int(ceil(samples / usual_samples)), most = blocks * scale;
+  for (int turn = 0; turn < most; turn++) {
     if (turn > 0) {
       mat3 derivative;
       vec3 off = place * ray - carried(point, derivative);
@@ -277,8 +282,8 @@ vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction) {
         direction = back * ray;
       }
     }
-    float longest = span_m / samples * exp2(max(float(turn + 1 - steady), 0.0));
-    if (turn > 0 && turn == blocks - 1) longest = longest_m;
+    float longest = span_m / samples * exp2(max(float(turn + 1 - steady * scale), 0.0));
+    if (turn > 0 && turn == most - 1) longest = longest_m;
     float stride = min((end - place) / float(block), longest);
     vec4 found = sampled(point, direction, stride, light, block);
     color += found.rgb;
@@ -321,7 +326,7 @@ Entry entry_of(int surfel, vec3 ray) {
   float lead = min(lead_m / cosine, most_lead_m);
   float sine = 1.0 - falling * falling / max(dot(e.direction, e.direction), 1e-12);
   e.begin = e.enter - lead;
-  e.end = e.begin + min(table.w * (sine * grazing + 1.0) / cosine + lead, longest_m);
+  e.end = e.begin + min(table.w * min((sine * grazing + 1.0) / cosine, lengthened) + lead, longest_m);
   return e;
 }
 
