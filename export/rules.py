@@ -30,8 +30,8 @@ class DrawingRules:
         steepest: Least cosine between ray and normal that lengthens a segment.
         lengthened: A segment is at most so many times as long as the hull is thick there.
         longest_m: Longest segment, metres.
-        stretch: Where the derivative's determinant is outside of (1/stretch, stretch), surfels are
-            not drawn and paths not corrected.
+        stretch: Where the derivative's determinant is outside of (1/stretch, stretch), the skin is
+            folded: surfels are looked at along their normals, and paths not corrected.
         hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
             filled.
         gap_m: Surfels of the second layer lie at least this far behind the first's.

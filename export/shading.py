@@ -73,14 +73,18 @@ def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | No
     place = Place(rows=taken(place.rows, surfel), fraction=taken(place.fraction, surfel))
     camera, derivative = carried(scene, hull.posed, place)
     inverse = inverse_of(scene, derivative, adjugate(derivative))
-    direction = inverse.applied(ray)
+    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], surfel)
+    # where the skin is folded, the hull is looked at from straight above
+    above = [-n for n in normal]
+    seen_along = zip(inverse.applied(ray), above, strict=True)
+    direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
     along = dot(camera, ray)
     beside = inverse.applied([along * r - c for r, c in zip(ray, camera, strict=True)])
-    enter, begin, end = _extent(scene, surfel, direction, beside, along)
+    thickness = scene.columns["thickness"].take(surfel)
+    enter, begin, end = _extent(scene, normal, thickness, direction, beside, along)
     canonical = taken([scene.columns[f"position_{letter}"] for letter in "xyz"], surfel)
     if before is not None:
         begin = _after(scene, before, canonical, camera, begin, end)
-    end = graph.where(inverse.trusted, end, begin)  # a folded skin shows nothing
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = Segment(ray=ray, begin=begin, end=end, canonical=start, direction=direction)
@@ -102,7 +106,12 @@ def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | No
 
 
 def _extent(
-    scene: Scene, surfel: Value, direction: Vector, beside: Vector, along: Value
+    scene: Scene,
+    normal: Vector,
+    thickness: Value,
+    direction: Vector,
+    beside: Vector,
+    along: Value,
 ) -> tuple[Value, Value, Value]:
     """Where rays enter the hull's tangent plane, and from where to where they are followed.
 
@@ -110,8 +119,6 @@ def _extent(
     `along` how far that is along the ray.
     """
     graph, rules = scene.graph, scene.rules
-    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], surfel)
-    thickness = scene.columns["thickness"].take(surfel)
     falling = dot(normal, direction)
     shallow = -0.5 * rules.steepest
     hit = -dot(normal, beside) / falling.minimum(shallow)

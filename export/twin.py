@@ -203,11 +203,12 @@ def _shade(
 
     inverse, sound = posed.inverse[surfel], posed.sound[surfel]
     along = (posed.camera[surfel] * ray).sum(axis=1)
-    direction = np.einsum("nij,nj->ni", inverse, ray)
+    normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
+    # where the skin is folded, the hull is looked at from straight above
+    direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
     nearest = ray * along[:, None] - posed.camera[surfel]
     beside = np.einsum("nij,nj->ni", inverse, nearest)  # of the surfel, where the ray is closest
-    normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
-
+    beside = np.where(sound[:, None], beside, np.float32(0.0))
     falling = (normal * direction).sum(axis=1)
     shallow = np.float32(-0.5 * rules.steepest)
     hit = -(normal * beside).sum(axis=1) / np.minimum(falling, shallow)
@@ -225,11 +226,10 @@ def _shade(
         one_sheet = apart < in_camera * rules.same_share + rules.same_m
         later = np.minimum(np.maximum(begin, before.end), end)
         begin = np.where(one_sheet, later, begin)
-    end = np.where(sound, end, begin)  # a folded skin shows nothing
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = Rays(ray, begin, end, start, direction)
     if before is None:
         colors = march(tables.bricks, rules, posed.nodes, rays, shot.samples)
     else:
         colors = sampled(tables.bricks, rays, np.ones(len(ray)), rules.second_block, np.inf).colors
-    return _Seen(colors=colors, depth=np.where(sound, enter, along) * ray[:, 2], end=end)
+    return _Seen(colors=colors, depth=enter * ray[:, 2], end=end)

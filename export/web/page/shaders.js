@@ -317,8 +317,8 @@ Entry entry_of(int surfel, vec3 ray) {
   mat3 back = e.there ? inverse(derivative) : mat3(0.0);
   e.along = dot(e.camera, ray);
   e.beside = back * (e.along * ray - e.camera);
-  e.direction = back * ray;
   vec3 normal = texelFetch(surfel_normal, at(surfel), 0).xyz;
+  e.direction = e.there ? back * ray : -normal; // a folded hull is looked at from straight above
   float falling = dot(normal, e.direction), shallow = -0.5 * steepest;
   float hit = -dot(normal, e.beside) / min(falling, shallow);
   e.enter = e.along + clamp(falling < shallow ? hit : 0.0, -slack_m, slack_m);
@@ -351,7 +351,7 @@ void main() {
   int surfel = key & SURFEL_MASK;
   vec3 ray = ray_of(pixel);
   Entry e = entry_of(surfel, ray);
-  if (e.there) color = march(ray, e.begin, e.end, start_of(e), e.direction); // else a folded skin
+  color = march(ray, e.begin, e.end, start_of(e), e.direction);
   bool wanted = layers > 1 && 1.0 - color.a > transmitted;
   extent = vec4(wanted ? e.enter * ray.z + gap_m : 1e6, e.end, float(surfel), 1.0);
 }`;
