@@ -22,7 +22,7 @@ from preprocess.capture_folder import CapturePaths, find_capture, find_live_capt
 from preprocess.doctor.claim import Claim
 from preprocess.focal import focal_from_masks
 from preprocess.live import LiveParts
-from preprocess.masks import Masks, open_masks
+from preprocess.masks import Masks, masks_in_poses, open_masks
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
@@ -123,7 +123,9 @@ class Recording:
         motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
         masks = None
         if paths.masks is not None:
-            masks = open_masks(paths.masks, invert=wanted.mask_invert)
+            masks = open_masks(paths.masks, invert=wanted.mask_invert, person=wanted.person)
+        elif named is None and not source.has_alpha:
+            masks = masks_in_poses(paths.poses, source, person=wanted.person)
         if paths.cameras is not None:
             cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source), source)
         else:

@@ -17,6 +17,9 @@ from capture.video import VideoFile
 MAX_PIXELS = 1 << 28
 """Of one run-length coded mask."""
 
+MOST_FRAMES = 1_000_000
+"""That a file of tracks may name."""
+
 BLACK, WHITE = 16.0, 239.0
 """Compressed videos ring around edges: what is darker is 0, what is brighter 1."""
 
@@ -66,13 +69,19 @@ class _Film:
         return self._last
 
 
-def coded_masks(content: Any, path: Path) -> tuple[int, Read] | None:
+def coded_masks(content: Any, path: Path, person: str | None = None) -> tuple[int, Read] | None:
     """How many run-length coded masks there are, and what decodes one; None if there are none.
 
     A list with one a frame (TRAM's masks.npy; an empty entry is an empty mask), a dictionary of
-    them by file names, or a COCO file with `images` and `annotations`. Several in a frame are one.
+    them by file names, a COCO file with `images` and `annotations`, or the tracks of PHALP. Several
+    in a frame are one, but of PHALP's people one is taken.
+
+    Args:
+        content: What the file holds.
+        path: For messages.
+        person: Whose, in a file of tracks; None for who was seen most.
     """
-    frames = _by_frame(content)
+    frames = _of_one_person(content, person) if is_tracked(content) else _by_frame(content)
     if not frames or not any(frames):
         return None
     first = next(codes for codes in frames if codes)[0]
@@ -85,6 +94,31 @@ def coded_masks(content: Any, path: Path) -> tuple[int, Read] | None:
             raise BadInput(f"Mask {row} in {path} is no run-length code ({cause}).") from cause
 
     return len(frames), read
+
+
+def is_tracked(content: Any) -> bool:
+    """Whether these are PHALP's tracks with masks: {picture: {tid, mask, …}}, lists in parallel."""
+    if not isinstance(content, dict) or not content:
+        return False
+    return all(isinstance(one, dict) and {"tid", "mask"} <= one.keys() for one in content.values())
+
+
+def _of_one_person(content: Any, person: str | None) -> list[list[dict[str, Any]]]:
+    """The masks of one track; a frame in which it was only guessed has none."""
+    seen: dict[str, dict[int, Any]] = {}
+    last = -1
+    for place, frame in enumerate(content.values()):
+        number = int(frame.get("time", place))
+        last = max(last, number)
+        guessed = frame.get("tracked_time", [0] * len(frame["tid"]))
+        for who, mask, lost in zip(frame["tid"], frame["mask"], guessed, strict=True):
+            if not lost:
+                seen.setdefault(str(int(who)), {})[number] = mask
+    if not 0 <= last < MOST_FRAMES:
+        return []
+    most = max(seen, key=lambda who: len(seen[who]), default="")
+    rows = seen.get(most if person is None else person, {})
+    return [_codes(rows.get(number)) for number in range(last + 1)]
 
 
 def _by_frame(content: Any) -> list[list[dict[str, Any]]] | None:

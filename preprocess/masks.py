@@ -10,10 +10,13 @@ from PIL import Image
 
 from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
-from capture.source import VIDEO_SUFFIXES
-from preprocess.mask_files import coded_masks, video_of_masks
+from capture.source import VIDEO_SUFFIXES, Source
+from preprocess.mask_files import coded_masks, is_tracked, video_of_masks
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content
+
+NOT_TRACKS = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+"""What a file raises that is nearly one of tracks."""
 
 CODED = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
 """Endings of files that may hold run-length codes."""
@@ -79,12 +82,13 @@ class Masks:
         return np.float32(1.0) - stored if self.inverted else stored
 
 
-def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
+def open_masks(path: Path, *, invert: bool | None = None, person: str | None = None) -> Masks:
     """Opens a folder of pictures or .npy files, a video, arrays (N, H, W), or run-length codes.
 
     Args:
         path: The folder or the file.
         invert: Whether the person is dark; None finds out from a few masks.
+        person: Whose masks, in a file of several people's tracks; None for who was seen most.
 
     Raises:
         BadInput: If there are none, if they are all empty, or if it cannot be seen which side is
@@ -92,7 +96,7 @@ def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
     """
     if not path.exists():
         raise BadInput(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
-    count, read = _folder_of_masks(path) if path.is_dir() else _file_of_masks(path)
+    count, read = _folder_of_masks(path) if path.is_dir() else _file_of_masks(path, person)
     return Masks(path, count, read, invert=invert)
 
 
@@ -115,12 +119,47 @@ def _folder_of_masks(path: Path) -> tuple[int, Reader]:
     return len(files), lambda row: read_mask(files[row])
 
 
-def _file_of_masks(path: Path) -> tuple[int, Reader]:
+def masks_in_poses(path: Path, source: Source, *, person: str | None = None) -> Masks | None:
+    """The masks that a tracker keeps beside its poses (PHALP), if they fit the video; else None.
+
+    Args:
+        path: The pose file.
+        source: The video.
+        person: Whose; None for who was seen most.
+    """
+    if path.suffix not in (".pkl", ".pickle") or not is_tracked(content := read_content(path)):
+        return None
+    try:
+        coded = coded_masks(content, path, person)
+        if coded is None or coded[0] != source.frames_in_file:
+            return None
+        count, decode = coded
+        if not any(decode(row).any() for row in range(count)):
+            return None
+        masks = Masks(path, count, lambda row: _as_alpha(decode(row), path), invert=False)
+    except (BadInput, *NOT_TRACKS):
+        return None
+    return masks if same_shape(masks.size_px, source.size_px) else None
+
+
+def _coded(path: Path, person: str | None) -> tuple[int, Reader] | None:
+    """What `coded_masks` finds in a file.
+
+    Raises:
+        BadInput: If it nearly is such a file.
+    """
+    try:
+        return coded_masks(read_content(path), path, person)
+    except NOT_TRACKS as cause:
+        raise BadInput(f"{path} holds tracks whose masks cannot be read ({cause}).") from cause
+
+
+def _file_of_masks(path: Path, person: str | None) -> tuple[int, Reader]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         count, read = video_of_masks(path)
         return count, lambda row: _as_alpha(read(row), path)
     if path.suffix in CODED and not (path.suffix == ".npy" and _is_plain(path)):
-        coded = coded_masks(read_content(path), path)
+        coded = _coded(path, person)
         if coded is None:
             raise BadInput(f"{path} holds no masks: no run-length codes, one or more a frame.")
         count, decode = coded

@@ -1,6 +1,7 @@
 """Masks in every container and polarity."""
 
 import json
+import pickle
 
 import cv2
 import numpy as np
@@ -11,8 +12,9 @@ from PIL import Image
 
 from capture.errors import BadInput
 from capture.quiet import silence_opencv
+from capture.source import open_source
 from preprocess.mask_files import decoded
-from preprocess.masks import open_masks, same_shape
+from preprocess.masks import masks_in_poses, open_masks, same_shape
 
 SIZE = (30, 40)
 
@@ -227,6 +229,58 @@ def test_coded_masks_are_read_from_whatever_holds_them(tmp_path, container):
     for row in (11, 0, 5):
         expected = hard[row] if row or container != "several" else np.zeros((40, 30))
         np.testing.assert_array_equal(masks.alpha(row, SIZE), expected)
+
+
+def tracks(count: int = 12) -> tuple[dict, list[np.ndarray]]:
+    """PHALP's file: person 7 in all frames but two, 2 in half of them; and the masks of 7."""
+    content, hard = {}, []
+    for row in range(count):
+        mask, other = ((person(row + shift) > 200).astype(np.uint8) for shift in (0, 5))
+        codes = [{"size": [40, 30], "counts": text_of(each)} for each in (other, mask)]
+        content[f"img/{row:06d}.jpg"] = {
+            "time": row, "tid": [2, 7], "mask": codes,
+            "tracked_time": [row % 2, 3 if row in (4, 5) else 0],
+        }  # fmt: skip
+        hard.append(np.zeros_like(mask) if row in (4, 5) else mask)
+    return content, hard
+
+
+def test_the_masks_of_one_of_phalps_people_are_read_from_its_tracks(tmp_path):
+    content, hard = tracks()
+    path = tmp_path / "demo.pkl"
+    path.write_bytes(pickle.dumps(content))
+    masks = open_masks(path)
+    assert masks.count == 12
+    for row in range(12):
+        np.testing.assert_array_equal(masks.alpha(row, SIZE), hard[row])
+    second = open_masks(path, person="2").alpha(2, SIZE)
+    np.testing.assert_array_equal(second, person(7) > 200)
+    assert not open_masks(path, person="2").alpha(3, SIZE).any()
+    with pytest.raises(BadInput):
+        open_masks(path, person="9")
+
+
+def test_masks_beside_poses_are_taken_only_where_they_fit_the_video(tmp_path):
+    content, hard = tracks()
+    path = tmp_path / "demo.pkl"
+    path.write_bytes(pickle.dumps(content))
+
+    def film(frames: int = 12, size_px: tuple[int, int] = SIZE):
+        folder = tmp_path / f"{frames}_{size_px[0]}"
+        folder.mkdir(exist_ok=True)
+        for row in range(frames):
+            Image.new("RGB", size_px).save(folder / f"{row}.png")
+        return open_source(folder)
+
+    masks = masks_in_poses(path, film())
+    assert masks is not None
+    np.testing.assert_array_equal(masks.alpha(3, SIZE), hard[3])
+    assert masks_in_poses(path, film(frames=13)) is None
+    assert masks_in_poses(path, film(size_px=(64, 64))) is None
+    spoilt = {name: {**frame, "mask": [{"size": [40, 30], "counts": b"abc"}] * 2}
+              for name, frame in content.items()}  # fmt: skip
+    path.write_bytes(pickle.dumps(spoilt))
+    assert masks_in_poses(path, film()) is None
 
 
 @pytest.mark.parametrize(
