@@ -8,7 +8,7 @@ from typing import Any
 
 from apps.recording import RecordingPaths
 
-VERSION = 1
+VERSION = 3
 """Of the method: other numbers would come out of the same pictures."""
 
 

@@ -13,7 +13,9 @@ from capture.frame import Frame
 from capture.images import list_images
 from capture.source import Source
 
-MOST_KEYS = 60
+MOST_KEYS, ENOUGH_KEYS, APART = 60, 24, 4
+"""Key frames at most; how many are always chosen, if there are so many frames; and of more only one
+in so many: frames between are placed as well as key frames, for a tenth of the time."""
 LEAST_KEYS = 8
 WORK_PX = 960
 """Longer side of the pictures in which features are looked for."""
@@ -56,7 +58,7 @@ def grey_of(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height
 def choose(
     source: Source, person_in: PersonIn, told: Callable[[float], None], most: int = MOST_KEYS
 ) -> Iterator[KeyFrame]:
-    """The sharpest frame of each of at most `most` equal stretches, in order.
+    """The sharpest frame of each of some equal stretches of the video, in order.
 
     Sharpness is the variance of the picture's Laplacian.
 
@@ -67,7 +69,8 @@ def choose(
         most: Key frames at most.
     """
     total = source.frame_count or source.frames_in_file
-    stretches, size_px = min(most, total), work_size(source.size_px)
+    stretches = min(most, total, max(ENOUGH_KEYS, total // APART))
+    size_px = work_size(source.size_px)
     best: tuple[float, KeyFrame] | None = None
     at = 0
     for frame in source.frames():

@@ -28,6 +28,8 @@ MOST_MODELS, MOST_BEGINNINGS = 2, 50
 """How often the incremental mapper begins anew, and with how many pairs at most: pictures without
 parallax would keep it busy for minutes."""
 LEAST_MATCHES = 15
+SAME_FOCAL = 0.01
+"""A stated focal length as near as this to the solved one is the true one."""
 AT_ONCE = 4
 """Pictures that each thread looks at before progress is told."""
 
@@ -138,7 +140,8 @@ def map_globally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | 
     options.mapper.global_positioning.use_gpu = False
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     told(0.0)
-    return _largest(colmap.global_mapping(bench.database, bench.images, out, options=options))
+    found = colmap.global_mapping(bench.database, bench.images, out, options=options)
+    return _largest(found, bench.focal_px)
 
 
 def map_incrementally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | None:
@@ -156,11 +159,10 @@ def map_incrementally(bench: Workbench, out: Path, seed: int, told: Told) -> Mod
         told(min(done / total, 1.0))
 
     told(0.0)
-    return _largest(
-        colmap.incremental_mapping(
-            bench.database, bench.images, out, options=options, next_image_callback=next_image
-        )
+    found = colmap.incremental_mapping(
+        bench.database, bench.images, out, options=options, next_image_callback=next_image
     )
+    return _largest(found, bench.focal_px)
 
 
 def _colmap() -> Any:
@@ -182,12 +184,26 @@ def _size(bench: Workbench) -> tuple[int, int]:
         return picture.size
 
 
-def _largest(models: dict[int, Any]) -> Model | None:
-    """The model with most cameras, in plain numbers."""
+def _largest(models: dict[int, Any], stated_px: float | None) -> Model | None:
+    """The model with most cameras, in plain numbers; with the stated lens, if that may be."""
     if not models:
         return None
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    lens = next(iter(best.cameras.values()))
+    if stated_px is not None and abs(lens.params[0] / stated_px - 1.0) < SAME_FOCAL:
+        _settle(best, stated_px)
     return _plain(best)
+
+
+def _settle(found: Any, focal_px: float) -> None:
+    """Moves cameras and points until all is seen by a lens of a known focal length."""
+    colmap = _colmap()
+    for lens in found.cameras.values():
+        lens.params = [focal_px, *lens.params[1:]]
+    options = colmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.print_summary = False, False
+    options.ceres.use_gpu, options.ceres.solver_options.num_threads = False, 1
+    colmap.bundle_adjustment(found, options)
 
 
 def _plain(found: Any) -> Model:

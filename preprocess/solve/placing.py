@@ -15,7 +15,7 @@ from preprocess.kinematics import rotation_matrices
 from preprocess.pose import Motion
 from preprocess.poses.place import moved, placed
 from preprocess.solve.floor import Floor, find_floor, up_of_cameras
-from preprocess.solve.scale import Scale, Standing, metric_scale
+from preprocess.solve.scale import SOLE_M, Scale, Standing, metric_scale
 from preprocess.solve.solver import KEY, MISSING, PLACED, Solved
 from preprocess.solve.world import metric_cameras
 
@@ -148,7 +148,7 @@ def _up(
 def _under_the_soles(standing: Standing, scale: float, up: Float[np.ndarray, "3"]) -> Floor:
     """The level plane on which the lowest sole of most frames stands."""
     turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
-    lowest = (turned @ up).min(axis=1) / scale + standing.centers @ up
+    lowest = ((turned @ up).min(axis=1) - SOLE_M) / scale + standing.centers @ up
     return Floor(normal=up, offset=-float(np.median(lowest)), points=0)
 
 

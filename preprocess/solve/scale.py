@@ -3,8 +3,8 @@
 A camera-frame point q (metres) is X = R_iᵀ q + s c_i in the world, with s metres per unit of the
 solved world: linear in s, so that each cue is a row a s = b of one least-squares problem.
 
-* **ground**: the lowest sole stands on the floor, s h_i = -min_j n · (R_iᵀ f_ij), h_i being the
-  camera's height above the floor. One value a frame; half of them agree, or the cue is no cue.
+* **ground**: the lowest foot stands on the floor, s h_i = sole - min_j n · (R_iᵀ f_ij), h_i being
+  the camera's height above the floor. One value a frame; half of them agree, or it is no cue.
 * **in place**: the person stays about where it is: s (c_i - c̄) = -(q_i - q̄), q_i = R_iᵀ p_i.
 
 One scale for all frames: with one a frame the body would jitter in depth.
@@ -29,6 +29,8 @@ MOST_SPREAD = 0.25
 MOST_WANDER_M = 0.35
 """How far the person may be from its place, r.m.s., if only that tells the scale."""
 LEAST_FRAMES = 5
+SOLE_M = 0.01
+"""What is under a foot: nothing, or a shoe of two centimetres or three. Bodies are barefoot."""
 LEAST_PATH_M = 0.3
 """Of the camera's path, for the second cue to say anything."""
 
@@ -82,7 +84,7 @@ def metric_scale(standing: Standing, floor: Floor | None) -> Scale:
     if floor is not None and floor.points and len(standing.centers) >= LEAST_FRAMES:
         heights = floor.heights(standing.centers)
         turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
-        contact = -(turned @ floor.normal).min(axis=1)
+        contact = SOLE_M - (turned @ floor.normal).min(axis=1)
     ground, spread = _by_ground(heights, contact)
     moves, stays = _in_place(standing)
     place, wander = _by_place(moves, stays)

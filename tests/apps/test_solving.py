@@ -85,6 +85,8 @@ def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
             for recording in (still, found)
         )
         np.testing.assert_allclose(before, after, atol=1.5)  # the focal length was solved, too
+    lenses = [each.cameras[0].focal_px[0] for each in (still, found)]
+    assert lenses[1] == pytest.approx(lenses[0], rel=1e-9)  # stated, and near what was solved
     assert found.solved["verdict"] == "solved"
     assert found.solved["frames"]["key"] == FRAMES
     assert set(found.solved["scale"]["cues"]) <= {"ground", "in place"}
@@ -104,6 +106,16 @@ def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
     one, other = (joined(recording, solved_of(solved_run)) for recording in (plain, taller))
     ratio = other.solved["scale"]["metres_per_unit"] / one.solved["scale"]["metres_per_unit"]
     assert ratio == pytest.approx(1.1, rel=1e-3)
+
+
+def test_a_camera_that_stood_stays_where_it_is(walkaround, solved_run):
+    recording = Recording.open(job_of(walkaround).paths)
+    standing = replace(solved_of(solved_run), still=True, moved=0.001, model=None, gates=())
+    found = joined(recording, standing)
+    assert found.cameras is recording.cameras
+    assert found.motion is recording.motion
+    assert found.solved["verdict"] == "still"
+    assert "stood still" in found.notes[-1]
 
 
 def test_the_same_job_is_not_solved_twice(walkaround, solved_run, monkeypatch):

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from preprocess.solve.floor import Floor
-from preprocess.solve.scale import Standing, metric_scale
+from preprocess.solve.scale import SOLE_M, Standing, metric_scale
 
 TRUE = 0.4
 """Metres per unit of the solved world."""
 FLOOR = Floor(normal=np.array([0.0, 1.0, 0.0]), offset=0.0, points=500)
 
 
-def filmed(cameras, *, at=None, depth=None, soles_m=0.0) -> Standing:
+def filmed(cameras, *, at=None, depth=None, soles_m=SOLE_M) -> Standing:
     """A person as a tracker tells it, in a solved world whose unit is 0.4 m.
 
     Args:
@@ -79,7 +79,7 @@ def test_nothing_tells_the_size_is_said(cameras, rng):
 
 def test_a_common_error_of_depth_is_the_error_of_the_scale(cameras):
     biased = metric_scale(filmed(cameras, depth=np.full(len(cameras), 1.02)), FLOOR)
-    assert biased.metres == pytest.approx(1.02 * TRUE, rel=1e-9)
+    assert biased.metres == pytest.approx(1.02 * TRUE, rel=1e-3)  # soles do not grow
 
 
 def test_errors_of_single_frames_average_out(cameras):
