@@ -17,6 +17,8 @@ from preprocess.pose import Lens, Motion
 
 DEFAULT_FOCAL = 0.85
 """Focal length of a phone's main camera in video, in units of the picture's longer side."""
+ASSUMED = f"{DEFAULT_FOCAL} x longer side"
+"""Where a camera comes from of which nothing at all was said."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -200,7 +202,7 @@ def default_cameras(motion: Motion, size_px: tuple[int, int]) -> CameraTrack:
             f" The tracker's own ({motion.lens.share:.1f} times the {motion.lens.of}) is no "
             "camera's; the person's distance was solved anew."
         )
-    return CameraTrack(cameras=(camera,), source=f"{DEFAULT_FOCAL} x longer side", note=note)
+    return CameraTrack(cameras=(camera,), source=ASSUMED, note=note)
 
 
 def tracker_intrinsic(motion: Motion, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"] | None:

@@ -6,7 +6,8 @@ from typing import Any
 from apps.recording import Recording
 from apps.run_folder import RunFolder
 from apps.whole import whole_file
-from preprocess.camera_file import write_cameras
+from capture.camera import Camera
+from preprocess.camera_file import ASSUMED, write_cameras
 from preprocess.pose_file import write_motion
 from preprocess.solve.placing import Placed, place_in_world, told
 from preprocess.solve.solver import Solved
@@ -31,7 +32,7 @@ def joined(recording: Recording, solved: Solved) -> Recording:
             recording, notes=(*recording.notes, note), solved=told(solved, None, recording.source)
         )
     place = place_in_world(
-        solved, recording.motion, recording.cameras[0], recording.shaped, recording.source
+        solved, recording.motion, _seen_by(recording), recording.shaped, recording.source
     )
     found = told(solved, place, recording.source)
     return replace(
@@ -49,6 +50,13 @@ def write_solved(recording: Recording, run: RunFolder) -> None:
         write_cameras(path, recording.cameras)
     with whole_file(run.poses) as path:
         write_motion(path, replace(recording.motion, intrinsic=None, camera_from_world=None))
+
+
+def _seen_by(recording: Recording) -> Camera | None:
+    """The camera that the poses were made for; None if its lens was only assumed."""
+    motion, camera = recording.motion, recording.cameras[0]
+    stated = motion.intrinsic is not None or motion.lens is not None
+    return camera if stated or recording.cameras.source != ASSUMED else None
 
 
 def _in_words(found: dict[str, Any], place: Placed) -> str:

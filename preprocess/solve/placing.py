@@ -43,14 +43,15 @@ class Placed:
 
 
 def place_in_world(
-    solved: Solved, motion: Motion, seen_by: Camera, shaped: ShapedBody, source: Source
+    solved: Solved, motion: Motion, seen_by: Camera | None, shaped: ShapedBody, source: Source
 ) -> Placed:
     """Cameras in metres and the poses in their world.
 
     Args:
         solved: Cameras of unknown size.
         motion: Each row in the camera of its frame, metres.
-        seen_by: The camera that the poses were made for, at its world's origin.
+        seen_by: The camera that the poses were made for, at its world's origin; None if nobody
+            knows, and then they are taken to be right for the solved lens.
         shaped: The person.
         source: The frames.
 
@@ -58,8 +59,9 @@ def place_in_world(
         BadInput: If nothing tells the size of the world.
     """
     lens = solved.lens(source.size_px)
-    motion = refocused_to(motion, seen_by, lens, shaped)
-    frames = frames_of(motion, seen_by, source)
+    if seen_by is not None:
+        motion = refocused_to(motion, seen_by, lens, shaped)
+    frames = frames_of(motion, lens, source)
     usable = motion.valid & (solved.marks[frames] >= PLACED)
     standing = _standing(solved, motion, frames, np.flatnonzero(usable), shaped)
     assert solved.model is not None

@@ -92,6 +92,26 @@ def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
     assert set(found.solved["scale"]["cues"]) <= {"ground", "in place"}
 
 
+def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
+    walkaround, solved_run, changed, tmp_path
+):
+    poses = tmp_path / "poses.npz"
+    poses.write_bytes((walkaround / "poses.npz").read_bytes())
+    changed(poses, K=None)
+    stated, silent = (
+        Recording.open(replace(job_of(walkaround).paths, **parts))
+        for parts in ({}, {"poses": poses, "masks": Path("segmenter:grabcut")})
+    )
+    assert silent.cameras[0].focal_px[0] > 1.2 * stated.cameras[0].focal_px[0]  # a phone's
+    one, other = (joined(each, solved_of(solved_run)) for each in (stated, silent))
+    for row in (0, 9):
+        seen = [
+            each.cameras[row].project(each.shaped.with_pose(each.motion[row]).joints())
+            for each in (one, other)
+        ]
+        np.testing.assert_allclose(*seen, atol=0.5)
+
+
 def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
     plain = Recording.open(job_of(walkaround).paths)
     tall = height_of(plain.shaped)
