@@ -50,16 +50,25 @@ def test_a_hollow_ball_has_no_surfels_inside():
     assert np.linalg.norm(hull.positions, axis=1).min() > RADIUS_M - 0.006
 
 
-def test_small_floaters_are_left_out_and_large_parts_are_kept():
+def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
+    """A floater of 8 mm beside a ball of 15 cm, and a part as large as a fist."""
+    floater, part = np.full(3, 0.14), np.full(3, -0.14)
+
     def extra(points):
-        small = np.linalg.norm(points - [0.11, 0.11, 0.11], axis=-1) < 0.010
-        large = np.linalg.norm(points - np.full(3, -0.09), axis=-1) < 0.035
+        small = np.linalg.norm(points - floater, axis=-1) < 0.008
+        large = np.linalg.norm(points - part, axis=-1) < 0.035
         return np.where(small | large, 300.0, 0.0)
 
-    lattice = ball_lattice(lambda r: np.where(r < RADIUS_M, 300.0, 0.0), extra=extra)
-    hull = find_hull(lattice, level=20.0, spacing_m=0.005)
-    assert np.linalg.norm(hull.positions - [0.11, 0.11, 0.11], axis=1).min() > 0.05
-    assert np.linalg.norm(hull.positions - np.full(3, -0.09), axis=1).min() < 0.035
+    lattice = ball_lattice(lambda r: np.where(r < 0.15, 300.0, 0.0), size=97, extra=extra)
+
+    def nearest(place):
+        hull = find_hull(lattice, level=20.0, spacing_m=0.005)
+        return np.linalg.norm(hull.positions - place, axis=1).min()
+
+    assert nearest(floater) > 0.05
+    assert nearest(part) < 0.04
+    monkeypatch.setattr("export.hull.SMALLEST_PART", 0.0)
+    assert nearest(floater) < 0.02
 
 
 @pytest.mark.parametrize("color", [(10, 200, 30), (255, 255, 255)])
