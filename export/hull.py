@@ -14,8 +14,8 @@ CONTRAST = 16.0
 SMOOTHING_M = 0.004
 """Deviation of the blur before the level is taken: a trained field is never quite smooth."""
 SMALLEST_PART = 0.0002
-"""Parts of less volume than this share of the largest are floaters. At ten times as much a foot that
-a few photographs left in pieces was gone."""
+"""Parts of less volume than this share of the largest are floaters. At ten times as much a foot
+that a few photographs left in pieces was gone."""
 OPAQUE = 7.0
 """Optical depth behind which nothing is seen (0.1 %)."""
 MARGIN_M = 0.004

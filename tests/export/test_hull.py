@@ -67,7 +67,7 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
 
     assert nearest(floater) > 0.05
     assert nearest(part) < 0.04
-    monkeypatch.setattr("export.hull.SMALLEST_PART", 0.0)
+    monkeypatch.setattr("export.hull.SMALLEST_PART", 1e-9)
     assert nearest(floater) < 0.02
 
 
