@@ -51,15 +51,15 @@ def test_a_hollow_ball_has_no_surfels_inside():
 
 
 def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
-    """A floater of 8 mm beside a ball of 15 cm, and a part as large as a fist."""
+    """A floater of 1 cm beside a ball of 18 cm, and a part as large as a fist."""
     floater, part = np.full(3, 0.14), np.full(3, -0.14)
 
     def extra(points):
-        small = np.linalg.norm(points - floater, axis=-1) < 0.008
+        small = np.linalg.norm(points - floater, axis=-1) < 0.010
         large = np.linalg.norm(points - part, axis=-1) < 0.035
         return np.where(small | large, 300.0, 0.0)
 
-    lattice = ball_lattice(lambda r: np.where(r < 0.15, 300.0, 0.0), size=97, extra=extra)
+    lattice = ball_lattice(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
 
     def nearest(place):
         hull = find_hull(lattice, level=20.0, spacing_m=0.005)
