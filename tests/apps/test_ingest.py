@@ -18,7 +18,7 @@ from export.player import Player
 
 KEYS = {
     "": "format command recipe machine frames training held_out held_out_refined curve stream "
-    "package coverage extended",
+    "package coverage extended cameras",
     "machine": "device backend threads",
     "frames": "read used held_out dropped alike not_replayed",
     "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
