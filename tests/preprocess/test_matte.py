@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.matte import softened
+from preprocess.matte import EDGE_PX, softened
 
 
 def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -21,7 +21,7 @@ def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray
 def test_edges_come_nearer_to_the_true_ones_than_hard_and_than_smooth_ones(rng):
     rgb, alpha = drawn(rng)
     hard = alpha > 0.5
-    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), 0.6)
+    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_PX)
     off = [((mask - alpha) ** 2).mean() for mask in (hard, smooth, softened(rgb, hard))]
     assert off[2] < 0.5 * off[1] < 0.5 * off[0]
 
@@ -45,7 +45,7 @@ def test_where_colours_are_alike_the_mask_is_smoothed(rng):
     hard = alpha > 0.5
     soft = softened(grey, hard)
     border = (soft > 0.0) & (soft < 1.0)
-    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), 0.6)
+    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_PX)
     np.testing.assert_allclose(soft[border], smooth[border], atol=1e-6)
 
 
