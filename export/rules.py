@@ -44,7 +44,7 @@ class DrawingRules:
     """
 
     layers: int = 2
-    samples: int = 8
+    samples: int = 10
     span_m: float = 0.05
     block: int = 3
     steady: int = 3
