@@ -58,7 +58,7 @@ def gradients(
             must be found before it can be hard.
         remember: Whose cached densities the samples' raise, if any.
         poses: Whose wrenches take up what pulls the samples, if poses are refined.
-        generator: Of backgrounds and empty points, on the field's device.
+        generator: Of backgrounds, empty points and pairs, on the field's device.
     """
     samples = sampler.samples(batch.rays, cells)
     empty = (

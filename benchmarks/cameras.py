@@ -31,7 +31,7 @@ from preprocess.camera_file import CameraTrack, read_cameras
 from preprocess.doctor.claim import Claim
 from preprocess.pose_file import read_motion
 from preprocess.solve.gates import similarity
-from preprocess.solve.solver import Solved
+from preprocess.solve.solved import Solved
 from preprocess.stature import as_tall, farther, height_of
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01

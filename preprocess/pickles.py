@@ -71,7 +71,9 @@ def guarded(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
             "to .npz."
         ) from None
     except Exception as cause:  # a broken pickle may fail in any way: see the pickle documentation
-        raise BadInput(f"{path} is no readable {kind} ({cause}). Is the file complete?") from cause
+        # a KeyError's text is the byte or name that was not expected, and tells nobody anything
+        why = "it holds something else" if isinstance(cause, KeyError) else cause
+        raise BadInput(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
 
 
 def bounded_bytes(path: Path) -> bytes:

@@ -10,7 +10,7 @@ from capture.camera import Camera
 from preprocess.camera_file import ASSUMED, write_cameras
 from preprocess.pose_file import write_motion
 from preprocess.solve.placing import Placed, place_in_world, told
-from preprocess.solve.solver import Solved
+from preprocess.solve.solved import Solved
 
 
 def joined(recording: Recording, solved: Solved) -> Recording:

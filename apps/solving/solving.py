@@ -17,7 +17,7 @@ from apps.solving.job import SolveJob
 from apps.solving.worker import KEPT, REFUSED, RESULT
 from capture.errors import BadInput
 from preprocess.solve.mapping import check_installed
-from preprocess.solve.solver import Solved
+from preprocess.solve.solved import Solved
 
 SHARES = {
     "key frames": 0.05, "features": 0.4, "matches": 0.1, "global mapping": 0.25,

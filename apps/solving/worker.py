@@ -22,7 +22,8 @@ from capture.frame import Frame
 from preprocess.observe import check_masks, check_motion, own_alpha
 from preprocess.outline import Outline
 from preprocess.solve.keyframes import PersonIn
-from preprocess.solve.solver import Settings, Solved, solve
+from preprocess.solve.solved import Solved
+from preprocess.solve.solver import Settings, solve
 from preprocess.solve.stages import Told
 
 REFUSED = 2

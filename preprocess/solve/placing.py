@@ -16,7 +16,7 @@ from preprocess.pose import Motion
 from preprocess.poses.place import moved, placed
 from preprocess.solve.floor import Floor, find_floor, up_of_cameras
 from preprocess.solve.scale import SOLE_M, Scale, Standing, metric_scale
-from preprocess.solve.solver import KEY, MISSING, PLACED, Solved
+from preprocess.solve.solved import KEY, MISSING, PLACED, Solved
 from preprocess.solve.world import metric_cameras
 
 FEET = (7, 8, 10, 11)

@@ -5,16 +5,13 @@ the frames in between. Two mappings that agree, and points followed from key fra
 that land where the next camera sees them: less is not believed.
 """
 
-import json
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from capture.camera import Camera
 from capture.errors import BadInput
 from capture.source import Source
 from preprocess.cameras.matching import bridged
@@ -31,6 +28,7 @@ from preprocess.solve.keyframes import (
 from preprocess.solve.mapping import Workbench
 from preprocess.solve.model import Model
 from preprocess.solve.resection import Between, place_between
+from preprocess.solve.solved import INTERPOLATED, KEY, MISSING, PLACED, Solved
 from preprocess.solve.stages import Stages, Told
 from preprocess.solve.stillness import Stillness, stillness
 
@@ -46,8 +44,6 @@ LEAST_FRAMES = 0.5
 """Share of the frames that must have a camera in the end."""
 STRAIGHT_PX = 0.3
 """A lens that bends the corners by less is taken for straight."""
-MISSING, INTERPOLATED, PLACED, KEY = range(4)
-"""What a frame's camera is: none, between its neighbours', by known points, or a key frame's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,61 +61,6 @@ class Settings:
     seed: int = 0
     threads: int = 1
     most_keys: int = MOST_KEYS
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Solved:
-    """Cameras in a world of unknown size, or the news that the camera stood still.
-
-    Attributes:
-        still: Whether it did; there is nothing else then.
-        moved: How far the background moved, in longer sides of the picture; NaN if it was lost.
-        gates: What the solution has passed.
-        model: The key frames' cameras and the points; None if it stood still.
-        camera_from_solved: One for every frame of the file.
-        marks: What each of them is: MISSING, INTERPOLATED, PLACED or KEY.
-        keys: How many key frames there were.
-        costs: Of all stages together.
-    """
-
-    still: bool
-    moved: float
-    gates: tuple[Gate, ...]
-    model: Model | None
-    camera_from_solved: Float[np.ndarray, "frames 4 4"]
-    marks: Int[np.ndarray, "frames"]
-    keys: int
-    costs: dict[str, Any]
-
-    def lens(self, size_px: tuple[int, int]) -> Camera:
-        """The lens, for pictures of the frames' size."""
-        assert self.model is not None
-        return self.model.camera(np.eye(4)).resized(size_px)
-
-    def save(self, folder: Path) -> None:
-        """Writes it as `solved.json`, `solved.npz` and `model.npz`."""
-        if self.model is not None:
-            self.model.save(folder / "model.npz")
-        np.savez(
-            folder / "solved.npz", camera_from_solved=self.camera_from_solved, marks=self.marks
-        )
-        content = {
-            "still": self.still, "moved": self.moved, "keys": self.keys, "costs": self.costs,
-            "gates": [asdict(gate) for gate in self.gates],
-        }  # fmt: skip
-        part = folder / "part.solved.json"
-        part.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        part.replace(folder / "solved.json")  # whoever finds it finds the rest
-
-    @classmethod
-    def load(cls, folder: Path) -> "Solved":
-        """What `save` wrote."""
-        content = json.loads((folder / "solved.json").read_text(encoding="utf-8"))
-        with np.load(folder / "solved.npz", allow_pickle=False) as file:
-            cameras, marks = file["camera_from_solved"], file["marks"]
-        gates = tuple(Gate(**gate) for gate in content.pop("gates"))
-        model = None if content["still"] else Model.load(folder / "model.npz")
-        return cls(gates=gates, model=model, camera_from_solved=cameras, marks=marks, **content)
 
 
 def solve(

@@ -24,7 +24,7 @@ from capture.errors import BadInput
 from preprocess.camera_file import read_cameras, write_cameras
 from preprocess.pose_file import read_motion
 from preprocess.solve.gates import similarity
-from preprocess.solve.solver import Solved
+from preprocess.solve.solved import Solved
 from preprocess.stature import height_of
 
 FRAMES = 14

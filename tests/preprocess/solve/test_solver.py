@@ -14,7 +14,8 @@ from capture.source import open_source
 from preprocess.solve import mapping, solver
 from preprocess.solve.gates import similarity
 from preprocess.solve.model import Model
-from preprocess.solve.solver import INTERPOLATED, KEY, PLACED, Settings, Solved, solve
+from preprocess.solve.solved import INTERPOLATED, KEY, PLACED, Solved
+from preprocess.solve.solver import Settings, solve
 
 SIZE = (320, 240)
 FRAMES, KEYS = 20, 10
