@@ -8,7 +8,7 @@ from typing import Any
 from apps.body_map import BodyMap
 from apps.console import Console
 from apps.follow import FollowingCamera
-from apps.learn import Learnt
+from apps.learnt import Learnt
 from apps.novel import novel_motion
 from apps.pictures import data_uri, eight_bit, moving_data_uri
 from apps.recording import Recording

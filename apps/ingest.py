@@ -24,7 +24,8 @@ from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
-    from apps.learn import Learnt, Lesson
+    from apps.learn import Lesson
+    from apps.learnt import Learnt
     from apps.snapshot import Snapshot
     from apps.view.viewer import Viewer
     from avatar.trainer import Trainer

@@ -5,16 +5,18 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, final
 
 import torch
 
 from apps.console import Bar, Console
+from apps.curve import CurvePoint
 from apps.extension import Extension
+from apps.learnt import Learnt
 from apps.meter import Meter
 from apps.recording import Recording
-from apps.report import CurvePoint, ExtendedNote, mean, percent
+from apps.report import mean, percent
 from apps.run_folder import RunFolder
 from apps.view.watcher import Watcher, shown
 from avatar import checkpoint
@@ -34,40 +36,6 @@ from capture.playback import Playback
 CHECKPOINT_EVERY_S = 5.0
 LATE_S = 0.5
 """A playback that lags more than this is spoken of."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Learnt:
-    """What training leaves in memory.
-
-    Attributes:
-        trainer: With the avatar as it is now.
-        held: Held-out frames that have arrived.
-        curve: Scores on the way, and at the end.
-        meter: What it saw of the stream.
-        coverage: What of the person the frames show that it was trained on.
-        added: Frames that were put into the trainer's memory in this run.
-        interrupted: Whether Ctrl-C ended it.
-        scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
-        fitted: The same in poses fitted to them, if poses are refined.
-        extended: What an earlier video lost, if there was one.
-    """
-
-    trainer: Trainer
-    held: list[HeldOut]
-    curve: tuple[CurvePoint, ...]
-    meter: Meter
-    coverage: Coverage
-    added: int
-    interrupted: bool
-    scores: tuple[Score, ...] = ()
-    fitted: tuple[Score, ...] = ()
-    extended: ExtendedNote | None = None
-
-    @property
-    def trained(self) -> bool:
-        """Whether there is anything to show."""
-        return self.trainer.steps > 0 and self.added > 0
 
 
 def new_trainer(

@@ -12,11 +12,13 @@ from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.growing import IDLE_S
+from capture.opening import open_live, open_source
 from capture.pace import Pace
 from capture.playback import Playback
-from capture.source import Source, open_live, open_source
+from capture.source import Source
 from capture.video import turned_by
 from preprocess.body import Body, ShapedBody
+from preprocess.body_file import load_body
 from preprocess.camera_file import CameraTrack, default_cameras, read_cameras, upright_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
@@ -119,7 +121,7 @@ class Recording:
         if named is not None:
             paths = replace(paths, masks=None)
         source = open_source(paths.video, frames=wanted.frames)
-        body = Body.load(wanted.body)
+        body = load_body(wanted.body)
         motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
         masks = None
         if paths.masks is not None:
@@ -166,7 +168,7 @@ class Recording:
         named = segmenter_name(wanted.masks)
         given_masks = wanted.masks if named is None else None
         paths = find_live_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
-        body, pace = Body.load(wanted.body), Pace()
+        body, pace = load_body(wanted.body), Pace()
         source = open_live(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
         live = LiveParts.open(
             paths, source, pace, family=body.family, invert=wanted.mask_invert,

@@ -3,10 +3,10 @@
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from apps.curve import CurvePoint
 from avatar.advice import advice
 from avatar.coverage import Coverage
 from avatar.events import Score
@@ -111,32 +111,6 @@ class HeldOutNote:
             psnr_mask=mean([score.psnr_mask for score in scores]),
             ssim=mean([score.ssim for score in scores]),
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class CurvePoint:
-    """How well held-out frames were rendered at some second of training.
-
-    Attributes:
-        wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: Frames trained on so far.
-        psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
-        frames: Which those were, each with its own PSNR of the whole picture: they need not be the
-            same at every mark, so that only a frame's own scores tell whether it fell.
-    """
-
-    wall_seconds: float
-    cpu_seconds: float
-    frames_seen: int
-    psnr: float | None
-    psnr_mask: float | None
-    frames: tuple[tuple[int, float], ...] = ()
-
-    @classmethod
-    def again(cls, content: dict[str, Any]) -> "CurvePoint":
-        """From what a checkpoint kept."""
-        frames = content.get("frames", [])
-        return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,20 +244,6 @@ class Report:
         order += ("held_out_refined", "curve", "stream", "package", "coverage", "extended")
         order += ("cameras",)
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
-
-
-def largest_fall(curve: Sequence[CurvePoint]) -> float | None:
-    """How far any held-out frame has fallen below its own best by a later mark, dB.
-
-    None if no frame was scored twice.
-    """
-    best: dict[int, float] = {}
-    falls: list[float] = []
-    for frame, value in (pair for point in curve for pair in point.frames):
-        if frame in best:
-            falls.append(best[frame] - value)
-        best[frame] = max(best.get(frame, value), value)
-    return max(0.0, *falls) if falls else None
 
 
 def percent(share: float) -> str:

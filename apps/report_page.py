@@ -6,8 +6,9 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
+from apps.curve import largest_fall
 from apps.curve_svg import curve_svg
-from apps.report import Report, largest_fall, percent
+from apps.report import Report, percent
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from avatar.warm import warm_up
 from benchmarks.hardware import ROOT
 from benchmarks.marks import Mark
 from benchmarks.stage import opened
-from capture.source import open_source
+from capture.opening import open_source
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
 

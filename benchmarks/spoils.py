@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from preprocess.body import Body
+from preprocess.body_file import load_body
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
 from preprocess.shape import betas_for
@@ -67,7 +67,7 @@ def _extrinsic(folder: Path) -> np.ndarray:
 
 
 def _pelvis(motion: Motion) -> np.ndarray:
-    body = Body.load()
+    body = load_body()
     return body.with_shape(betas_for(body, motion)).joints[0]
 
 

@@ -8,8 +8,8 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.decoder import PATIENCE, Shot, refusal
 from capture.hdr import CURVES, sdr_from_hdr
+from capture.shot import PATIENCE, Shot, refusal
 
 
 def pyav() -> Any:

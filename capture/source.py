@@ -1,17 +1,11 @@
-"""Where frames come from: a video file, a folder of pictures, or a capture folder with either."""
+"""What every source of frames is, recorded or live."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from capture.errors import BadInput
 from capture.frame import Frame
-from capture.pace import Pace
 from capture.selection import Selection
-
-VIDEO_SUFFIXES = frozenset(
-    {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
-)
 
 
 @runtime_checkable
@@ -69,61 +63,3 @@ class Source(Protocol):
     def close(self) -> None:
         """Ends `frames()`, also one that waits on another thread, and lets a device go."""
         ...
-
-
-def open_source(path: Path, *, frames: slice | None = None) -> Source:
-    """Opens a video file, a folder of pictures or a native capture folder.
-
-    Args:
-        path: A video, a folder of pictures, or a folder with `images/` or a single video in it.
-        frames: Which frames are wanted; they keep their numbers. All if None.
-
-    Raises:
-        BadInput: If there is nothing there that can be read.
-    """
-    from capture.images import ImageFolder, list_images
-    from capture.video import VideoFile
-
-    selection = Selection.of(frames)
-    if not path.exists():
-        raise BadInput(f"{path} does not exist; a video or a folder of pictures was expected.")
-    if not path.is_dir():
-        return VideoFile(path, selection)
-    if (path / "images").is_dir():
-        return ImageFolder(path / "images", selection)
-    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-    if list_images(path) and not videos:
-        return ImageFolder(path, selection)
-    if len(videos) != 1:
-        found = ", ".join(file.name for file in videos) or "neither"
-        raise BadInput(
-            f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
-            f"{found}. Name the video itself."
-        )
-    return VideoFile(videos[0], selection)
-
-
-def open_live(
-    path: Path, camera: str | None, frames: slice | None, pace: Pace, *, idle_s: float
-) -> Source:
-    """Opens a camera, or a folder that another program writes pictures to.
-
-    Args:
-        path: The folder; a capture folder's pictures lie in its `images/`.
-        camera: Number or address of a camera instead.
-        frames: Which frames are wanted. All if None.
-        pace: The clock of a folder.
-        idle_s: No new picture for so long is a folder's end.
-
-    Raises:
-        BadInput: If there is no such camera, or no picture comes into the folder.
-        OSError: If the camera cannot be used now.
-    """
-    from capture.camera_device import CameraDevice
-    from capture.growing import GrowingFolder
-
-    selection = Selection.of(frames)
-    if camera is not None:
-        return CameraDevice(camera, selection, pace)
-    inside = path / "images"
-    return GrowingFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)

@@ -6,12 +6,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.decoder import Shot, open_decoder
+from capture.decoder import open_decoder
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.hdr import hdr_curve
 from capture.selection import Selection
+from capture.shot import Shot
 from capture.source import Source
+
+VIDEO_SUFFIXES = frozenset(
+    {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
+)
 
 COUNTED = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""

@@ -11,7 +11,7 @@ from PIL import Image
 from apps.background import background
 from apps.follow import FollowingCamera
 from apps.whole import whole_file
-from capture.source import open_source
+from capture.opening import open_source
 from export.player import Player
 from preprocess.camera_file import read_cameras
 from preprocess.pose_file import read_motion

@@ -1,8 +1,6 @@
 """The parametric body in three stages: a model, a shape of it, a pose of that."""
 
 from dataclasses import dataclass
-from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,17 +34,6 @@ class Body:
     shape_directions: Float[np.ndarray, "vertices 3 betas"]
     joint_directions: Float[np.ndarray, "24 3 betas"]
     pose_directions: Float[np.ndarray, "vertices 3 207"] | None = None
-
-    @classmethod
-    def load(cls, path: Path | None = None) -> "Body":
-        """Reads a body file, SMPL's or ours; the embedded body if no path is given.
-
-        Raises:
-            ValueError: If the file is no body, or holds code.
-        """
-        from preprocess.body_file import read_body  # it knows the formats; this file the body
-
-        return read_body(path or Path(str(files("preprocess") / "data" / "body24.npz")))
 
     def with_shape(self, betas: Float[np.ndarray, "betas"] | None = None) -> "ShapedBody":
         """The body of one person; the mean shape if `betas` is None (missing betas count as 0)."""

@@ -1,5 +1,6 @@
 """Body files: SMPL's own keys or the embedded body's, from .npz or .pkl."""
 
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ KEYS = (*ALWAYS, "J_regressor", "J", "J_shapedirs", "posedirs")
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
-def read_body(path: Path) -> Body:
-    """Reads a 24-joint body.
+def load_body(path: Path | None = None) -> Body:
+    """Reads a 24-joint body, SMPL's or ours; the embedded body if no path is given.
 
     Keys: v_template (V, 3), shapedirs (V, 3, B), weights (V, 24), kintree_table (2, 24), f (F, 3),
     and either J_regressor (24, V), which makes it SMPL's, or J (24, 3) and J_shapedirs (24, 3, B);
@@ -27,6 +28,7 @@ def read_body(path: Path) -> Body:
     Raises:
         BadInput: If there is no such file, or it holds no such body, or code.
     """
+    path = path or Path(str(files("preprocess") / "data" / "body24.npz"))
     if not path.is_file():
         raise BadInput(f"There is no body file {path}. Leave --body out for the embedded body.")
     if path.suffix == ".npz":

@@ -10,7 +10,8 @@ from PIL import Image
 
 from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
-from capture.source import VIDEO_SUFFIXES, Source
+from capture.source import Source
+from capture.video import VIDEO_SUFFIXES
 from preprocess.mask_files import coded_masks, is_tracked, video_of_masks
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from preprocess.body import Body, ShapedBody
+from preprocess.body import ShapedBody
+from preprocess.body_file import load_body
 
 settings.register_profile("busy", deadline=None)  # a machine may be busy with something else
 settings.load_profile("busy")
@@ -23,4 +24,4 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def shaped() -> ShapedBody:
-    return Body.load().with_shape()
+    return load_body().with_shape()

@@ -1,6 +1,7 @@
 """House rules that a machine can check."""
 
 import ast
+import graphlib
 import importlib
 import importlib.util
 import pkgutil
@@ -85,6 +86,43 @@ def test_data_walks_right_and_imports_walk_left():
 )
 def test_the_check_of_imports_can_fail(stage, line, is_wrong):
     assert bool(wrong_arrows(stage, ast.parse(line))) == is_wrong
+
+
+def circle(trees):
+    """Files that import one another in a circle, wherever in them they do; none if there is none.
+
+    Args:
+        trees: Syntax trees by module name. What a package's `__init__` passes on does not count.
+    """
+    graph = {}
+    for name, tree in trees.items():
+        names = {name for name in imported(tree) if name in trees}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                below = (f"{node.module}.{alias.name}" for alias in node.names)
+                names.update(name for name in below if name in trees)
+        graph[name] = names - {name}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_no_two_files_lean_on_one_another():
+    trees = {
+        ".".join(path.with_suffix("").parts): tree
+        for path, tree in sources()
+        if path.name != "__init__.py"
+    }
+    assert circle(trees) == []
+
+
+def test_the_check_of_circles_can_fail():
+    texts = {"a.x": "from a import y", "a.y": "def f():\n import a.z", "a.z": "import a.x"}
+    trees = {name: ast.parse(text) for name, text in texts.items()}
+    assert set(circle(trees)) == set(trees)
+    assert circle({**trees, "a.z": ast.parse("import numpy")}) == []
 
 
 @pytest.mark.parametrize("package", TORCH_FREE)

@@ -14,7 +14,8 @@ from apps.studio.raster import rasterise
 from apps.studio.shade import over, shade
 from apps.studio.wardrobe import dressed, places32, vertex_normals
 from capture.camera import Camera
-from preprocess.body import Body, ShapedBody
+from preprocess.body import ShapedBody
+from preprocess.body_file import load_body
 from preprocess.pose import BodyPose
 
 A_POSE = np.zeros(69)
@@ -52,7 +53,7 @@ class Actor:
     @classmethod
     def of(cls, subject: int = 1, seed: int = 0) -> "Actor":
         """Subject 1 or 2; the seed varies shape and colours a little (0: as designed)."""
-        body, outfit = Body.load(), OUTFITS[subject]
+        body, outfit = load_body(), OUTFITS[subject]
         generator = np.random.default_rng([seed, subject])
         spread = 0.0 if seed == 0 else 1.0
         betas = np.zeros(10)

@@ -10,7 +10,6 @@ from jaxtyping import UInt8
 from apps.body_map import BodyMap
 from apps.console import Console
 from apps.interrupt import ended_by_ctrl_c
-from apps.learn import Lesson
 from apps.recording import Recording
 from apps.report import percent
 from apps.run_folder import RunFolder
@@ -18,6 +17,7 @@ from apps.snapshot import snapshot, views_of
 from apps.view.page import FRAME_PX, Page
 from apps.view.poser import DANCE, FILMED, NEWEST, Poser
 from apps.view.scene import Look, drawn
+from apps.view.watcher import Watched
 from avatar.advice import advice
 from avatar.cells import WarpCells
 from avatar.events import Evaluated, Finished, TrainEvent
@@ -73,7 +73,7 @@ class Viewer:
             self._next_panel = 0.0
         self._finished = isinstance(event, Finished)
 
-    def tend(self, lesson: Lesson) -> None:
+    def tend(self, lesson: Watched) -> None:
         """Takes a tenth of the time at most, except while somebody has paused or saves."""
         what = "Writing the package, after" if self._finished else "Learning,"
         self._look_after(lesson, f"{what} {self._progress(lesson)}", idle=False)
@@ -84,7 +84,7 @@ class Viewer:
             with lesson.trainer.held_up():
                 self._hold(lesson)
 
-    def stay(self, lesson: Lesson) -> None:
+    def stay(self, lesson: Watched) -> None:
         """Keeps the page after the end, until Ctrl-C."""
         self.page.end()
         status = f"Done after {lesson.trainer.wall_seconds:.0f} s"
@@ -98,11 +98,11 @@ class Viewer:
         """Takes the page down."""
         self.page.close()
 
-    def _progress(self, lesson: Lesson) -> str:
+    def _progress(self, lesson: Watched) -> str:
         trainer = lesson.trainer
         return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
 
-    def _hold(self, lesson: Lesson) -> None:
+    def _hold(self, lesson: Watched) -> None:
         """Nothing is learnt until somebody resumes, or Ctrl-C ends everything."""
         self._next_panel = 0.0
         status = f"Paused after {self._progress(lesson)}"
@@ -113,7 +113,7 @@ class Viewer:
             time.sleep(0.02)
         self._next_panel = 0.0
 
-    def _save(self, lesson: Lesson) -> None:
+    def _save(self, lesson: Watched) -> None:
         """Writes the package as the avatar stands."""
         self.page.saving = False
         trainer, mark = lesson.trainer, lesson.curve[-1] if lesson.curve else None
@@ -133,7 +133,7 @@ class Viewer:
         self.page.tell("Package saved", f"{self._run.package}: {size}.")
         self._console.say(f"Saved from the page: {self._run.package}, {size}.")
 
-    def _look_after(self, lesson: Lesson, status: str, *, idle: bool) -> None:
+    def _look_after(self, lesson: Watched, status: str, *, idle: bool) -> None:
         """Brings the page up to date, as far as it is time to."""
         now = time.perf_counter()
         if now >= self._next_panel:
@@ -149,7 +149,7 @@ class Viewer:
                 share = IDLE_SHARE if idle else SHARE
                 self._next_picture = began + took / share
 
-    def _fill_panel(self, lesson: Lesson, status: str) -> None:
+    def _fill_panel(self, lesson: Watched, status: str) -> None:
         trainer = lesson.trainer
         psnr = lesson.curve[-1].psnr if lesson.curve else None
         self.page.say(
@@ -171,7 +171,7 @@ class Viewer:
             self._framed = newest
             self.page.show_frame(_fitted(newest.frame.rgb))
 
-    def _fill_map(self, lesson: Lesson) -> None:
+    def _fill_map(self, lesson: Watched) -> None:
         coverage = lesson.coverage
         if coverage.seen == self._seen:
             return
@@ -180,7 +180,7 @@ class Viewer:
         self._seen = coverage.seen
         self.page.show_coverage(advice(coverage), self._body_map.svg())
 
-    def _draw(self, lesson: Lesson, *, idle: bool) -> bool:
+    def _draw(self, lesson: Watched, *, idle: bool) -> bool:
         """Draws for the browser that has waited longest; whether any needed it."""
         now = time.perf_counter()
         looks = self.page.looks()
@@ -210,7 +210,7 @@ class Viewer:
             return MOVING_PX
         return SHARP_PX if idle else RESTING_PX
 
-    def _warped(self, lesson: Lesson, pose: BodyPose, now: float) -> WarpCells:
+    def _warped(self, lesson: Watched, pose: BodyPose, now: float) -> WarpCells:
         """The pose's warp; solved anew only if the pose has changed."""
         if self._cells is None or not np.array_equal(
             self._cells[0].joint_rotations, pose.joint_rotations

@@ -1,16 +1,37 @@
 """What looks on while an avatar is learnt: it hears of everything, and is let in between steps."""
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
+from apps.curve import CurvePoint
 from avatar.coverage import Coverage
 from avatar.events import TrainEvent
-from avatar.hold import is_held_out
+from avatar.hold import HeldOut, is_held_out
+from avatar.trainer import Trainer
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
 
-if TYPE_CHECKING:  # a lesson knows its watchers, too
-    from apps.learn import Lesson
+
+@runtime_checkable
+class Watched(Protocol):
+    """A lesson, as those see it who look on.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        curve: Scores so far.
+        coverage: What of the person has been seen so far.
+    """
+
+    trainer: Trainer
+    held: list[HeldOut]
+    curve: list[CurvePoint]
+    coverage: Coverage
+
+    @property
+    def stopping(self) -> bool:
+        """Whether somebody wants it to end."""
+        ...
 
 
 @runtime_checkable
@@ -26,7 +47,7 @@ class Watcher(Protocol):
     def heard(self, event: TrainEvent) -> None:
         """Something happened; called on the thread that trains."""
 
-    def tend(self, lesson: "Lesson") -> None:
+    def tend(self, lesson: Watched) -> None:
         """Between two steps, on the thread that trains: kernels may run here.
 
         What it takes counts as training time, except inside `Trainer.held_up`.

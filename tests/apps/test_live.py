@@ -14,7 +14,7 @@ from avatar import warm
 from avatar.train import train
 from avatar.warm import warm_up
 from capture import camera_device
-from capture.source import open_source
+from capture.opening import open_source
 
 FRAMES = 14
 

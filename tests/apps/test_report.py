@@ -8,10 +8,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from apps.curve import CurvePoint, largest_fall
 from apps.curve_svg import curve_svg
 from apps.pictures import data_uri, moving_data_uri
 from apps.report import (
-    CurvePoint,
     DroppedNote,
     FramesNote,
     HeldOutNote,
@@ -20,7 +20,6 @@ from apps.report import (
     Spread,
     StreamNote,
     TrainingNote,
-    largest_fall,
     mean,
 )
 from apps.report_page import Pair, report_page

@@ -18,7 +18,7 @@ from apps.studio.tracker import tracked
 from apps.studio.wardrobe import dressed
 from apps.studio.writer import ShootConfig, shoot
 from capture.errors import BadInput
-from preprocess.body import Body
+from preprocess.body_file import load_body
 from preprocess.pose import BodyPose, Motion
 from preprocess.pose_file import read_motion
 
@@ -75,7 +75,7 @@ def test_every_layer_is_there_and_hangs_from_the_body(actor):
 
 
 def test_the_shirt_stands_off_the_body_by_one_to_four_centimetres():
-    body = Body.load()
+    body = load_body()
     for outfit in OUTFITS.values():
         shirt = next(layer for layer in dressed(body, outfit) if layer.kind == SHIRT)
         x, y, _ = shirt.place.T

@@ -5,7 +5,7 @@ import pytest
 
 from capture.decoder import CvDecoder
 from capture.hdr import HLG, PEAK_NITS, PQ, WHITE_NITS, hdr_curve, sdr_from_hdr
-from capture.source import open_source
+from capture.opening import open_source
 
 
 def box(kind: bytes, content: bytes) -> bytes:

@@ -7,7 +7,7 @@ from PIL import Image
 
 from capture.errors import BadInput
 from capture.images import list_images, read_image
-from capture.source import open_source
+from capture.opening import open_source
 
 
 def test_pictures_come_in_natural_order_and_exactly(write_images):

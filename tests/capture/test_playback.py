@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from capture.frame import Frame
+from capture.opening import open_source
 from capture.pace import Pace
 from capture.playback import Playback
 from capture.selection import Selection
-from capture.source import open_source
 
 UNEVEN_S = [5.0, 5.04, 5.1, 5.1, 5.7, 5.733]
 """Timestamps of no fixed rate; one comes twice, and the first is not 0."""

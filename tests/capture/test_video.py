@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
-from capture.source import open_source
+from capture.opening import open_source
 from capture.video import turned_by
 
 

@@ -13,7 +13,7 @@ from capture.camera import Camera
 from export.bake import BakeConfig, bake
 from export.build import ExportReport, export_field
 from export.tables import Tables
-from preprocess.body import Body
+from preprocess.body_file import load_body
 from preprocess.kinematics import body_from_rest
 from preprocess.pose import BodyPose
 
@@ -126,7 +126,7 @@ def capsule_field(rig: Rig) -> Callable:
 
 @pytest.fixture(scope="session")
 def stand_in() -> StandIn:
-    rig = Rig.of(Body.load().with_shape())
+    rig = Rig.of(load_body().with_shape())
     return StandIn(rig, capsule_field(rig), (rig.distance < 0.10).astype(np.uint8))
 
 

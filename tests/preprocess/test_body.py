@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import preprocess
 from preprocess.body import Body
+from preprocess.body_file import load_body
 from preprocess.pose import BodyPose
 from preprocess.shape import betas_for
 from preprocess.skeleton import JOINT_NAMES
@@ -16,7 +17,7 @@ from preprocess.skeleton import JOINT_NAMES
 
 @pytest.fixture(scope="module")
 def body() -> Body:
-    return Body.load()
+    return load_body()
 
 
 def pose_with(**changes: np.ndarray) -> BodyPose:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from capture.errors import BadInput
+from capture.opening import open_source
 from capture.quiet import silence_opencv
-from capture.source import open_source
 from preprocess.mask_files import decoded
 from preprocess.masks import masks_in_poses, open_masks, same_shape
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
+from capture.opening import open_source
 from capture.quiet import silence_opencv
-from capture.source import open_source
 from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.masks import open_masks
 from preprocess.observation import Observation

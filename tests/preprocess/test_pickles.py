@@ -20,7 +20,7 @@ from scipy import sparse
 
 from capture.errors import BadInput
 from preprocess import pickles
-from preprocess.body_file import read_body
+from preprocess.body_file import load_body
 from preprocess.pickles import read_pickled_arrays
 
 
@@ -73,7 +73,7 @@ def test_a_python_2_file_with_chumpy_and_scipy_is_read(tmp_path, smpl_arrays, ch
     path.write_bytes(python2_pickle(content))
     names = {arg for op, arg, _ in pickletools.genops(path.read_bytes()) if op.name == "GLOBAL"}
     assert {"chumpy.ch Ch", "numpy.core.multiarray _reconstruct"} <= names
-    body = read_body(path)
+    body = load_body(path)
     np.testing.assert_array_equal(body.template, smpl_arrays["v_template"])
     np.testing.assert_array_equal(body.shape_directions, smpl_arrays["shapedirs"])
     np.testing.assert_array_equal(body.pose_directions, smpl_arrays["posedirs"])
@@ -130,7 +130,7 @@ def test_a_pickle_with_code_in_it_is_refused_and_nothing_runs(tmp_path, smpl_arr
     content = {**smpl_arrays, "v_template": hostile(marker)[way]}
     path.write_bytes(pickle.dumps(content, protocol))
     with pytest.raises(BadInput, match="nothing was run"):
-        read_body(path)
+        load_body(path)
     assert not marker.exists()
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from preprocess.body import Body, ShapedBody
+from preprocess.body import ShapedBody
+from preprocess.body_file import load_body
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness
 from preprocess.pose import Motion
@@ -49,7 +50,7 @@ def scaled(shaped: ShapedBody, factor: float) -> ShapedBody:
 @pytest.fixture(scope="module", params=[1.12, 0.9])
 def filmed(request, turning) -> tuple[ShapedBody, Claim, Evidence, Refit]:
     """Somebody with SMPL's proportions and another height; the claim; masks; what was found."""
-    body = Body.load()
+    body = load_body()
     own = shaped_for(body, turning)
     person = scaled(own, request.param)
     claim = Claim(
@@ -70,7 +71,7 @@ def filmed(request, turning) -> tuple[ShapedBody, Claim, Evidence, Refit]:
 
 
 def test_the_bodys_joints_move_exactly_as_smpls_do(turning):
-    shaped = shaped_for(Body.load(), turning)
+    shaped = shaped_for(load_body(), turning)
     offset = shaped.joints - smpl_joints()
     np.testing.assert_allclose(offset, np.broadcast_to(offset[0], (24, 3)), atol=1e-12)
 
@@ -85,7 +86,7 @@ def test_the_skin_goes_along_with_its_joints(shaped):
 
 
 def test_poses_of_the_bodys_own_family_change_nothing(turning):
-    body = Body.load()
+    body = load_body()
     own = shaped_for(body, replace(turning, model="body24", betas=np.zeros(10)))
     np.testing.assert_array_equal(own.joints, body.joints)
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from capture.errors import BadInput
-from capture.source import Source, open_source
+from capture.opening import open_source
+from capture.source import Source
 from preprocess.camera_file import read_cameras
 from preprocess.cameras.door import read_named
 

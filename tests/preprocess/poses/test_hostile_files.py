@@ -25,7 +25,7 @@ import torch
 
 from capture.errors import BadInput
 from preprocess import pickles
-from preprocess.body_file import read_body
+from preprocess.body_file import load_body
 from preprocess.poses import read_poses
 from preprocess.poses.content import read_content
 
@@ -333,7 +333,7 @@ def test_random_files_are_read_or_refused_and_no_worse(tmp_path, joblib_bytes):
                 ended[outcome(path, read_content)] += 1
                 outcome(path, read_poses)
                 with suppress(BadInput):
-                    read_body(path)
+                    load_body(path)
             assert tracemalloc.get_traced_memory()[1] - before < MOST_BYTES, data
             assert time.process_time() - began < 10.0, data
     finally:

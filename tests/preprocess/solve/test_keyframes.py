@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
-from capture.source import open_source
+from capture.opening import open_source
 from preprocess.solve.keyframes import choose, grown, read_keys, write_keys
 
 COUNT, SHARP = 36, (1, 5, 6, 11, 13, 17, 18, 22, 25, 29, 32, 35)

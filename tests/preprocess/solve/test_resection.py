@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.source import open_source
+from capture.opening import open_source
 from preprocess.solve.keyframes import KeyFrame
 from preprocess.solve.resection import place_between, resected
 from preprocess.solve.stillness import stillness

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.errors import BadInput
-from capture.source import open_source
+from capture.opening import open_source
 from preprocess.solve import mapping, solver
 from preprocess.solve.gates import similarity
 from preprocess.solve.model import Model

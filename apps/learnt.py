@@ -1,0 +1,45 @@
+"""What training leaves in memory, for scores, report and package."""
+
+from dataclasses import dataclass
+
+from apps.curve import CurvePoint
+from apps.meter import Meter
+from apps.report import ExtendedNote
+from avatar.coverage import Coverage
+from avatar.events import Score
+from avatar.hold import HeldOut
+from avatar.trainer import Trainer
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Learnt:
+    """What training leaves in memory.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        curve: Scores on the way, and at the end.
+        meter: What it saw of the stream.
+        coverage: What of the person the frames show that it was trained on.
+        added: Frames that were put into the trainer's memory in this run.
+        interrupted: Whether Ctrl-C ended it.
+        scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
+        fitted: The same in poses fitted to them, if poses are refined.
+        extended: What an earlier video lost, if there was one.
+    """
+
+    trainer: Trainer
+    held: list[HeldOut]
+    curve: tuple[CurvePoint, ...]
+    meter: Meter
+    coverage: Coverage
+    added: int
+    interrupted: bool
+    scores: tuple[Score, ...] = ()
+    fitted: tuple[Score, ...] = ()
+    extended: ExtendedNote | None = None
+
+    @property
+    def trained(self) -> bool:
+        """Whether there is anything to show."""
+        return self.trainer.steps > 0 and self.added > 0
