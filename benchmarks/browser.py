@@ -4,7 +4,9 @@
 
 Draws the same 24 pictures of 540 px natively and in headless Chromium (WebAssembly, one thread), in
 turns, of both tiers. A loaded machine lengthens wall time; so CPU time is given as well,
-of Chromium with all its processes. Shaders are not measured: without a GPU they would say nothing.
+of Chromium with all its processes. Before that, how long the page takes from its address to the
+first picture, as Chromium opens it for the first time and again. Shaders are not measured: without
+a GPU they would say nothing.
 """
 
 import itertools
@@ -56,8 +58,8 @@ def compare(package: Path, rounds: int) -> int:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     found: dict[str, list[tuple[float, float, float]]] = {tier: [] for tier in TIERS}
     with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
-        browser.go(f"http://127.0.0.1:{server.server_port}/")
-        until(lambda: browser.run("!!window.player"), 120.0)
+        address = f"http://127.0.0.1:{server.server_port}/"
+        opened = np.array([opening(browser, f"{address}?{again}") for again in range(1 + rounds)])
         browser.run("document.querySelector('#play.playing')?.click()")
         for tier in TIERS:
             browser_ms(browser, tier)  # the browser compiles again what it finds hot
@@ -68,8 +70,38 @@ def compare(package: Path, rounds: int) -> int:
     server.shutdown()
     server.server_close()
     rows = [row for tier in TIERS for row in marks(tier, np.array(found[tier]))]
+    rows = [*opening_marks(opened), *rows]
     print("\n".join([*Hardware.here().lines(), "", *table(rows)]))
     return 0
+
+
+def opening(browser: Browser, address: str) -> tuple[float, float]:
+    """Wall and CPU seconds from an address to the page's first whole picture of 540 px."""
+    browser.go("about:blank")
+    until(lambda: browser.run("!window.player"), 30.0)
+    before = browser.cpu_seconds()
+    browser.go(address)
+    until(lambda: browser.run("!!window.player"), 120.0)
+    first = f"player.measure({{tier: 'hq', size: {SIZE_PX}, frames: 1}})"
+    wall = browser.run(f"{first}.then(() => performance.now() / 1000)", seconds=120.0)
+    return wall, browser.cpu_seconds() - before
+
+
+def opening_marks(opened: Float[np.ndarray, "times 2"]) -> list[Mark]:
+    """The table's rows on how long the page takes to open."""
+    (first, first_cpu), (wall, cpu) = opened[0], np.median(opened[1:], axis=0)
+    return [
+        Mark(
+            name="page: first picture, wall s",
+            value=float(first),
+            beside=f"a fresh browser; {first_cpu:.2f} CPU-s of all of its processes",
+        ),
+        Mark(
+            name="page: first picture again, wall s",
+            value=float(wall),
+            beside=f"median of {len(opened) - 1} reloads; {cpu:.2f} CPU-s",
+        ),
+    ]
 
 
 def native_ms(player: Player, motion: Motion) -> float:
