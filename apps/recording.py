@@ -16,10 +16,9 @@ from capture.opening import open_live, open_source
 from capture.pace import Pace
 from capture.playback import Playback
 from capture.source import Source
-from capture.video import turned_by
 from preprocess.body import Body, ShapedBody
 from preprocess.body_file import load_body
-from preprocess.camera_file import CameraTrack, default_cameras, read_cameras, upright_cameras
+from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
 from preprocess.focal import focal_from_masks
@@ -34,6 +33,7 @@ from preprocess.refit import refit_to_masks
 from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.shape import shaped_for
 from preprocess.stature import as_tall, farther
+from preprocess.upright import upright_cameras
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ class Recording:
         elif named is None and not source.has_alpha:
             masks = masks_in_poses(paths.poses, source, person=wanted.person)
         if paths.cameras is not None:
-            cameras = upright_cameras(paths.cameras, source.size_px, turned_by(source), source)
+            cameras = upright_cameras(paths.cameras, source)
         else:
             cameras = default_cameras(motion, source.size_px)
         shaped = shaped_for(body, motion)
@@ -176,7 +176,7 @@ class Recording:
         )  # fmt: skip
         motion = live.poses.motion
         if paths.cameras is not None:
-            cameras = read_cameras(paths.cameras, source.size_px)
+            cameras = upright_cameras(paths.cameras, source)
         else:
             cameras = default_cameras(motion, source.size_px)
         shaped = shaped_for(body, motion)

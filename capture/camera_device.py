@@ -47,6 +47,7 @@ class CameraDevice:
     """
 
     has_alpha = False
+    quarter_turns = 0
     live = paced = True
     frames_in_file = 0
     frame_count: int | None = None

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from capture.errors import BadInput
 from capture.frame import Frame
-from capture.images import list_images, natural_key, read_image
+from capture.images import QUARTER_TURNS, list_images, natural_key, orientation, read_image
 from capture.pace import Pace
 from capture.selection import Selection
 
@@ -65,7 +65,8 @@ class GrowingFolder:
         self.dropped = 0
         self._pace, self._idle_s = pace, idle_s
         self._there_before: set[Path] = set()
-        rgb, alpha = self._first()
+        first, (rgb, alpha) = self._first()
+        self.quarter_turns = QUARTER_TURNS.get(orientation(first.read_bytes()), 0)
         self.started_at = min(map(_written_at, list_images(path)), default=time.time())
         self.size_px, self.has_alpha = (rgb.shape[1], rgb.shape[0]), alpha is not None
 
@@ -105,12 +106,13 @@ class GrowingFolder:
         """Ends the watch, also in the middle of a wait."""
         self._pace.end()
 
-    def _first(self) -> Picture:
+    def _first(self) -> tuple[Path, Picture]:
+        """The first picture that can be read."""
         deadline = self._now() + self._idle_s
         while True:
             for path in list_images(self.path):
                 try:
-                    return read_image(path)
+                    return path, read_image(path)
                 except (BadInput, OSError):
                     continue
             if self._now() >= deadline:

@@ -1,5 +1,6 @@
 """A folder of pictures as frames, in natural order; and the reading of one picture."""
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -14,6 +16,23 @@ from capture.quiet import silence_opencv
 from capture.selection import Selection
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+
+EXIF_ORIENTATION = 0x0112
+QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
+"""By EXIF's orientation: turns by 90° against the clock that make a stored picture upright."""
+UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""The same with those that are mirrored, for pixels."""
+
+TIFF = (b"II*\x00", b"MM\x00*")
+"""How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
 RATE = 30.0
 """Pictures a second, where nobody has said when each was taken."""
@@ -51,7 +70,7 @@ def read_image(
     if picture.ndim == 3 and picture.shape[2] == 4:
         alpha = picture[..., 3]
         alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
-        alpha = np.ascontiguousarray(alpha)
+        alpha = np.ascontiguousarray(_turned(alpha, data))
     picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
     if picture is None:
         raise BadInput(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
@@ -59,6 +78,27 @@ def read_image(
     if alpha is not None and alpha.shape != rgb.shape[:2]:
         raise BadInput(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
     return rgb, alpha
+
+
+def orientation(data: bytes) -> int:
+    """EXIF's orientation of an encoded picture, 1 to 8; 1 (upright) where there is none."""
+    tagged = data.startswith(TIFF) or any(mark in data for mark in (b"Exif", b"eXIf", b"EXIF"))
+    if not tagged:  # looking closer would decode a PNG
+        return 1
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            found = picture.getexif().get(EXIF_ORIENTATION, 1)
+    except Exception:  # damaged tags; of many types, and OpenCV leaves the picture as it is, too
+        return 1
+    return found if found in UPRIGHT else 1
+
+
+def _turned(alpha: UInt8[np.ndarray, "_ _"], data: bytes) -> UInt8[np.ndarray, "height width"]:
+    """An alpha channel as it was stored, made upright as OpenCV makes the colours."""
+    found = orientation(data)
+    if found == 1 or data.startswith(TIFF):
+        return alpha
+    return np.asarray(Image.fromarray(alpha).transpose(UPRIGHT[found]))
 
 
 def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
@@ -105,7 +145,7 @@ class ImageFolder:
                 f"; at least one was expected from number {selection.start} on."
             )
         self.duration_s: float | None = selection.span(self.frames_in_file) / RATE
-        self.size_px, self.has_alpha = self._look()
+        self.size_px, self.has_alpha, self.quarter_turns = self._look()
 
     def frames(self) -> Iterator[Frame]:
         """The wanted pictures in order; every call starts anew."""
@@ -136,15 +176,20 @@ class ImageFolder:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def _look(self) -> tuple[tuple[int, int], bool]:
-        """Size of the first picture that can be read, and whether its alpha channel cuts it out."""
+    def _look(self) -> tuple[tuple[int, int], bool, int]:
+        """What is told by the first picture that can be read.
+
+        Returns:
+            Its size, whether its alpha channel cuts it out, and by how many quarters it is turned.
+        """
         for path in self._images:
             try:
                 rgb, alpha = read_image(path)
             except BadInput:
                 continue
             cut_out = alpha is not None and bool(alpha.min() < 255)  # opaque ones say nothing
-            return (rgb.shape[1], rgb.shape[0]), cut_out
+            turns = QUARTER_TURNS.get(orientation(path.read_bytes()), 0)
+            return (rgb.shape[1], rgb.shape[0]), cut_out, turns
         raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
 
     def _warn(self, message: str) -> None:

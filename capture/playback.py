@@ -41,6 +41,7 @@ class Playback:
         self.frame_count = source.frame_count
         self.duration_s = source.duration_s
         self.has_alpha = source.has_alpha
+        self.quarter_turns = source.quarter_turns
         self.started_at = source.started_at
         self.warnings = source.warnings
 

@@ -22,6 +22,7 @@ class Source(Protocol):
             knows, of a live source.
         duration_s: How long the wanted frames last, as the container claims; None if nobody knows.
         has_alpha: Whether the frames have an alpha channel of their own.
+        quarter_turns: How often stored pictures are turned by 90° against the clock to be upright.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
         waited_s: How long `frames()` has waited for frames, in all.
@@ -37,6 +38,7 @@ class Source(Protocol):
     frame_count: int | None
     duration_s: float | None
     has_alpha: bool
+    quarter_turns: int
     live: bool
     paced: bool
     started_at: float

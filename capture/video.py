@@ -12,7 +12,6 @@ from capture.frame import Frame
 from capture.hdr import hdr_curve
 from capture.selection import Selection
 from capture.shot import Shot
-from capture.source import Source
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
@@ -135,11 +134,6 @@ class VideoFile:
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
             self.warnings.append(message)
-
-
-def turned_by(source: Source) -> int:
-    """How often a source's stored pictures are turned by 90° against the clock; 0 if no video."""
-    return source.quarter_turns if isinstance(source, VideoFile) else 0
 
 
 def _flags(

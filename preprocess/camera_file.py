@@ -1,6 +1,6 @@
 """Cameras of a capture: InstantAvatar's cameras.npz, other programs' files, or none at all."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -117,36 +117,6 @@ def write_cameras(path: Path, track: CameraTrack) -> None:
         height=first.size_px[1],
         distortion=np.array(first.distortion),
         valid=np.array([row not in track.missing for row in rows]),
-    )
-
-
-def upright_cameras(
-    path: Path, size_px: tuple[int, int], quarter_turns: int, source: Source | None = None
-) -> CameraTrack:
-    """The cameras of a video whose stored pictures are turned to stand upright.
-
-    Cameras that were made for the pictures as they are stored are turned with them; which they were
-    made for, their width and height tell.
-
-    Args:
-        path: See `read_cameras`.
-        size_px: Of the upright frames.
-        quarter_turns: How often stored pictures are turned by 90° against the clock.
-        source: The frames; see `read_cameras`.
-
-    Raises:
-        BadInput: As `read_cameras`.
-    """
-    try:
-        return read_cameras(path, size_px, source)
-    except BadInput:
-        if quarter_turns % 2 == 0:
-            raise
-        lying = read_cameras(path, (size_px[1], size_px[0]), source)
-    return replace(
-        lying,
-        cameras=tuple(camera.turned(quarter_turns) for camera in lying.cameras),
-        note=f"The cameras in {path.name} were turned with the video, by its rotation flag.",
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
-from PIL import Image
+from PIL import Image, ImageOps
 
 from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
@@ -207,6 +207,7 @@ def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
     try:
         with Image.open(path) as picture:
             picture.load()
+            ImageOps.exif_transpose(picture, in_place=True)
             channel = _channel(picture)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
         raise BadInput(f"{path} is no mask that can be decoded ({cause}).") from cause

@@ -18,6 +18,7 @@ class Recorded:
 
     path, size_px, selection = Path("video.mp4"), (2, 2), Selection()
     has_alpha = live = paced = False
+    quarter_turns = 0
     started_at = 0.0
     frames_in_file, frame_count, duration_s = 3, 3, 0.1
     waited_s, dropped = 0.0, 0

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from capture.errors import BadInput
 from capture.images import list_images, read_image
@@ -48,6 +48,24 @@ def test_a_picture_is_turned_upright_by_its_exif_tag(tmp_path):
     assert rgb.shape == upright.shape
     assert alpha is None
     assert np.abs(rgb.astype(int) - upright).mean() < 3
+
+
+@pytest.mark.parametrize("ending", ["png", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_colours_and_alpha_are_turned_alike(tmp_path, ending, orientation):
+    """Each pixel is as opaque as it is red, however the file is turned or mirrored."""
+    ramp = np.arange(128, 248, dtype=np.uint8).reshape(10, 12)
+    rgba = np.stack([ramp, ramp // 2, 255 - ramp, ramp], axis=-1)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    lossless = {"lossless": True} if ending == "webp" else {}
+    Image.fromarray(rgba).save(tmp_path / f"0.{ending}", exif=exif, **lossless)
+    source = open_source(tmp_path)
+    (frame,) = source.frames()
+    shown = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / f"0.{ending}")))
+    np.testing.assert_array_equal(frame.alpha, shown[..., 3])
+    np.testing.assert_array_equal(frame.rgb, shown[..., :3])
+    assert source.quarter_turns == {3: 2, 6: 3, 8: 1}.get(orientation, 0)
 
 
 def test_grey_and_16_bit_pictures_become_8_bit_rgb(tmp_path):

@@ -38,6 +38,7 @@ class Recorded:
 
     path, size_px, selection = Path("uneven.mp4"), (2, 2), Selection()
     has_alpha = live = paced = False
+    quarter_turns = 0
     started_at = 0.0
     frames_in_file = frame_count = len(UNEVEN_S)
     duration_s, waited_s, dropped = 0.77, 0.0, 0

@@ -5,7 +5,6 @@ import pytest
 
 from capture.errors import BadInput
 from capture.opening import open_source
-from capture.video import turned_by
 
 
 def greys(frames) -> list[int]:
@@ -160,6 +159,6 @@ def test_a_variable_frame_rate_keeps_the_containers_times(write_video, with_dura
 
 def test_a_turned_video_says_by_how_much(write_video, turned_clockwise):
     path = write_video(frames=2)
-    assert turned_by(open_source(path)) == 0
+    assert open_source(path).quarter_turns == 0
     path.write_bytes(turned_clockwise(path.read_bytes()))
-    assert turned_by(open_source(path)) == 3
+    assert open_source(path).quarter_turns == 3

@@ -87,6 +87,15 @@ def test_every_kind_of_picture_is_one_mask(tmp_path, mode):
     np.testing.assert_allclose(open_masks(folder).alpha(0, SIZE), hard / 255.0)
 
 
+def test_a_mask_is_turned_by_its_exif_tag_as_its_picture_is(tmp_path):
+    upright = np.zeros((12, 8), np.uint8)
+    upright[1:5, 2:4] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying: to be turned 90° clockwise
+    Image.fromarray(np.ascontiguousarray(np.rot90(upright))).save(tmp_path / "0.png", exif=exif)
+    np.testing.assert_array_equal(open_masks(tmp_path).alpha(0, (8, 12)), upright / 255.0)
+
+
 def test_one_archive_or_array_is_read_like_a_folder(write, tmp_path):
     stack = np.stack([person(), person(4)])
     np.savez(tmp_path / "m.npz", masks=stack, note=np.zeros(3))
