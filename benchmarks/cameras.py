@@ -13,6 +13,7 @@ import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.console import Console as RichConsole
@@ -38,6 +39,9 @@ MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.0
 MOST_PSNR_LOSS = 0.5
 TOO_TALL = 1.04
 TRAINED_PX, TRAINED_CORE_S = 320, 20.0
+
+Room = Literal["room", "tiles"]
+ROOMS: tuple[Room, ...] = ("room", "tiles")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,13 +96,13 @@ class Errors:
         )
 
 
-def filmed(folder: Path, background: str, seed: int, given: argparse.Namespace) -> Path:
+def filmed(folder: Path, background: Room, seed: int, given: argparse.Namespace) -> Path:
     """A capture, unless it lies there already."""
     capture = folder / f"{background}{seed}-{given.size}-{given.frames}"
     if not capture.exists():
         config = ShootConfig(
             frames=given.frames, size=given.size, seed=seed, motion="walkaround",
-            background=background, subject=1 + seed % 2,
+            background=background, subject=2 if seed % 2 else 1,
         )  # fmt: skip
         shoot(capture, config)
     return capture
@@ -138,9 +142,10 @@ def told(capture: Path, runs: Path) -> tuple[str, bool | None]:
         return f"refused: {str(refusal).split(';')[0]}", None
     errors = Errors.of(recording.cameras.cameras, truth(capture, recording).cameras)
     costs = solved.costs
-    frames = recording.solved["frames"] if recording.solved else {}
+    assert recording.solved is not None
+    frames = recording.solved["frames"]
     return (
-        f"{errors}; {solved.keys} key frames + {frames.get('placed')}; {costs['cpu_seconds']:.0f} "
+        f"{errors}; {solved.keys} key frames + {frames['placed']}; {costs['cpu_seconds']:.0f} "
         f"core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.solved['scale']['cues']}",
         errors.good,
     )
@@ -226,7 +231,7 @@ def main() -> None:
         folder = given.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         runs = folder / "runs"
-        for background in ("room", "tiles"):
+        for background in ROOMS:
             for seed in range(given.seeds):
                 said, good = told(filmed(folder, background, seed, given), runs)
                 fine &= good is True or (good is None and background == "tiles")
