@@ -166,6 +166,7 @@ def _report(
         "camera": recording.cameras.source,
         "body": recording.shaped.body.family,
         "pose_model": recording.motion.model,
+        "body_fit": recording.told_of_body(),
         **recording.told_of_masks(),
     }
     return Report(

@@ -112,8 +112,8 @@ def looks_well(recording: Recording) -> bool:
 
     Poses that are a frame or two late are noticed, too.
     """
-    if recording.live is not None or recording.masks is None or recording.source.has_alpha:
-        return True  # what is not there cannot be looked at; pictures are not decoded for it
+    if recording.live is not None or not (recording.masks or recording.source.has_alpha):
+        return True  # what is not there cannot be looked at
     try:
         evidence = _evidence(recording, FEW)
     except BadInput:  # nobody in these few; whoever reads all of them will say so

@@ -22,6 +22,8 @@ from apps.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 
+SAME_JOINTS_M = 1e-3
+
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from apps.deliver import Delivered
     from apps.learn import Lesson
@@ -157,6 +159,7 @@ def _trainer(
         )  # fmt: skip
         return trainer, 0, {"video": video}
     trainer, notes = checkpoint.load(run.checkpoint, device)
+    _check_person(trainer, recording, run)
     had, extension = trainer.wall_seconds, Extension(run, notes)
     if notes.get("video") == video:
         before = notes.get("before", {"frames": 0, "seconds": 0.0})
@@ -175,6 +178,21 @@ def _trainer(
         seconds, seen, notes["video"] = had + seconds, 0, video
     trainer.config = replace(trainer.config, seconds=seconds, refine_poses=given.refine_poses)
     return trainer, seen, notes
+
+
+def _check_person(trainer: "Trainer", recording: Recording, run: RunFolder) -> None:
+    """Raises if the poses are for another body than the checkpoint's.
+
+    Raises:
+        BadInput: If they are.
+    """
+    apart = abs(trainer.avatar.rig.rest_joints - recording.shaped.joints).max()
+    if apart > SAME_JOINTS_M:
+        raise BadInput(
+            f"The avatar in {run.path} has another body than these poses, with joints up to "
+            f"{100.0 * apart:.1f} cm elsewhere, and {run.person.name}, which would say which, is "
+            "not there. Learn the avatar anew (--overwrite)."
+        )
 
 
 def _name_of(recording: Recording) -> str:

@@ -187,7 +187,9 @@ class IngestArguments:
 
     def recording(self) -> Recording:
         """Opens what the arguments name."""
-        recording = Recording.open(self.wanted())
+        run = self.run_folder()
+        goes_on = self.resume and run.has_checkpoint() and run.person.is_file()
+        recording = Recording.open(self.wanted(), avatars=run.person if goes_on else None)
         size_px = self.size or learnable_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
         return recording.played() if self.realtime else recording

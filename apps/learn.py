@@ -19,6 +19,7 @@ from apps.recording import Recording
 from apps.report import mean, percent
 from apps.run_folder import RunFolder
 from apps.view.watcher import Watcher, shown
+from apps.whole import whole_file
 from avatar import checkpoint
 from avatar.advice import advice
 from avatar.config import TrainConfig
@@ -32,6 +33,7 @@ from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
 from capture.playback import Playback
+from preprocess.person_file import write_person
 
 CHECKPOINT_EVERY_S = 5.0
 LATE_S = 0.5
@@ -91,7 +93,7 @@ class Lesson:
         self._watchers = watchers
         self.curve: list[CurvePoint] = [CurvePoint.again(kept) for kept in notes.get("curve", [])]
         self.held: list[HeldOut] = []
-        self._saved_at = time.perf_counter()
+        self._saved_at, self._person_kept = time.perf_counter(), False
         self.meter = Meter(stop, recording.source)
         self.coverage = Coverage(recording.shaped)
         if "coverage" in notes:
@@ -134,7 +136,7 @@ class Lesson:
             inbox.close()
         self.meter.inbox_dropped = inbox.dropped
         interrupted = self._stop.is_set()
-        for warning in [*source.warnings, *self._how_late()]:
+        for warning in [*source.warnings, *self._how_late(), *self._recording.told_at_the_end()]:
             self._console.warn(warning)
         self._console.count_the_rest()
         if len(self.trainer.replay):
@@ -289,4 +291,8 @@ class Lesson:
         curve = [vars(point) for point in self.curve]
         notes = {**self._notes, "curve": curve, "coverage": self.coverage.as_notes()}
         checkpoint.save(self.trainer, self._run.checkpoint, notes=notes)
+        if not self._person_kept:
+            with whole_file(self._run.person) as path:
+                write_person(path, self._recording.shaped)
+            self._person_kept = True
         self._saved_at = time.perf_counter()

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from apps.person import live_person, person_of
+from apps.recording_notes import notes_of
 from capture.camera import Camera
 from capture.camera_device import camera_address
 from capture.errors import BadInput
@@ -16,12 +18,13 @@ from capture.opening import open_live, open_source
 from capture.pace import Pace
 from capture.playback import Playback
 from capture.source import Source
-from preprocess.body import Body, ShapedBody
+from preprocess.body import ShapedBody
 from preprocess.body_file import load_body
 from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
 from preprocess.focal import focal_from_masks
+from preprocess.growing_fit import GrowingFit
 from preprocess.live import LiveParts
 from preprocess.masks import Masks, masks_in_poses, open_masks
 from preprocess.observation import Observation
@@ -29,10 +32,9 @@ from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
-from preprocess.refit import refit_to_masks
+from preprocess.refit import Refit
 from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.shape import shaped_for
-from preprocess.stature import as_tall, farther
 from preprocess.upright import upright_cameras
 
 
@@ -84,6 +86,8 @@ class Recording:
             when it was opened.
         segment: What estimates the masks, if nothing holds them.
         solved: What the report says of cameras that were solved.
+        refit: How the poses were fitted to the masks, if they were made for another body.
+        growing_fit: The same of a live source, which goes on while its frames come.
     """
 
     paths: CapturePaths
@@ -97,10 +101,17 @@ class Recording:
     live: LiveParts | None = None
     segment: Segmenter | None = None
     solved: dict[str, Any] | None = None
+    refit: Refit | None = None
+    growing_fit: GrowingFit | None = None
 
     @classmethod
     def open(
-        cls, wanted: RecordingPaths, *, size_px: int | None = None, doubtful: bool = False
+        cls,
+        wanted: RecordingPaths,
+        *,
+        size_px: int | None = None,
+        doubtful: bool = False,
+        avatars: Path | None = None,
     ) -> "Recording":
         """Finds, opens and checks the parts.
 
@@ -108,13 +119,14 @@ class Recording:
             wanted: What the user named.
             size_px: Longer side that training will see.
             doubtful: Leaves out whether they fit together, for somebody who wants to find out.
+            avatars: The person of a finished avatar, as a file, to whom the poses are to belong.
 
         Raises:
             BadInput: If one is missing or unreadable, or they do not fit together.
         """
         camera = camera_address(wanted.video)
         if wanted.live or camera is not None:
-            return cls._open_live(wanted, camera, size_px)
+            return cls._open_live(wanted, camera, size_px, avatars)
         named = segmenter_name(wanted.masks)
         given_masks = wanted.masks if named is None else None
         paths = find_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
@@ -136,20 +148,21 @@ class Recording:
         motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
         if paths.cameras is None and motion.intrinsic is None and motion.lens is None:
             cameras = focal_from_masks(cameras, motion, shaped, source, masks)
-        shaped, motion, fitted = refit_to_masks(motion, shaped, cameras, source, masks)
-        if wanted.height_m is not None:
-            shaped, motion = _grown(shaped, motion, cameras, source, wanted.height_m)
+        fit = person_of(
+            motion, shaped, cameras, source, masks, avatars=avatars, height_m=wanted.height_m
+        )
         estimated = named or (OURS if masks is None and not source.has_alpha else None)
         recording = cls(
             paths=paths,
             source=source,
-            motion=motion,
+            motion=fit.motion,
             masks=masks,
             cameras=cameras,
-            shaped=shaped,
+            shaped=fit.shaped,
             size_px=size_px,
-            notes=tuple(_notes(body, motion, masks, cameras, segment=estimated, fitted=fitted)),
-            segment=None if estimated is None else make_segmenter(estimated, shaped),
+            notes=tuple(notes_of(fit, masks, cameras, segment=estimated)),
+            segment=None if estimated is None else make_segmenter(estimated, fit.shaped),
+            refit=fit.refit,
         )
         if not doubtful:
             recording.check()
@@ -157,7 +170,11 @@ class Recording:
 
     @classmethod
     def _open_live(
-        cls, wanted: RecordingPaths, camera: str | None, size_px: int | None
+        cls,
+        wanted: RecordingPaths,
+        camera: str | None,
+        size_px: int | None,
+        avatars: Path | None,
     ) -> "Recording":
         """The same of a live source, whose first picture and first pose are waited for."""
         if wanted.cameras == "solve" or wanted.height_m is not None:
@@ -179,18 +196,23 @@ class Recording:
             cameras = upright_cameras(paths.cameras, source)
         else:
             cameras = default_cameras(motion, source.size_px)
-        shaped = shaped_for(body, motion)
+        shaped, given = shaped_for(body, motion), paths.cameras is not None
+        live.poses.place(lambda read: placed(read, shaped, cameras, cameras_given=given))
+        fit, growing_fit = live_person(
+            live.poses.motion, shaped, avatars=avatars, masked=named is None
+        )
         recording = cls(
             paths=paths,
             source=source,
-            motion=motion,
+            motion=fit.motion,
             masks=None,
             cameras=cameras,
-            shaped=shaped,
+            shaped=fit.shaped,
             size_px=size_px,
-            notes=tuple(_notes(body, motion, None, cameras, segment=named)),
+            notes=tuple(notes_of(fit, None, cameras, segment=named)),
             live=live,
-            segment=None if named is None else make_segmenter(named, shaped),
+            segment=None if named is None else make_segmenter(named, fit.shaped),
+            growing_fit=growing_fit,
         )
         recording.observer()
         recording.footprint_m()
@@ -212,7 +234,8 @@ class Recording:
     def observer(self) -> Callable[[Frame], Observation | Dropped]:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
-            return self.live.observer(self.source, self.cameras, self.size_px, self.segment)
+            seen = self.live.observer(self.source, self.cameras, self.size_px, self.segment)
+            return seen if self.growing_fit is None else self.growing_fit.observing(seen)
         return observer(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
             segment=self.segment,
@@ -226,6 +249,21 @@ class Recording:
             return {"masks": f"estimated by {name}", "mask_agreement": agreement}
         source = "alpha channel" if self.masks is None else self.masks.path.name
         return {"masks": source, "mask_agreement": None}
+
+    def told_at_the_end(self) -> Iterator[str]:
+        """What could not be said before the frames came."""
+        growing = self.growing_fit
+        if growing is not None and growing.refit is not None:
+            yield f"{growing.refit.in_words()} (By the first {growing.frames} frames.)"
+
+    def told_of_body(self) -> dict[str, float | bool] | None:
+        """How the poses were fitted to the body that is used; None if that was not needed."""
+        growing = self.growing_fit
+        refit = self.refit if growing is None else growing.refit
+        if refit is None:
+            return None
+        told = refit.as_json()
+        return told if growing is None else {**told, "frames": growing.frames}
 
     def camera_of_row(self, row: int) -> Camera:
         """The camera that sees one of the poses."""
@@ -259,50 +297,3 @@ class Recording:
         longer = max(camera.size_px)
         shrinking = min(1.0, (self.size_px or longer) / longer)
         return depth / (max(camera.focal_px) * shrinking)
-
-
-def _grown(
-    shaped: ShapedBody, motion: Motion, cameras: CameraTrack, source: Source, height_m: float
-) -> tuple[ShapedBody, Motion]:
-    """Body and motion of a person whose height is known.
-
-    Raises:
-        BadInput: If given cameras move: then their world has a size already.
-    """
-    if cameras.moves:
-        raise BadInput(
-            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
-            "size of its own. Leave one of them out."
-        )
-    taller = as_tall(shaped, height_m)
-    return taller, farther(Claim.of(motion, cameras, source), shaped, taller)
-
-
-def _notes(
-    body: Body,
-    motion: Motion,
-    masks: Masks | None,
-    cameras: CameraTrack,
-    *,
-    segment: str | None = None,
-    fitted: str = "",
-) -> Iterator[str]:
-    if motion.note is not None:
-        yield motion.note
-    if cameras.note is not None:
-        yield cameras.note
-    if segment is not None:
-        yield (
-            f"Masks are estimated from the pictures and the poses (segmenter:{segment}); a "
-            "segmenter's own masks (--masks) are sharper around hair and hands."
-        )
-    if masks is not None and masks.inverted:
-        yield f"The masks in {masks.path} show the background; they were turned."
-    if motion.model != body.family:
-        yield (
-            f"The poses were made for the body model {motion.model!r}, but {body.family!r} is used "
-            f"(--body), with joints where the mean shape has them. {fitted}".strip()
-        )
-    lost = len(motion) - int(motion.valid.sum())
-    if lost:
-        yield f"{lost} of {len(motion)} poses are not valid; their frames are left out."

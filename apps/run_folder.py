@@ -39,6 +39,11 @@ class RunFolder:
         return self.path / "checkpoint"
 
     @property
+    def person(self) -> Path:
+        """The body that the avatar has, for videos that are added later."""
+        return self.checkpoint / "person.npz"
+
+    @property
     def cameras(self) -> Path:
         """Cameras that were solved here; the folder of the same name without ending made them."""
         return self.path / "cameras.npz"

@@ -1,5 +1,6 @@
 """Poses that a tracker still writes: read again whenever their file has changed."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import final
 
@@ -55,6 +56,7 @@ class GrowingPoses:
         self._default_model, self._started_at = default_model, started_at
         self._version: tuple[int, int] | None = None
         self._motion: Motion | None = None
+        self._placed: Callable[[Motion], Motion] = lambda motion: motion
         self._row_of: dict[int, int] = {}
         self._trouble = f"There are no poses {path}."
         deadline = pace.now() + first_within_s
@@ -72,6 +74,10 @@ class GrowingPoses:
         """All poses that have come so far."""
         assert self._motion is not None
         return self._motion
+
+    def place(self, placed: Callable[[Motion], Motion]) -> None:
+        """Brings these poses, and all that come, to the body and the cameras that are used."""
+        self._placed, self._motion = placed, placed(self.motion)
 
     def of(self, frame: Frame) -> BodyPose | str:
         """The pose of a frame; waits for it. Or why there is none."""
@@ -122,7 +128,8 @@ class GrowingPoses:
         if version == self._version:
             return
         try:
-            self._motion = read_motion(self._path, default_model=self._default_model)
+            read = read_motion(self._path, default_model=self._default_model)
+            self._motion = self._placed(read)
         except BadInput as cause:
             self._trouble = str(cause)
             return

@@ -10,24 +10,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.errors import BadInput
-from capture.source import Source
 from preprocess.body import ShapedBody
-from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.diagnosis import mean
-from preprocess.doctor.evidence import Evidence, Witness, gather
+from preprocess.doctor.evidence import Evidence, Witness
 from preprocess.kinematics import rotation_matrices
-from preprocess.masks import Masks
-from preprocess.observe import check_cameras, check_masks
 from preprocess.pose import Motion
-from preprocess.silhouette import SkinPoints, agreement, silhouette
+from preprocess.silhouette import agreement, silhouette
 
 FRAMES = 8
 STEPS = 110
 FIRST_LOG, FIRST_SHIFT_M = 0.08, 0.03
 """First steps of the search: of the distance's logarithm, and of the pelvis's shift."""
-BETTER = 0.02
+SHY = 4.0
+"""What a shift costs, in agreement per square metre: seen from one side alone, a body is nearer or
+was moved towards the camera, and nothing else tells."""
 LEAST, GAIN = 0.6, 0.01
 """A refit is taken if body and masks then agree by so much, and by more than before."""
 
@@ -54,6 +51,31 @@ class Refit:
         """Whether the poses fit so much better that they are to be taken."""
         return self.after >= LEAST and self.after > self.before + GAIN
 
+    def in_words(self) -> str:
+        """What was done, for people."""
+        if not self.worth_it and self.before >= LEAST:
+            return f"Distances fit the masks as they are (agreement {self.before:.2f})."
+        if not self.worth_it:
+            return (
+                f"Their distances could not be fitted to the masks ({self.before:.2f} before, "
+                f"{self.after:.2f} after); they stay as they are."
+            )
+        return (
+            f"Distances were divided by {self.nearer:.3f} and the pelvis moved by "
+            f"{100.0 * float(np.linalg.norm(self.shift_m)):.1f} cm to fit the masks: agreement "
+            f"{self.before:.2f} before, {self.after:.2f} after."
+        )
+
+    def as_json(self) -> dict[str, float | bool]:
+        """The same for the report."""
+        return {
+            "taken": self.worth_it,
+            "agreement_before": round(self.before, 4),
+            "agreement_after": round(self.after, 4),
+            "distances_divided_by": round(self.nearer, 4),
+            "pelvis_moved_cm": round(100.0 * float(np.linalg.norm(self.shift_m)), 2),
+        }
+
 
 def refitted(claim: Claim, evidence: Evidence) -> Refit:
     """Fits SMPL's poses to another body with the masks of a few frames.
@@ -68,7 +90,8 @@ def refitted(claim: Claim, evidence: Evidence) -> Refit:
     scenes = [scene for witness in some.witnesses if (scene := _scene(claim, some, witness))]
 
     def agreed(x: Float[np.ndarray, "4"]) -> float:
-        return float(np.mean([scene.score(float(np.exp(x[0])), x[1:]) for scene in scenes]))
+        scores = [scene.score(float(np.exp(x[0])), x[1:]) for scene in scenes]
+        return float(np.mean(scores)) - SHY * float(x[1:] @ x[1:])
 
     found = np.zeros(4)
     if scenes:
@@ -88,62 +111,6 @@ def refitted(claim: Claim, evidence: Evidence) -> Refit:
     )
 
 
-def refit_to_masks(
-    motion: Motion,
-    shaped: ShapedBody,
-    cameras: CameraTrack,
-    source: Source,
-    masks: Masks | None,
-) -> tuple[ShapedBody, Motion, str]:
-    """Body and motion as they fit the masks, if the tracker had another body in mind.
-
-    The body's own mean proportions are tried beside SMPL's; they are taken if they fit better by
-    `BETTER`: files say SMPL of poses that were fitted to something else.
-
-    Args:
-        motion: In the cameras' world.
-        shaped: The body that is used, with SMPL's mean joints (`shaped_for`).
-        cameras: Of the frames' size.
-        source: The frames; none is decoded.
-        masks: The masks; None if the pictures have an alpha channel, and then nothing is done.
-
-    Returns:
-        The body, its motion, and what was done, in words.
-    """
-    if masks is None or shaped.body.family in ("smpl", motion.model):
-        return shaped, motion, ""
-    claim = Claim.of(motion, cameras, source)
-    try:
-        rows = check_masks(masks, source), check_cameras(cameras, source)
-        evidence = gather(
-            source, masks, *rows, SkinPoints.of(shaped), count=FRAMES, without=cameras.missing
-        )
-    except BadInput:  # parts that do not fit, or nobody in these masks: that is said elsewhere
-        return shaped, motion, ""
-    refit = refitted(claim, evidence)
-    own = shaped.body.with_shape()
-    other = refitted(claim, Evidence(witnesses=evidence.witnesses, skin=SkinPoints.of(own)))
-    if other.worth_it and other.after > refit.after + BETTER:
-        return own, other.motion, f"{_in_words(other)} Its own proportions fit better than SMPL's."
-    return shaped, (refit.motion if refit.worth_it else motion), _in_words(refit)
-
-
-def _in_words(refit: Refit) -> str:
-    """What was done, for people."""
-    if not refit.worth_it and refit.before >= LEAST:
-        return f"Distances fit the masks as they are (agreement {refit.before:.2f})."
-    if not refit.worth_it:
-        return (
-            f"Their distances could not be fitted to the masks ({refit.before:.2f} before, "
-            f"{refit.after:.2f} after); they stay as they are."
-        )
-    return (
-        f"Distances were divided by {refit.nearer:.3f} and the pelvis moved by "
-        f"{100.0 * float(np.linalg.norm(refit.shift_m)):.1f} cm to fit the masks: agreement "
-        f"{refit.before:.2f} before, {refit.after:.2f} after."
-    )
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scene:
     """One frame: the posed skin, and what a distance and a shift make of it."""
@@ -158,10 +125,20 @@ class _Scene:
     def score(self, nearer: float, shift: Float[np.ndarray, "3"]) -> float:
         """Agreement after both; a camera in the world's middle sees no difference."""
         camera = self.claim.camera(self.witness.camera_row, self.size_px)
-        eye = camera.center_world
-        there = eye + (self.pelvis - eye) / nearer + self.root @ shift
+        there = moved_pelvis(self.pelvis, camera.center_world, self.root, nearer, shift)
         points = self.points + (there - self.pelvis).astype(np.float32)
         return agreement(silhouette(points, camera), self.witness.alpha)
+
+
+def moved_pelvis(
+    pelvis: Float[np.ndarray, "*poses 3"],
+    eye: Float[np.ndarray, "*poses 3"],
+    root: Float[np.ndarray, "*poses 3 3"],
+    nearer: float,
+    shift_m: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "*poses 3"]:
+    """Where a pelvis is after a refit: nearer to the camera's eye, then shifted in its own axes."""
+    return eye + (pelvis - eye) / nearer + root @ shift_m
 
 
 def _scene(claim: Claim, evidence: Evidence, witness: Witness) -> _Scene | None:
@@ -185,6 +162,6 @@ def _applied(
     """The whole motion with distances divided, each from its own camera, and the pelvis shifted."""
     eyes = claim.eyes()[claim.camera_rows()]
     pelves = shaped.joints[0] + claim.motion.root_translations
-    moved = eyes + (pelves - eyes) / nearer
-    moved += rotation_matrices(claim.motion.root_rotations) @ shift
+    roots = rotation_matrices(claim.motion.root_rotations)
+    moved = moved_pelvis(pelves, eyes, roots, nearer, shift)
     return replace(claim.motion, root_translations=moved - shaped.joints[0])

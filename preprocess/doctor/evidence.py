@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.errors import BadInput
+from capture.frame import Frame
+from capture.images import list_images, read_image
 from capture.source import Source
 from preprocess.doctor.claim import Claim
 from preprocess.masks import Masks
@@ -21,8 +23,6 @@ FIRST_LOOK_PX = 256.0
 """Longer side of the masks in which the person's height is measured."""
 MOST_KEPT = 256
 """Posed skins that are kept: 25 MB."""
-MOST_READ = 400
-"""Frames of a source with an alpha channel that are decoded to find some to look at."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -156,12 +156,15 @@ def _from_masks(
 def _from_pictures(
     source: Source, frames: Sequence[int], size_px: tuple[int, int]
 ) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
-    found, wanted = [], set(frames)
-    for number, frame in enumerate(source.frames()):
-        if frame.index in wanted:
-            found.append((frame.index, own_alpha(frame, size_px)))
-        if number >= MOST_READ or frame.index >= frames[-1]:
-            break
+    found, pictures = [], list_images(source.path)  # only pictures have alpha channels
+    for index in frames:
+        try:
+            rgb, alpha = read_image(pictures[index])
+        except (BadInput, OSError):  # one of many; that it is damaged is said elsewhere
+            continue
+        if rgb.shape[1::-1] == source.size_px:
+            frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
+            found.append((index, own_alpha(frame, size_px)))
     return found
 
 

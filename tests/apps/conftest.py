@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from apps import deliver, ingest, learn, play, snapshot
+from apps.recording import Recording, RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
@@ -75,9 +76,9 @@ def run(film, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def rig(shaped) -> Rig:
-    """The rig of the embedded body, which all of these films are about."""
-    return Rig.of(shaped)
+def rig(film) -> Rig:
+    """The rig of the actor, whom all of these films are about."""
+    return Rig.of(Recording.open(RecordingPaths(video=film)).shaped)
 
 
 @pytest.fixture

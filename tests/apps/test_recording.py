@@ -14,7 +14,7 @@ from benchmarks import spoils
 from capture.errors import BadInput
 from preprocess.kinematics import rotation_matrices
 from preprocess.poses import read_poses
-from preprocess.poses.place import placed
+from preprocess.poses.place import SMPLX_PELVIS, placed
 from preprocess.rotations import axis_angles
 
 
@@ -133,3 +133,42 @@ def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
     changed(capture / "poses.npz", K=intrinsic)
     found = Recording.open(RecordingPaths(video=capture))
     assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
+
+
+def test_a_live_strangers_poses_are_fitted_while_they_come(film, own, tmp_path):
+    folder = tmp_path / "live"
+    (folder / "images").mkdir(parents=True)
+    shutil.copytree(film / "masks", folder / "masks")
+    for frame in own.source.frames():
+        Image.fromarray(frame.rgb).save(folder / "images" / f"{frame.index:04d}.png")
+    (folder / "images" / "DONE").touch()
+    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
+    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
+    far = own.motion.root_translations.copy()
+    far[:, 2] -= 0.4
+    np.savez(folder / "poses.npz", **rows, transl=far)
+    cameras = f"{film}/cameras.npz"
+    live = Recording.open(RecordingPaths(video=folder, cameras=cameras, live=True, idle_s=1.0))
+    assert any("fitted to the masks as they come" in note for note in live.notes)
+    assert live.told_of_body() is None
+    assert len(list(live.observations())) == 24
+    (said,) = live.told_at_the_end()
+    assert "By the first 16 frames" in said
+    told = live.told_of_body()
+    assert told["taken"]
+    assert told["agreement_after"] > max(0.7, told["agreement_before"] + 0.05)
+
+
+def test_smplx_poses_of_a_live_source_turn_about_smpls_pelvis(film, own, tmp_path):
+    folder = tmp_path / "live"
+    folder.mkdir()
+    for frame in list(own.source.frames())[:2]:
+        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
+    (folder / "DONE").touch()
+    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smplx")}
+    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
+    np.savez(folder / "poses.npz", **rows, transl=own.motion.root_translations)
+    named = {"video": folder, "cameras": f"{film}/cameras.npz", "masks": film / "masks"}
+    live = Recording.open(RecordingPaths(**named, live=True, idle_s=1.0))
+    pelves = live.shaped.joints[0] + live.motion.root_translations
+    np.testing.assert_allclose(pelves, SMPLX_PELVIS + own.motion.root_translations)
