@@ -80,8 +80,11 @@ class Player:
             BadInput: If the file is no sound package, or has no such tier, or there is no such
                 provider here.
         """
-        package = read_package(Path(path), tier=tier)
-        return cls(package, tier=tier, threads=threads, provider=provider)
+        try:
+            package = read_package(Path(path), tier=tier)
+            return cls(package, tier=tier, threads=threads, provider=provider)
+        except BadInput as cause:
+            raise cause if str(path) in str(cause) else BadInput(f"{path}: {cause}") from cause
 
     def render(
         self,

@@ -102,6 +102,16 @@ class Encoded(Inert):
     """_codecs.encode(text, "latin1"): how Python 3 writes bytes for Python 2."""
 
 
+class Nothing(Inert):
+    """bytes(): how Python 3 writes b"" for Python 2, as in an array without rows."""
+
+    def __new__(cls, *arguments: Any) -> Any:
+        """The empty bytes themselves."""
+        if arguments:
+            raise pickle.UnpicklingError("bytes made of something")
+        return b""
+
+
 class Tensor(Inert):
     """torch's _rebuild_tensor_v2(storage, offset, size, stride, …)."""
 
@@ -170,6 +180,7 @@ ALLOWED: dict[tuple[str, str], type] = {
             (("__builtin__", "builtins"), "object", Named),
             (("__builtin__", "builtins"), "dict", Named),
             (("__builtin__", "builtins"), "set", set),
+            (("__builtin__", "builtins"), "bytes", Nothing),
         )
         for module in modules
     },

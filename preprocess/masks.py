@@ -192,7 +192,7 @@ def _is_plain(path: Path) -> bool:
 def _load(path: Path) -> Shaped[np.ndarray, "..."]:
     try:
         return np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError, EOFError) as cause:
+    except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
         raise BadInput(f"{path} is no readable .npy of numbers ({cause}).") from cause
 
 

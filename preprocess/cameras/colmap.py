@@ -1,6 +1,8 @@
 """COLMAP models, 3.x and 4.x, binary and text, read by pycolmap."""
 
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,9 @@ from preprocess.cameras.named import NamedCamera
 
 PLACES = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""
+
+LEAST_CAMERA, IMAGE_HEAD, POINT = 24 + 3 * 8, 4 + 7 * 8 + 4, 24
+"""Bytes of a camera in cameras.bin, before a picture's name in images.bin, of a point behind it."""
 
 PADDED = {
     "SIMPLE_PINHOLE": lambda p: (),
@@ -44,12 +49,14 @@ def read_colmap(folder: Path) -> list[NamedCamera]:
 
     pycolmap.logging.minloglevel = 3  # it would print to stderr what is said here
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        with TemporaryDirectory() as bare:
+            _without_points(folder, Path(bare))
+            model = pycolmap.Reconstruction(bare)
         images = sorted(
             (model.image(number) for number in model.reg_image_ids()),
             key=lambda image: natural_key(Path(image.name)),
         )
-    except (RuntimeError, ValueError, IndexError, OSError) as cause:
+    except Exception as cause:  # what C++ throws; a damaged count is a bad_alloc
         raise BadInput(f"{folder} holds no COLMAP model that can be read ({cause}).") from cause
     if not images:
         raise BadInput(f"The COLMAP model in {folder} has no registered picture.")
@@ -57,6 +64,39 @@ def read_colmap(folder: Path) -> list[NamedCamera]:
         NamedCamera(name=Path(image.name).stem, camera=_camera(image, model, folder))
         for image in images
     ]
+
+
+def _without_points(folder: Path, bare: Path) -> None:
+    """Copies a model's cameras and pictures, which is all that is wanted, once they are sound.
+
+    Counts that a damaged file claims are believed by COLMAP's reader, which then reads beyond the
+    end for minutes and fills the memory.
+
+    Raises:
+        ValueError: If counts and sizes do not fit.
+    """
+    ending = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    for part in ("cameras", "images"):
+        shutil.copyfile(folder / f"{part}{ending}", bare / f"{part}{ending}")
+    (bare / f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
+    if ending == ".txt":
+        return
+    cameras, images = ((bare / f"{part}.bin").read_bytes() for part in ("cameras", "images"))
+    if len(cameras) < 8 + LEAST_CAMERA * _count(cameras, 0):
+        raise ValueError("cameras.bin is cut off")
+    place = 8
+    for _ in range(_count(images, 0)):
+        name_ends = images.find(b"\0", place + IMAGE_HEAD)
+        if name_ends < 0:
+            raise ValueError("images.bin is cut off")
+        place = name_ends + 9 + POINT * _count(images, name_ends + 1)
+        if place > len(images):
+            raise ValueError("images.bin is cut off")
+
+
+def _count(data: bytes, place: int) -> int:
+    """COLMAP's 64-bit number of what follows."""
+    return int.from_bytes(data[place : place + 8], "little") if place + 8 <= len(data) else 1 << 62
 
 
 def _camera(image: Any, model: Any, folder: Path) -> Camera:

@@ -89,7 +89,7 @@ def pinhole(
     except (KeyError, TypeError, ValueError, OverflowError) as cause:
         raise BadInput(f"{where}: expected the numbers {', '.join(keys)}; {cause}.") from cause
     sizes = min(width, height) >= 1.0 and max(width, height) <= MOST_PX
-    if not np.isfinite([fx, fy, cx, cy]).all() or min(fx, fy) <= 0.0 or not sizes:
+    if not np.isfinite([fx, fy, cx, cy, width, height]).all() or min(fx, fy) <= 0.0 or not sizes:
         raise BadInput(
             f"{where}: focal length and size must be positive pixels, and at most {MOST_PX}."
         )

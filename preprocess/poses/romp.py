@@ -21,6 +21,8 @@ FOV_60 = Lens(share=443.4 / 512.0)
 WEAK = Lens(share=1.0)
 """The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 
+WHOLE = "video_results.npz"
+
 JUMP_M = 1.0
 """From frame to frame nobody is expected to move farther; without track numbers that tells."""
 
@@ -29,6 +31,7 @@ def tracks(content: Any, driving: bool = False) -> People | None:
     """The people of the file; None if it is none of ROMP's."""
     if not isinstance(content, dict):
         return None
+    content = content.get(WHOLE, content)  # a folder with everything in it
     sequence = content.get("sequence_results")
     if isinstance(sequence, dict) and sequence:
         return {
@@ -63,6 +66,7 @@ def _person(rows: dict[str, Any], frames: Any) -> Any:
             lens = WEAK
     return track(
         [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
+        lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed
         anchor="hips" if is_bev else "pelvis",
     )  # fmt: skip
 

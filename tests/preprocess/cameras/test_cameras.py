@@ -329,6 +329,26 @@ def test_a_damaged_colmap_model_is_refused(colmap, rng):
             read_named(folder)
 
 
+def test_counts_that_a_damaged_colmap_model_claims_are_not_believed(colmap):
+    """COLMAP's own reader would read beyond the end for minutes, and fill the memory."""
+    folder, model = colmap()
+    model.write_binary(folder)
+    huge = (1 << 60).to_bytes(8, "little")
+    for part in ("points3D", "frames", "rigs"):  # are not read at all
+        (folder / f"{part}.bin").write_bytes(huge)
+    assert len(read_named(folder)) == COUNT
+    whole = (folder / "images.bin").read_bytes()
+    name_ends = whole.find(b"\0", 8 + 64)
+    for damaged in (huge + whole[8:], whole[: name_ends + 1] + huge + whole[name_ends + 9 :]):
+        (folder / "images.bin").write_bytes(damaged)
+        with pytest.raises(BadInput, match="cut off"):
+            read_named(folder)
+    (folder / "images.bin").write_bytes(whole)
+    (folder / "cameras.bin").write_bytes(huge)
+    with pytest.raises(BadInput, match="cut off"):
+        read_named(folder)
+
+
 def test_a_world_that_is_turned_with_its_cameras_looks_the_same(cameras, points, tmp_path):
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec([0.3, -0.8, 0.1]).as_matrix()

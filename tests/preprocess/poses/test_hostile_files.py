@@ -1,7 +1,7 @@
 """Files that mean harm, and thousands of random ones: refused with a reason, or read; no worse.
 
-A few hundred are tried with every run; `IA_FUZZ=10000 pytest tests/preprocess/poses -k random`
-tries as many as one likes.
+A few hundred are tried with every run, and as many as one likes with
+`IA_FUZZ=10000 pytest tests/preprocess/poses -k random`; benchmarks.hostile tries every reader.
 """
 
 import gzip
@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.mutations import mutated, random_opcodes
 from capture.errors import BadInput
 from preprocess import pickles
 from preprocess.body_file import load_body
@@ -156,6 +157,16 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
     assert found[3] == {"é": ["b"]}
 
 
+@pytest.mark.parametrize("protocol", range(6))
+def test_arrays_without_rows_are_read_from_every_protocol(tmp_path, protocol):
+    path = tmp_path / "empty.pkl"
+    path.write_bytes(pickle.dumps({"a": np.zeros((0, 3)), "b": b"", "c": np.ones(2)}, protocol))
+    found = read_content(path)
+    assert found["a"].shape == (0, 3)
+    assert found["b"] == ""
+    np.testing.assert_array_equal(found["c"], np.ones(2))
+
+
 def test_tensors_of_every_type_and_stride_are_read(tmp_path):
     base = torch.arange(24).reshape(2, 3, 4)
     tensors = [base.to(kind) for kind in (torch.float16, torch.float64, torch.int16, torch.uint8)]
@@ -252,53 +263,6 @@ def seeds(joblib_bytes) -> list[bytes]:
     found += [torch_bytes(thing), torch_bytes(thing, new=False), json.dumps([person]).encode()]
     found += [zipped(results_npy=object_npy({"smpl_thetas": np.zeros((1, 72))}))]
     return found
-
-
-CALLS = (
-    b"cos\nsystem\n(S'true'\ntR", b"cbuiltins\neval\n(S'1'\ntR", b"(S'true'\nios\nsystem\n",
-    b"\x8c\x02os\x8c\x06system\x93", b"cnumpy\nload\n", b"cbuiltins\nset\n", b"c__main__\nx\n",
-)  # fmt: skip
-
-
-WAYS = (0, 0, 0, 0, 0, 0, 0, 1, 2, 3, 4, 4, 5, 6, 6, 7)
-"""How often each thing is done to a file: mostly a byte is changed, so that most of it is read."""
-
-
-def mutated(whole: bytes, others: list[bytes], rng: np.random.Generator) -> bytes:
-    """A file with one to three things done to it, most of them small."""
-    data = bytearray(whole)
-    for _ in range(int(rng.integers(1, 3))):
-        at, to = sorted(int(n) for n in rng.integers(0, max(len(data), 1), 2))
-        to = to if rng.random() < 0.2 else min(to, at + 4)
-        way = WAYS[int(rng.integers(0, len(WAYS)))]
-        if way == 0:
-            data[at : at + 1] = rng.bytes(1)
-        elif way == 1:
-            del data[at:to]
-        elif way == 2:
-            data[at:at] = data[at:to]
-        elif way == 3:
-            data[at:at] = rng.bytes(int(rng.integers(1, 9)))
-        elif way == 4:
-            data[at:at] = CALLS[int(rng.integers(0, len(CALLS)))]
-        elif way == 5:
-            other = others[int(rng.integers(0, len(others)))]
-            data[at:to] = other[len(other) // 3 : len(other) // 2]
-        elif way == 6:
-            data[at : at + 8] = int(rng.integers(0, 1 << 62)).to_bytes(8, "little")
-        else:
-            data = data[: max(to, len(data) - 9, 1)]
-    return bytes(data)
-
-
-def random_opcodes(rng: np.random.Generator) -> bytes:
-    """A pickle of opcodes that come as they like."""
-    opcodes = [bytes([code]) for code in pickle._Unpickler.dispatch]
-    parts = [rng.bytes(int(rng.integers(0, 4))) for _ in range(40)]
-    chosen = rng.integers(0, len(opcodes), 40)
-    calls = [CALLS[int(n)] if n < len(CALLS) else b"" for n in rng.integers(0, 60, 40)]
-    mixed = (opcodes[c] + part + call for c, part, call in zip(chosen, parts, calls, strict=True))
-    return b"\x80\x04" + b"".join(mixed) + b"."
 
 
 def random_files(count: int, joblib_bytes) -> Iterator[bytes]:

@@ -1,0 +1,342 @@
+"""Ten thousand damaged, hostile and random files through every reader.
+
+    python -m benchmarks.hostile [--files 10000] [--seed 0] [--keep DIR]
+
+Small whole files of each kind are made, and of these files with bytes changed, left out, exchanged,
+calls of something put in; archives and packages changed inside, with sums that are right; JSON with
+strange values; opcodes at random; bombs. Each is given to its reader in a process whose memory is
+limited, which notes whatever is run, written or connected to. Asked: read or refused with a message
+that names the file, nothing run, no more memory than the cap, nothing that hangs or dies.
+"""
+
+import argparse
+import gzip
+import hashlib
+import io
+import json
+import pickle
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.hardware import Hardware
+from benchmarks.hostile_seeds import make_seeds
+from benchmarks.mutations import mutated, mutated_json, mutated_zip, random_opcodes
+
+SHARES = {
+    "pickles": 30, "poses": 25, "masks": 12, "cameras": 12, "bodies": 7, "captures": 6,
+    "pictures": 5, "packages": 3,
+}  # fmt: skip
+"""Files of each reader, of a hundred."""
+BOMB_EVERY = 500
+CAP_MB = 1100
+"""Of one file: 1 GiB, which is what a stranger's file may unpack to, and some for its records."""
+HANGS_AFTER_S = 60
+ZIPS = (".npz", ".pt", ".r3d", ".iavatar")
+RUNS = (
+    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.", "socket.",
+    "webbrowser.",
+)  # fmt: skip
+CHANGES = ("os.remove", "os.rename", "os.rmdir", "shutil.")
+WATCHED = RUNS + CHANGES
+
+_seen: list[str] = []
+_watched: tuple[str, ...] = ()
+
+
+def _audit(event: str, arguments: tuple[Any, ...]) -> None:
+    if not _watched:
+        return
+    writes = event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
+    if event.startswith(_watched) or (writes and CHANGES[0] in _watched):
+        _seen.append(f"{event} {arguments!r:.200}")
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def bomb(rng: np.random.Generator) -> bytes:
+    """A small file that unpacks to more than the cap."""
+    zeros = bytes(64 << 20)
+    way = int(rng.integers(0, 4))
+    if way == 0:
+        packer = zlib.compressobj(9)
+        return b"".join(packer.compress(zeros) for _ in range(24)) + packer.flush()
+    if way == 1:
+        stream = io.BytesIO()
+        with gzip.GzipFile(fileobj=stream, mode="wb") as file:
+            for _ in range(24):
+                file.write(zeros)
+        return stream.getvalue()
+    if way == 2:
+        thing: Any = [0.0]
+        for _ in range(30):
+            thing = [thing] * 10
+        return pickle.dumps(thing)
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 33, 3)}
+    np.lib.format.write_array_header_1_0(stream, header)
+    return stream.getvalue() + bytes(64)
+
+
+def changed(whole: bytes, name: str, others: list[bytes], rng: np.random.Generator) -> bytes:
+    """One file made hostile, as its kind allows."""
+    ending = Path(name).suffix
+    if ending == ".iavatar":
+        return resealed(whole, rng)
+    if ending in ZIPS and whole.startswith(b"PK") and rng.random() < 0.7:
+        return mutated_zip(whole, rng)
+    if ending == ".json" and rng.random() < 0.7:
+        return mutated_json(whole, rng)
+    if ending == ".pkl" and rng.random() < 0.15:
+        return random_opcodes(rng)
+    return mutated(whole, others, rng)
+
+
+def resealed(whole: bytes, rng: np.random.Generator) -> bytes:
+    """A package changed inside, or outside; mostly with sums that say it is right."""
+    if rng.random() < 0.2:
+        return mutated(whole, [whole], rng)
+    data = mutated_zip(whole, rng)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    try:
+        manifest = json.loads(entries["manifest.json"])
+        for name in manifest["sha256"]:
+            manifest["sha256"][name] = hashlib.sha256(entries[name]).hexdigest()
+    except (KeyError, TypeError, ValueError):
+        return data
+    entries["manifest.json"] = json.dumps(manifest).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Generator) -> Path:
+    """Writes one; returns what its reader is given."""
+    shutil.rmtree(folder, ignore_errors=True)
+    places = sorted((seeds / kind).iterdir())
+    chosen = places[int(rng.integers(0, len(places)))]
+    target = folder / chosen.name
+    if chosen.is_dir():
+        shutil.copytree(chosen, target)
+        files = sorted(file for file in target.rglob("*") if file.is_file())
+        file = files[int(rng.integers(0, len(files)))]
+    else:
+        folder.mkdir()
+        shutil.copy(chosen, target)
+        file = target
+    others = [other.read_bytes() for other in places if other.is_file()] or [b"PK"]
+    is_bomb = number % BOMB_EVERY == 1 and kind in ("pickles", "poses", "masks", "bodies")
+    data = bomb(rng) if is_bomb else changed(file.read_bytes(), file.name, others, rng)
+    file.write_bytes(data)
+    return target
+
+
+# --- readers -------------------------------------------------------------------------------------
+
+
+def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
+    """What each kind of file is read by, as the commands do."""
+    from apps.examine import examine
+    from apps.recording import Recording, RecordingPaths
+    from capture.opening import open_source
+    from export.player import Player
+    from preprocess.body_file import load_body
+    from preprocess.camera_file import read_cameras
+    from preprocess.masks import open_masks, read_mask
+    from preprocess.person_file import read_person
+    from preprocess.poses import read_poses
+    from preprocess.poses.content import read_content
+
+    embedded, film = load_body(), open_source(seeds / "captures" / "film")
+
+    def bodies(path: Path) -> object:
+        return read_person(path, embedded) if path.stem == "person" else load_body(path)
+
+    def masks(path: Path) -> object:
+        if path.suffix == ".png":
+            return read_mask(path)
+        found = open_masks(path)
+        return [found.alpha(row, found.size_px) for row in range(found.count)]
+
+    def captures(path: Path) -> object:
+        if len(path.read_bytes() if path.is_file() else path.name) % 7 == 0:
+            examine(RecordingPaths(video=path))
+        recording = Recording.open(RecordingPaths(video=path))
+        return list(recording.observations())
+
+    def pictures(path: Path) -> object:
+        return list(open_source(path if path.suffix == ".mp4" else path.parent).frames())
+
+    def packages(path: Path) -> object:
+        player = Player.load(path)
+        golden = player.manifest.golden[0]
+        return player.render(golden.pose, golden.camera, size=32)
+
+    def cameras(path: Path) -> object:
+        return read_cameras(path, film.size_px, film)
+
+    return {
+        "pickles": read_content, "poses": read_poses, "masks": masks, "cameras": cameras,
+        "bodies": bodies, "captures": captures, "pictures": pictures, "packages": packages,
+    }  # fmt: skip
+
+
+def outcome(path: Path, read: Callable[[Path], object]) -> str:
+    """How reading one file ended."""
+    from capture.errors import BadInput
+
+    global _watched
+    _seen.clear()
+    # cameras and pictures of a COLMAP model are copied to a passing folder
+    _watched = RUNS if (path / "images.bin").exists() or (path / "images.txt").exists() else WATCHED
+    try:
+        read(path)
+    except BadInput as refusal:
+        words, joined = str(refusal), path.is_dir()  # of what does not fit together, the parts
+        named = joined or str(path.parent) in words or path.name in words
+        ended = "refused" if named else f"nameless: {words}"
+    except OSError as error:  # the commands say these, too
+        ended = f"OSError {error}" if error.filename is None else "refused"
+    except Exception as error:  # what this is about
+        ended = f"{type(error).__name__} {error}"[:200]
+    else:
+        ended = "read"
+    finally:
+        _watched = ()
+    return f"RAN {_seen[0]}" if _seen else ended
+
+
+# --- the process that reads ----------------------------------------------------------------------
+
+
+def _memory_mb(key: str) -> float:
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return float(next(line for line in lines if line.startswith(key)).split()[1]) / 1024.0
+
+
+def batch(seeds: Path, start: int, stop: int, seed: int) -> None:
+    """Reads some of the files, and says of each what came of it, a line of JSON."""
+    reads = readers(seeds)
+    kinds = [kind for kind, share in SHARES.items() for _ in range(share)]
+    kinds = [kind for kind in kinds if (seeds / kind).is_dir()]
+    for kind, read in reads.items():  # whole files first: what is loaded late is loaded now
+        for path in sorted((seeds / kind).iterdir()) if (seeds / kind).is_dir() else ():
+            ended = outcome(path, read)
+            assert ended == "read" or ended.startswith("RAN"), (path, ended)
+    sys.addaudithook(_audit)
+    limit = int((_memory_mb("VmSize") + 2.0 * CAP_MB) * (1 << 20))
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(start, stop):
+            rng = np.random.default_rng([seed, number])
+            kind = kinds[int(rng.integers(0, len(kinds)))]
+            path = hostile(kind, seeds, Path(scratch) / "file", number, rng)
+            print(json.dumps({"number": number, "kind": kind}), flush=True)
+            Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
+            before, began = _memory_mb("VmRSS"), time.process_time()
+            signal.alarm(HANGS_AFTER_S)
+            ended = outcome(path, reads[kind])
+            signal.alarm(0)
+            told = {"ended": ended, "mb": _memory_mb("VmHWM") - before, "name": path.name}
+            told["seconds"] = time.process_time() - began
+            print(json.dumps(told), flush=True)
+
+
+def batches(seeds: Path, files: int, seed: int) -> list[dict[str, Any]]:
+    """All of them, in processes that may die."""
+    found: list[dict[str, Any]] = []
+    while len(found) < files:
+        start, stop = len(found), min(files, len(found) + 1000)
+        command = [sys.executable, "-m", "benchmarks.hostile", "--batch", str(seeds)]
+        command += [str(start), str(stop), str(seed)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        ours = (line for line in done.stdout.splitlines() if line.startswith(('{"num', '{"end')))
+        lines = [json.loads(line) for line in ours]  # libraries print, too
+        heads, ends = lines[::2], lines[1::2]
+        found += [{**a, **b} for a, b in zip(heads, ends, strict=False)]
+        if len(ends) < len(heads):  # it died of the last one
+            last = done.stderr.strip().splitlines()[-1:] or [""]
+            died = f"DIED {done.returncode} {last[0]}"
+            found.append({**heads[-1], "ended": died, "mb": 0.0, "seconds": 0.0, "name": ""})
+        elif not heads or done.returncode:
+            raise RuntimeError(done.stderr[-3000:])
+    return found
+
+
+def package_of(film: Path, scratch: Path) -> Path:
+    """An avatar of the film, as small as one gets."""
+    from apps import ingest
+
+    run = scratch / "run"
+    code = ingest.main([str(film), "--out", str(run), "--seconds", "6", "--threads", "1"])
+    assert code == 0, "no avatar to begin with"
+    return run / "avatar.iavatar"
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--batch"]:
+        seeds, start, stop, seed = sys.argv[2:]
+        batch(Path(seeds), int(start), int(stop), int(seed))
+        return
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--files", type=int, default=10_000)
+    arguments.add_argument("--seed", type=int, default=0)
+    arguments.add_argument("--package", type=Path, help="an avatar; without it one is learnt")
+    arguments.add_argument("--no-packages", action="store_true")
+    given = arguments.parse_args()
+    print("\n".join(Hardware.here().lines()))
+    with tempfile.TemporaryDirectory() as scratch:
+        seeds = Path(scratch) / "seeds"
+        make_seeds(seeds)
+        if not given.no_packages:
+            package = given.package or package_of(seeds / "captures" / "film", Path(scratch))
+            (seeds / "packages").mkdir()
+            shutil.copy(package, seeds / "packages" / "avatar.iavatar")
+        found = batches(seeds, given.files, given.seed)
+    sys.exit(0 if told(found) else 1)
+
+
+def told(found: list[dict[str, Any]]) -> bool:
+    """Prints a row for each reader and whatever went wrong; whether nothing did."""
+    by_kind: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for each in found:
+        by_kind[each["kind"]].append(each)
+    print(f"{'':<10}{'files':>7}{'read':>7}{'refused':>9}{'other':>7}{'most MB':>9}{'most s':>8}")
+    for kind, files in [*by_kind.items(), ("all", found)]:
+        ended = Counter(each["ended"] for each in files)
+        other = len(files) - ended["read"] - ended["refused"]
+        most = max(each["mb"] for each in files), max(each["seconds"] for each in files)
+        print(
+            f"{kind:<10}{len(files):>7}{ended['read']:>7}{ended['refused']:>9}{other:>7}"
+            f"{most[0]:>9.0f}{most[1]:>8.1f}"
+        )
+    slowest, largest = (max(found, key=lambda each: each[key]) for key in ("seconds", "mb"))
+    for word, each in (("slowest", slowest), ("largest", largest)):
+        print(f"{word}: {each['number']} {each['kind']}/{each['name']}: {each['ended']}")
+    wrong = [
+        each for each in found
+        if each["ended"] not in ("read", "refused") or each["mb"] > CAP_MB
+    ]  # fmt: skip
+    for each in wrong[:60]:
+        print(f"✗ {each['number']} {each['kind']}/{each['name']}: {each['ended']} {each['mb']:.0f}")
+    return not wrong
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Whole files made into damaged, hostile and random ones."""
+
+import io
+import json
+import pickle
+import zipfile
+from typing import Any
+
+import numpy as np
+
+CALLS = (
+    b"cos\nsystem\n(S'true'\ntR", b"cbuiltins\neval\n(S'1'\ntR", b"(S'true'\nios\nsystem\n",
+    b"\x8c\x02os\x8c\x06system\x93", b"cnumpy\nload\n", b"cbuiltins\nset\n", b"c__main__\nx\n",
+)  # fmt: skip
+"""Pieces of pickles that call something."""
+
+WAYS = (0, 0, 0, 0, 0, 0, 0, 1, 2, 3, 4, 4, 5, 6, 6, 7)
+"""How often each thing is done to a file: mostly a byte is changed, so that most of it is read."""
+
+STRANGE: tuple[Any, ...] = (
+    None, True, -1, 0, 1 << 62, 1e308, float("nan"), float("inf"), "", "../../etc/passwd", [], {},
+    [[]], [0.0] * 9, "x" * 3000,
+)  # fmt: skip
+"""What stands in place of a value of JSON."""
+
+
+def mutated(whole: bytes, others: list[bytes], rng: np.random.Generator) -> bytes:
+    """A file with one to three things done to it, most of them small."""
+    data = bytearray(whole)
+    for _ in range(int(rng.integers(1, 3))):
+        at, to = sorted(int(n) for n in rng.integers(0, max(len(data), 1), 2))
+        to = to if rng.random() < 0.2 else min(to, at + 4)
+        way = WAYS[int(rng.integers(0, len(WAYS)))]
+        if way == 0:
+            data[at : at + 1] = rng.bytes(1)
+        elif way == 1:
+            del data[at:to]
+        elif way == 2:
+            data[at:at] = data[at:to]
+        elif way == 3:
+            data[at:at] = rng.bytes(int(rng.integers(1, 9)))
+        elif way == 4:
+            data[at:at] = CALLS[int(rng.integers(0, len(CALLS)))]
+        elif way == 5:
+            other = others[int(rng.integers(0, len(others)))]
+            data[at:to] = other[len(other) // 3 : len(other) // 2]
+        elif way == 6:
+            data[at : at + 8] = int(rng.integers(0, 1 << 62)).to_bytes(8, "little")
+        else:
+            data = data[: max(to, len(data) - 9, 1)]
+    return bytes(data)
+
+
+def mutated_zip(whole: bytes, rng: np.random.Generator) -> bytes:
+    """An archive with one entry mutated inside, left out, or there twice; its sums are right."""
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        entries = [(info.filename, archive.read(info)) for info in archive.infolist()]
+    chosen, way = int(rng.integers(0, len(entries))), rng.random()
+    name, content = entries[chosen]
+    if way < 0.1 and len(entries) > 1:
+        del entries[chosen]
+    elif way < 0.15:
+        entries.append((f"../{name}", content))
+    elif name.endswith(".json"):
+        entries[chosen] = (name, mutated_json(content, rng))
+    else:
+        entries[chosen] = (name, mutated(content, [c for _, c in entries], rng))
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in entries:
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def mutated_json(whole: bytes, rng: np.random.Generator) -> bytes:
+    """JSON with one or two values exchanged for something strange, or left out."""
+    content = json.loads(whole)
+    for _ in range(int(rng.integers(1, 3))):
+        places = list(_places(content))
+        if not places:
+            break
+        parent, key = places[int(rng.integers(0, len(places)))]
+        if rng.random() < 0.2:
+            del parent[key]
+        else:
+            parent[key] = STRANGE[int(rng.integers(0, len(STRANGE)))]
+    return json.dumps(content).encode()
+
+
+def _places(content: Any) -> Any:
+    """Every container of a JSON, with each of its keys."""
+    keys = range(len(content)) if isinstance(content, list) else content
+    for key in list(keys) if isinstance(content, list | dict) else ():
+        yield content, key
+        yield from _places(content[key])
+
+
+def random_opcodes(rng: np.random.Generator) -> bytes:
+    """A pickle of opcodes that come as they like."""
+    opcodes = [bytes([code]) for code in pickle._Unpickler.dispatch]  # type: ignore[attr-defined]
+    parts = [rng.bytes(int(rng.integers(0, 4))) for _ in range(40)]
+    chosen = rng.integers(0, len(opcodes), 40)
+    calls = [CALLS[int(n)] if n < len(CALLS) else b"" for n in rng.integers(0, 60, 40)]
+    mixed = (opcodes[c] + part + call for c, part, call in zip(chosen, parts, calls, strict=True))
+    return b"\x80\x04" + b"".join(mixed) + b"."
