@@ -1,6 +1,7 @@
 """ia-check: says in seconds what is wrong with a capture, and how to mend it."""
 
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from apps.sheet import write_sheet
 from apps.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
-from preprocess.doctor.diagnosis import USABLE
+from preprocess.doctor.diagnosis import GOOD, USABLE
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -134,8 +135,8 @@ def check(given: CheckArguments, console: Console) -> int:
         write_mended(examined, given.fix)
         console.made("mended", given.fix)
         return DONE if examined.after >= USABLE else BAD_INPUT
-    if examined.causes:
-        console.say(f"Mend it:  ia-check {given.video} … --fix OUT")
+    if examined.causes and not _mends_itself(examined):
+        console.say(f"Mend it:  ia-check {shlex.quote(str(given.video))} … --fix OUT")
     return BAD_INPUT if examined.verdict == "unusable" else DONE
 
 
@@ -171,7 +172,7 @@ def unreadable(why: str) -> dict[str, Any]:
 def _say(examined: Examined, console: Console) -> None:
     for note in examined.recording.notes:
         console.warn(note)
-    for sentence in examined.odd:
+    for sentence in (*examined.recording.source.warnings, *examined.odd):
         console.warn(sentence)
     if examined.refused is not None:
         console.say(f"ia-ingest would refuse it: {examined.refused}")
@@ -186,8 +187,18 @@ def _say(examined: Examined, console: Console) -> None:
         console.say(f"It looks as if {cure.words} ({cure.cause}).")
     if examined.causes:
         console.say(f"Undone, they would agree by {examined.after:.2f}.")
+    elif examined.verdict != "good" and examined.now >= GOOD:
+        console.say("So they fit where there are both; what is wrong is said above.")
     elif examined.verdict != "good":
         console.say("None of the usual mistakes explains it.")
+    if _mends_itself(examined):
+        console.say("ia-ingest turns such masks by itself: nothing needs to be done.")
+
+
+def _mends_itself(examined: Examined) -> bool:
+    """Whether all that is wrong is what ia-ingest undoes without being asked."""
+    masks = examined.recording.masks
+    return examined.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
 
 if __name__ == "__main__":

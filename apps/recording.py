@@ -288,11 +288,11 @@ class Recording:
         camera = self.cameras[0]
         if depth <= 0.0:
             raise BadInput(
-                f"The person is {abs(depth):.2f} m behind the camera; poses were expected in the "
-                "camera's world, in metres, with OpenCV axes (x right, y down, z forward). "
-                "Do poses and cameras come from the same run? Poses in a world need the cameras of "
-                "that world; without them, and with --cameras solve, poses must be in each frame's "
-                "own camera."
+                f"The person is at the camera or behind it (depth {depth:.2f} m); poses were "
+                "expected in the camera's world, in metres, with OpenCV axes (x right, y down, "
+                "z forward). Do poses and cameras come from the same run? Poses in a world need "
+                "the cameras of that world; without them, and with --cameras solve, poses must be "
+                "in each frame's own camera."
             )
         longer = max(camera.size_px)
         shrinking = min(1.0, (self.size_px or longer) / longer)

@@ -175,7 +175,7 @@ def _picture_size(path: Path) -> tuple[int, int]:
     from preprocess.cameras.door import read_named
     from preprocess.npz import read_npz
 
-    if path.suffix != ".npz":
+    if path.suffix.lower() != ".npz":
         return read_named(path)[0].camera.size_px
 
     arrays = read_npz(path, ("width", "height", "intrinsic"))

@@ -5,11 +5,15 @@ from pathlib import Path
 from capture.camera_device import CameraDevice
 from capture.errors import BadInput
 from capture.growing import GrowingFolder
-from capture.images import ImageFolder, list_images
+from capture.images import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.pace import Pace
 from capture.selection import Selection
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES, VideoFile
+
+HEIC = frozenset({".heic", ".heif"})
+NO_VIDEO = HEIC | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
+"""Endings of files that people name by mistake."""
 
 
 def open_source(path: Path, *, frames: slice | None = None) -> Source:
@@ -26,6 +30,11 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
     if not path.exists():
         raise BadInput(f"{path} does not exist; a video or a folder of pictures was expected.")
     if not path.is_dir():
+        if path.suffix.lower() in IMAGE_SUFFIXES | NO_VIDEO:
+            raise BadInput(
+                f"{path} is no video; expected one ({', '.join(sorted(VIDEO_SUFFIXES))}), or a "
+                "folder of pictures."
+            )
         return VideoFile(path, selection)
     if (path / "images").is_dir():
         return ImageFolder(path / "images", selection)
@@ -33,10 +42,16 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
     if list_images(path) and not videos:
         return ImageFolder(path, selection)
     if len(videos) != 1:
-        found = ", ".join(file.name for file in videos) or "neither"
+        if videos:
+            found, advice = ", ".join(file.name for file in videos), "Name the video itself."
+        else:
+            endings = {file.suffix.lower() for file in path.iterdir() if file.suffix}
+            found = f"files ending in {', '.join(sorted(endings))}" if endings else "neither"
+            heic = "HEIC pictures must be converted, to JPEG or PNG."
+            advice = heic if endings & HEIC else "Name the folder that holds them."
         raise BadInput(
             f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
-            f"{found}. Name the video itself."
+            f"{found}. {advice}"
         )
     return VideoFile(videos[0], selection)
 

@@ -38,7 +38,7 @@ COLOR_STEP, DENSITY_STEP, POSITION_STEP, NORMAL_STEP = 8, 16, 32, 7
 54 %, of positions a millimetre, of normals three degrees."""
 EMPTY = (
     f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
-    "Nothing was written. Train it longer (--resume), or check the masks."
+    "No package was written. Train it longer (--resume), or check the masks."
 )
 
 

@@ -266,7 +266,7 @@ def _check_pictures(
     if tier == "hq" and score < LOWEST_PSNR:
         raise ExportRefused(
             f"The player draws the avatar at {score:.1f} dB to the volume renderer; at least "
-            f"{LOWEST_PSNR:.0f} are wanted. Nothing was written; the checkpoint is kept. Train "
+            f"{LOWEST_PSNR:.0f} are wanted. No package was written; the checkpoint is kept. Train "
             "longer (--resume), so that the avatar has a firm surface."
         )
     return score

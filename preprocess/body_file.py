@@ -31,9 +31,9 @@ def load_body(path: Path | None = None) -> Body:
     path = path or Path(str(files("preprocess") / "data" / "body24.npz"))
     if not path.is_file():
         raise BadInput(f"There is no body file {path}. Leave --body out for the embedded body.")
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         arrays = read_npz(path, KEYS)
-    elif path.suffix == ".pkl":
+    elif path.suffix.lower() == ".pkl":
         arrays = read_pickled_arrays(path, KEYS)
     else:
         raise BadInput(f"{path} ends in {path.suffix!r}; a body file ends in .npz or .pkl.")

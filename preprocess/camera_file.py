@@ -65,7 +65,7 @@ def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = N
         BadInput: If there is no such file, or it holds no such cameras, or their pictures had
             another aspect ratio.
     """
-    if path.is_dir() or path.suffix != ".npz":
+    if path.is_dir() or path.suffix.lower() != ".npz":
         return _foreign(path, size_px, source)
     arrays = read_npz(path)
     if "intrinsic" not in arrays:

@@ -128,7 +128,9 @@ def masks_in_poses(path: Path, source: Source, *, person: str | None = None) -> 
         source: The video.
         person: Whose; None for who was seen most.
     """
-    if path.suffix not in (".pkl", ".pickle") or not is_tracked(content := read_content(path)):
+    if path.suffix.lower() not in (".pkl", ".pickle"):
+        return None
+    if not is_tracked(content := read_content(path)):
         return None
     try:
         coded = coded_masks(content, path, person)
@@ -159,15 +161,15 @@ def _file_of_masks(path: Path, person: str | None) -> tuple[int, Reader]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         count, read = video_of_masks(path)
         return count, lambda row: _as_alpha(read(row), path)
-    if path.suffix in CODED and not (path.suffix == ".npy" and _is_plain(path)):
+    if path.suffix.lower() in CODED and not (path.suffix.lower() == ".npy" and _is_plain(path)):
         coded = _coded(path, person)
         if coded is None:
             raise BadInput(f"{path} holds no masks: no run-length codes, one or more a frame.")
         count, decode = coded
         return count, lambda row: _as_alpha(decode(row), path)
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         stack = _load(path)
-    elif path.suffix == ".npz":
+    elif path.suffix.lower() == ".npz":
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
     else:
@@ -202,7 +204,7 @@ def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
     Raises:
         BadInput: If it cannot be decoded, or is not complete.
     """
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         return _as_alpha(np.asarray(_load(path)), path)
     try:
         with Image.open(path) as picture:

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from capture.errors import BadInput
 from capture.source import Source
 
+NUMBERED = "; or say which frame each belongs to (the keys `frame` or `time`)"
+
 
 def row_by_order(rows: int, source: Source, things: str) -> Callable[[int], int]:
     """From a frame's number to its row: one row a frame, of all frames or of the wanted ones.
@@ -28,5 +30,15 @@ def row_by_order(rows: int, source: Source, things: str) -> Callable[[int], int]
             return source.selection.position
     raise BadInput(
         f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
-        "frame, in order; or say which frame each belongs to (poses: the keys `frame` or `time`)."
+        f"frame, in order{NUMBERED if things.startswith('poses') else ''}.{_guess(rows, count)}"
     )
+
+
+def _guess(rows: int, count: int) -> str:
+    """What may have happened, and what to do then."""
+    if rows > count:
+        return " Was the video cut, or written anew with fewer frames a second?"
+    step = round(count / rows)
+    if step > 1 and rows == -(-count // step):
+        return f" If they are those of one frame in {step}: --frames ::{step}."
+    return f" If they are those of the first {rows} frames: --frames 0:{rows}."

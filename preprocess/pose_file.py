@@ -43,12 +43,12 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
     Raises:
         BadInput: If there is no such file, or it holds no such poses.
     """
-    if path.suffix not in (".npz", ".jsonl"):
+    if path.suffix.lower() not in (".npz", ".jsonl"):
         raise BadInput(
             f"{path}: poses are read from .npz files (InstantAvatar's keys), or from .jsonl files "
             "with the same keys, a frame a line."
         )
-    arrays = read_npz(path) if path.suffix == ".npz" else _read_lines(path)
+    arrays = read_npz(path) if path.suffix.lower() == ".npz" else _read_lines(path)
     return motion_of(arrays, path, default_model=default_model)
 
 

@@ -33,11 +33,11 @@ def read_named(path: Path) -> list[NamedCamera]:
         raise BadInput(f"{path} does not exist; expected {READ}.")
     if path.is_dir():
         return _in_folder(path)
-    if path.suffix in (".bin", ".txt") and (model := find_model(path.parent)) is not None:
+    if path.suffix.lower() in (".bin", ".txt") and (model := find_model(path.parent)) is not None:
         return read_colmap(model)
-    if path.suffix == ".r3d":
+    if path.suffix.lower() == ".r3d":
         return read_r3d(path)
-    if path.suffix == ".json" or path.name == "metadata":
+    if path.suffix.lower() == ".json" or path.name == "metadata":
         return _in_json(path)
     raise BadInput(f"{path} holds no cameras that are known; expected {READ}.")
 

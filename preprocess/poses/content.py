@@ -9,6 +9,7 @@ import lzma
 import zipfile
 import zlib
 from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,12 @@ from preprocess.pickles import MAX_BYTES, bounded_bytes, guarded, plain_pickle
 
 SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"})
 """Endings of files that may hold poses; in a folder only these are read."""
+
+OTHERS = frozenset({".txt", ".csv", ".md", ".bvh", ".fbx", ".glb", ".obj", ".mp4", ".mov", ".png"})
+"""Endings of files that people name by mistake."""
+
+PIECE = 1 << 20
+"""Bytes that are unpacked at a time."""
 
 MOST_FILES = 100_000
 """Of a folder: more files are no poses, a file a frame."""
@@ -36,6 +43,11 @@ def read_content(path: Path) -> Any:
         return _folder(path)
     if not path.is_file():
         raise BadInput(f"{path} does not exist (or is no file); a file of poses was expected.")
+    if path.suffix.lower() in OTHERS:
+        raise BadInput(
+            f"{path} holds no poses that are read; expected a file ending in "
+            f"{', '.join(sorted(SUFFIXES))} or .jsonl (docs/formats.md)."
+        )
     return guarded(path, lambda: _decoded(bounded_bytes(path), path), "file of poses")
 
 
@@ -58,13 +70,13 @@ def _decoded(data: bytes, path: Path) -> Any:
     if data.startswith(b"\x93NUMPY"):
         return _npy(data)
     if data[:1] == b"\x78" and (data[0] * 256 + data[1]) % 31 == 0:
-        return plain_pickle(_inflated(data, zlib.MAX_WBITS))
+        return plain_pickle(_unpacked(lambda: _inflated(data, zlib.MAX_WBITS)))
     if data.startswith(b"\x1f\x8b"):
-        return plain_pickle(_inflated(data, 16 + zlib.MAX_WBITS))
+        return plain_pickle(_unpacked(lambda: _inflated(data, 16 + zlib.MAX_WBITS)))
     if data.startswith(b"BZ"):
-        return plain_pickle(_bounded(BZ2Decompressor().decompress(data, MAX_BYTES + 1)))
+        return plain_pickle(_unpacked(lambda: _blocks(BZ2Decompressor(), data)))
     if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
-        return plain_pickle(_bounded(lzma.LZMADecompressor().decompress(data, MAX_BYTES + 1)))
+        return plain_pickle(_unpacked(lambda: _blocks(lzma.LZMADecompressor(), data)))
     if data[:64].lstrip()[:1] in (b"{", b"["):
         return _json(data, path)
     return plain_pickle(data)
@@ -74,7 +86,7 @@ def _json(data: bytes, path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError):
-        if path.suffix == ".json":
+        if path.suffix.lower() == ".json":
             raise
         return plain_pickle(data)  # a pickle may begin with a bracket, too
 
@@ -124,11 +136,31 @@ def _npy(data: bytes) -> Any:
     return array
 
 
-def _inflated(data: bytes, bits: int) -> bytes:
-    return _bounded(zlib.decompressobj(bits).decompress(data, MAX_BYTES + 1))
+def _unpacked(pieces: Callable[[], Iterator[bytes]]) -> bytes:
+    """All pieces as one, once their sizes were counted: what is too large is not kept at all."""
+    size = 0
+    for piece in pieces():
+        size += len(piece)
+        if size > MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
+    return b"".join(pieces())
 
 
-def _bounded(data: bytes) -> bytes:
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
-    return data
+def _inflated(data: bytes, bits: int) -> Iterator[bytes]:
+    """zlib's and gzip's content, piece after piece."""
+    inflater = zlib.decompressobj(bits)
+    for start in range(0, len(data), PIECE):
+        packed = data[start : start + PIECE]
+        while packed and not inflater.eof:
+            yield inflater.decompress(packed, PIECE)
+            packed = inflater.unconsumed_tail
+
+
+def _blocks(unpacker: BZ2Decompressor | lzma.LZMADecompressor, data: bytes) -> Iterator[bytes]:
+    """bzip2's and LZMA's content, piece after piece."""
+    for start in range(0, len(data), PIECE):
+        if unpacker.eof:
+            return
+        yield unpacker.decompress(data[start : start + PIECE], PIECE)
+        while not (unpacker.needs_input or unpacker.eof):
+            yield unpacker.decompress(b"", PIECE)

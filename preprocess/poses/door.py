@@ -62,7 +62,7 @@ def read_poses(
         BadInput: If there is no such file, it holds no poses that are known, or nobody of that
             name.
     """
-    if path.suffix == ".jsonl":
+    if path.suffix.lower() == ".jsonl":
         return read_motion(path, default_model=default_model)
     content = read_content(path)
     tool, people = _recognised(content, path, default_model, driving)

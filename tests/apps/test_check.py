@@ -102,6 +102,32 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
         assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
 
 
+def test_masks_that_are_turned_anyway_need_no_mending(spoilt, call_check):
+    _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
+    assert found["cause"] == "mask_polarity"
+    assert "nothing needs to be done" in said
+    assert "Mend it" not in said
+
+
+def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call_check, changed):
+    folder = spoilt()
+    with np.load(folder / "poses.npz") as archive:
+        fewer = {key: archive[key] for key in archive.files}
+    count = len(fewer["transl"])
+    fewer = {key: a[:-12] if a.shape[:1] == (count,) else a for key, a in fewer.items()}
+    np.savez(folder / "poses.npz", **fewer)
+    _, said, found = call_check(folder)
+    assert found["verdict"] == "warn"
+    assert "12 of" in said
+    assert "they fit where there are both" in said
+
+
+def test_what_is_to_be_typed_may_be_typed(spoilt, call_check, tmp_path):
+    folder = spoilt(SPOILS["left_right"]).rename(tmp_path / "my film")
+    _, said, _ = call_check(folder)
+    assert f"Mend it: ia-check '{folder}'" in said
+
+
 def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
     code, said, found = call_check(spoilt(spoils.opengl_poses, spoils.late(-5)))
     assert code == 2
