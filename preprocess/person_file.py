@@ -41,8 +41,8 @@ def read_person(path: Path, body: Body) -> ShapedBody:
     family, vertices = str(arrays["family"]), arrays["vertices"].astype(np.float64)
     if family != body.family or vertices.shape != body.template.shape:
         raise BadInput(
-            f"{path}: the avatar was learnt on a {family!r} body of {len(vertices)} vertices, now "
-            f"it is {body.family!r} with {len(body.template)}. Give the same --body as then (none is the "
-            "embedded body), or learn the avatar anew (--overwrite)."
+            f"{path}: the avatar was learnt on a {family!r} body of {len(vertices)} vertices, "
+            f"now it is {body.family!r} with {len(body.template)}. Give the same --body as then "
+            "(none is the embedded body), or learn the avatar anew (--overwrite)."
         )
     return ShapedBody(body=body, vertices=vertices, joints=arrays["joints"].astype(np.float64))
