@@ -7,8 +7,11 @@ from jaxtyping import Bool, Float32, UInt8
 
 from capture.camera import Camera
 
-LIKE, UNLIKE = 10.0, 40.0
+LIKE, UNLIKE = 10.0, 18.0
 """Colours nearer to what was seen behind the person are background, farther ones are person."""
+
+DARKEST, BRIGHTEST = 0.5, 1.1
+"""Shadows, and what the person reflects, darken and brighten the background by such factors."""
 
 TRUSTED = 2.0
 """How often a pixel must have been background before it says anything."""
@@ -44,13 +47,23 @@ class Behind:
     def compared(
         self, rgb: UInt8[np.ndarray, "height width 3"], doubtful: Pixels
     ) -> tuple[Pixels, Pixels]:
-        """Doubtful pixels that look like what was seen there before, and those that do not."""
+        """Doubtful pixels that look like what was seen there before, and those that do not.
+
+        A shadow of the person is neither: it is the background's colour, only darker, I = g B
+        (Horprasert et al. 1999, a statistical approach for background subtraction and shadow
+        detection). So person is what no brightness g of the background comes near to.
+        """
         if self._mean is None or self._times is None:
             nothing = np.zeros(doubtful.shape, dtype=bool)
             return nothing, nothing
         known = doubtful & (self._times >= TRUSTED)
-        off = np.abs(rgb.astype(np.float32) - self._mean).max(axis=-1)
-        return known & (off < LIKE), known & (off > UNLIKE)
+        like, unlike = np.zeros_like(known), np.zeros_like(known)
+        seen, before = rgb[known].astype(np.float32), self._mean[known]
+        squared = np.maximum((before**2).sum(axis=-1), np.float32(1.0))
+        gain = np.clip((seen * before).sum(axis=-1) / squared, DARKEST, BRIGHTEST)
+        like[known] = np.abs(seen - before).max(axis=-1) < LIKE
+        unlike[known] = np.abs(seen - gain[:, None] * before).max(axis=-1) > UNLIKE
+        return like, unlike & ~like
 
     def seen_by(
         self, camera: Camera, rgb: UInt8[np.ndarray, "height width 3"], free: Pixels

@@ -5,7 +5,7 @@ Alone it leaks into backgrounds of the person's colours; so the posed body, with
 earlier frames have shown on it (`Shell`), says where to look: only a narrow band around that shape
 is in doubt. If the camera stands still, pixels that were background in earlier frames also say what
 lies behind the person (`Behind`). The mask is the mean of cut and shape, weighted by how far they
-were found to be off.
+were found to be off; where they are far apart though the poses are good, the cut has leaked.
 """
 
 from typing import NamedTuple, final
@@ -58,7 +58,7 @@ MARGIN_M = 0.04
 ROUNDS = 2
 
 CUT_OFF_M = 0.006
-"""How far the cut's border is off, for whatever reason."""
+"""How far the cut's border is off, for whatever reason, where it has not leaked."""
 SHELL_OFF_M, UNKNOWN_OFF_M = 0.002, 0.012
 """How far the shell is off at the least, and how far as long as nothing is known of it."""
 
@@ -85,11 +85,13 @@ class _Cut(NamedTuple):
 
     Attributes:
         person: Who is.
+        away: How far each pixel is outside of the person, in pixels; inside negative.
         sure: Where what lies behind decided, 1, else 0.
         doubt_m: How far inside and outside the shell pixels were in doubt.
     """
 
     person: Bool[np.ndarray, "height width"]
+    away: Float32[np.ndarray, "height width"]
     sure: Float32[np.ndarray, "height width"]
     doubt_m: tuple[float, float]
 
@@ -141,7 +143,8 @@ class GrabCut:
         self._learn(rgb, cut, alpha, small, around, shape)
         self.found += 1
         self.agreement += (agreement - self.agreement) / self.found
-        return self._mixed(alpha, cut.sure, shape, around.known, frame.size_px)
+        weight = self._weight_of_shell(cut, shape, around)
+        return _mixed(alpha, weight, shape, frame.size_px)
 
     def _scale_for(self, pose: BodyPose, camera: Camera) -> float:
         """How many times larger than the frame the picture is in which its mask is found."""
@@ -193,8 +196,10 @@ class GrabCut:
             cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
         person = np.zeros(away.shape, dtype=bool)
         person[box] = (part & 1) > 0
+        person = (person & ~like) | unlike
         return _Cut(
-            person=(person & ~like) | unlike,
+            person=person,
+            away=_away(person),
             sure=(like | unlike).astype(np.float32),
             doubt_m=(float(inwards), float(outwards)),
         )
@@ -209,7 +214,7 @@ class GrabCut:
         shape: _Shape,
     ) -> None:
         """How far poses are off, what the person wears, and what lies behind."""
-        from_cut, per_m = _away(cut.person), around.px_per_m
+        from_cut, per_m = cut.away, around.px_per_m
         rim = (from_cut > 0.0) & (from_cut < 1.2)
         deep = rim & (shape.away < 1.5 - cut.doubt_m[0] * per_m)
         too_deep = deep.sum() > TOO_DEEP * max(rim.sum(), 1)
@@ -224,32 +229,41 @@ class GrabCut:
         margin = max(2.0, MARGIN_M * per_m)
         self._behind.learn(rgb, (from_cut > margin) & (shape.away > margin))
 
-    def _mixed(
-        self,
-        alpha: Float32[np.ndarray, "height width"],
-        sure: Float32[np.ndarray, "height width"],
-        shape: _Shape,
-        known: float,
-        size_px: tuple[int, int],
-    ) -> Float32[np.ndarray, "_ _"]:
-        """The mean of cut and shell, each with the inverse of its variance, at the frame's size.
+    def _weight_of_shell(
+        self, cut: _Cut, shape: _Shape, around: Around
+    ) -> Float32[np.ndarray, "height width"]:
+        """The shell's share of the mask: both count with the inverse of their variance.
 
-        Where what lies behind decided, the shell has no say.
+        Cut and shell are usually `_off_m` apart. What that is more than the cut's own error is the
+        pose's, and so the shell's. Where they are farther apart than that, one of them is wrong:
+        the cut, as far as the shell is known and the poses are good. Where what lies behind
+        decided, the shell has no say.
         """
         shell = max(self._off_m**2 - CUT_OFF_M**2, SHELL_OFF_M**2)
-        shell += (UNKNOWN_OFF_M * (1.0 - known)) ** 2
-        weight = np.float32(CUT_OFF_M**2 / (CUT_OFF_M**2 + shell)) * (np.float32(1.0) - sure)
-        covered = shape.covered
-        if alpha.shape[::-1] != size_px:
-            smaller = alpha.shape[1] > size_px[0]
-            way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-            alpha, weight = (
-                cv2.resize(each, size_px, interpolation=way) for each in (alpha, weight)
-            )
-            finer = shape.fine.shape[1] >= size_px[0]
-            way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
-            covered = cv2.resize(shape.fine, size_px, interpolation=way)
-        return weight * covered + (np.float32(1.0) - weight) * alpha
+        shell += (UNKNOWN_OFF_M * (1.0 - around.known)) ** 2
+        trusted = around.known * CUT_OFF_M**2 / (CUT_OFF_M**2 + shell)
+        apart = (cut.away - shape.away) / np.float32(around.px_per_m)
+        leaked = np.maximum(apart**2 - np.float32(self._off_m**2), np.float32(0.0))
+        cut_off = np.float32(CUT_OFF_M**2) + np.float32(trusted) * leaked
+        return cut_off / (cut_off + np.float32(shell)) * (np.float32(1.0) - cut.sure)
+
+
+def _mixed(
+    alpha: Float32[np.ndarray, "height width"],
+    weight: Float32[np.ndarray, "height width"],
+    shape: _Shape,
+    size_px: tuple[int, int],
+) -> Float32[np.ndarray, "_ _"]:
+    """The mean of the cut's alpha and what the shell covers, of so much weight, of a size."""
+    covered = shape.covered
+    if alpha.shape[::-1] != size_px:
+        smaller = alpha.shape[1] > size_px[0]
+        way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        alpha, weight = (cv2.resize(each, size_px, interpolation=way) for each in (alpha, weight))
+        finer = shape.fine.shape[1] >= size_px[0]
+        way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
+        covered = cv2.resize(shape.fine, size_px, interpolation=way)
+    return weight * covered + (np.float32(1.0) - weight) * alpha
 
 
 def _away(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:

@@ -40,6 +40,13 @@ AT_LIMIT_M, AT_LIMIT_VOTE = 0.006, 0.1
 """A border so near to the limit of what was in doubt was not found but cut off; its vote is so much
 worth."""
 
+FOLLOWED = 0.4
+"""From so much of the rim known, the thickness makes up for how far the drawn outline stands beyond
+the vertices. Before, the shell stays too large rather: what is too much GrabCut takes away, but it
+does not look for what is not in doubt."""
+BEYOND_M, BEYOND_PX = 0.01, 1.5
+"""A vertex farther than this from the drawn outline is not on it."""
+
 FINE = 3
 """The shell is drawn so many times finer than the picture in which masks are found."""
 EDGE_PX = 0.25
@@ -127,7 +134,8 @@ class Shell:
             doubt_m: How far inside and outside the shell the mask was in doubt.
         """
         rim, count = around.rim, len(LAYERS_M)
-        points = around.skin[rim, None] + around.normals[rim, None] * LAYERS_M[None, :, None]
+        from_skin = LAYERS_M + self._beyond(around, camera, away_px)[:, None]
+        points = around.skin[rim, None] + around.normals[rim, None] * from_skin[:, :, None]
         at = camera.project(points).astype(np.float32) - np.float32(0.5)
         x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
         mask = cv2.remap(alpha, x, y, cv2.INTER_LINEAR, borderValue=-1.0)
@@ -148,6 +156,26 @@ class Shell:
         weight *= np.clip(np.abs(before - behind).max(axis=1) / CLEAR, 0.0, 1.0) ** 2
         self._votes[rim, :count] += np.where(told, mask, 0.0) * weight[:, None]
         self._votes[rim, count:] += told * weight[:, None]
+
+    def _beyond(
+        self, around: Around, camera: Camera, away_px: Float32[np.ndarray, "height width"]
+    ) -> Float[np.ndarray, "rim"]:
+        """How far the outline was drawn beyond each vertex of the rim, metres.
+
+        An outline is the envelope of all triangles: where vertices are dense and their thickness
+        is noisy, as on the head, the farthest of them make it. By so much less a vertex must be
+        lifted for the outline to lie where the mask ends.
+        """
+        rim = around.rim
+        shell = around.skin[rim] + around.normals[rim] * around.thickness[rim, None]
+        x, y = camera.project(shell).astype(np.float32).T - np.float32(0.5)
+        away = cv2.remap(
+            away_px, x.reshape(-1, 1), y.reshape(-1, 1), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        ).reshape(-1)  # fmt: skip
+        beyond = np.clip(-away / around.px_per_m, -BEYOND_M, BEYOND_M)
+        beyond[np.abs(away) > BEYOND_PX] = 0.0
+        return min(1.0, around.known / FOLLOWED) * beyond
 
     def _thickness(
         self,

@@ -10,13 +10,13 @@ from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess import segmenter
-from preprocess.behind import Behind
-from preprocess.grabcut import GrabCut, _away
+from preprocess.behind import BRIGHTEST, DARKEST, UNLIKE, Behind
+from preprocess.grabcut import GrabCut, _away, _Cut, _Shape
 from preprocess.kinematics import rotation_matrices
 from preprocess.outline import Outline
 from preprocess.pose import BodyPose
 from preprocess.segmenter import make_segmenter, segmenter_name
-from preprocess.shell import Shell
+from preprocess.shell import Around, Shell
 
 SIZE = (160, 200)
 
@@ -137,10 +137,31 @@ def test_what_lay_behind_tells_who_stands_before_it(camera, rng):
     person = np.zeros(SIZE[::-1], dtype=bool)
     person[50:90, 40:60] = True
     picture = np.where(person[..., None], np.uint8(255) - wall, wall)
-    contrast = np.abs(picture.astype(int) - wall).max(axis=-1) > 40
     like, unlike = behind.compared(picture, free)
-    np.testing.assert_array_equal(unlike, person & contrast)
     assert like[~person].all()
+    assert not unlike[~person].any()
+    # no brightness of the wall, of all that are possible, comes near to these pixels
+    brightness = np.linspace(DARKEST, BRIGHTEST, 241)[:, None, None]
+    off = picture[person] - brightness * wall[person]
+    nearest = (off**2).sum(axis=-1).argmin(axis=0)
+    off = np.abs(off).max(axis=-1)[nearest, np.arange(person.sum())]
+    sure = np.abs(off - UNLIKE) > 1.0
+    np.testing.assert_array_equal(unlike[person][sure], off[sure] > UNLIKE)
+    assert 0.5 < unlike[person].mean() < 1.0
+
+
+def test_a_shadow_on_what_lay_behind_is_no_person_but_a_red_sole_in_it_is(camera):
+    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    floor = np.broadcast_to(np.uint8([140, 105, 65]), (*SIZE[::-1], 3)).copy()
+    for _ in range(3):
+        behind.learn(floor, free)
+    picture = floor.copy()
+    picture[100:] = floor[100:] * 0.6
+    picture[120:124] = 0.6 * np.array([200.0, 70.0, 60.0])
+    like, unlike = behind.compared(picture, free)
+    assert like[:100].all()
+    assert not like[100:].any()
+    np.testing.assert_array_equal(np.flatnonzero(unlike.any(axis=1)), np.arange(120, 124))
 
 
 @pytest.mark.parametrize("thick_m", [0.0, 0.02, 0.04])
@@ -167,6 +188,31 @@ def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
     drawn = cv2.resize(shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA)
     true = outline.filled(around.skin + thick_m * around.normals, large)
     assert agreement(drawn, true) > 0.96
+
+
+def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, camera, rng):
+    """Every other vertex, at random, is 4 mm thicker: the outline is theirs."""
+    large, shell = camera.resized((480, 600)), Shell(shaped)
+    around = shell.around(standing(shaped), large)
+    assert around is not None
+    head = around.skin[around.rim, 1] > 1.5
+
+    def beyond(thickness: np.ndarray, known: float) -> np.ndarray:
+        now = around._replace(thickness=thickness, known=known)
+        fine = shell.drawn(now, large)
+        covered = cv2.resize(fine, large.size_px, interpolation=cv2.INTER_AREA)
+        return shell._beyond(now, large, _away(covered > 0.5))[head]
+
+    even = np.full(len(shaped.vertices), 0.01)
+    thicker = rng.random(len(even)) < 0.5
+    rough, smooth = beyond(even + 0.004 * thicker, 1.0), beyond(even, 1.0)
+    thick = thicker[around.rim][head]
+    # those farther inside are hidden by other parts of the head, and say nothing
+    low, high = (rough[(thick == which) & (rough != 0.0)] for which in (False, True))
+    assert np.median(smooth[smooth != 0.0]) < 0.001
+    assert 0.002 < np.median(low) < 0.004
+    assert np.median(high) < 0.001
+    np.testing.assert_allclose(beyond(even + 0.004 * thicker, 0.1), 0.25 * rough)
 
 
 def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
@@ -197,6 +243,36 @@ def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
         found.append(agreement(find(frame, pose, camera), true))
     assert np.mean(found[-6:]) > np.mean(found[:3])
     assert np.mean(found[-6:]) > 0.95
+
+
+@pytest.mark.parametrize("off_m", [0.006, 0.02])
+def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m):
+    find, shape = GrabCut(shaped), np.zeros((40, 60), dtype=bool)
+    shape[:, :30] = True
+    away = _away(shape)
+    around = Around(
+        skin=np.zeros((0, 3)), normals=np.zeros((0, 3)), thickness=np.zeros(0),
+        rim=np.zeros(0, dtype=int), known=1.0, px_per_m=100.0,
+    )  # fmt: skip
+    covered = shape.astype(np.float32)
+    find._off_m = off_m
+    cut = np.zeros_like(shape)
+    cut[:20, :30] = True
+    cut[20:, :34] = True  # four centimetres too far
+    weight = find._weight_of_shell(
+        _Cut(person=cut, away=_away(cut), sure=np.zeros_like(covered), doubt_m=(0.05, 0.05)),
+        _Shape(fine=covered, covered=covered, away=away),
+        around,
+    )
+    assert weight.min() >= 0.0
+    assert weight.max() <= 1.0
+    found, leaked = weight[5, 25:35].mean(), weight[35, 25:35].mean()
+    if off_m < 0.01:
+        assert leaked > 0.97
+        assert found < 0.95
+    else:
+        assert abs(leaked - found) < 0.2
+        assert leaked < 0.35
 
 
 def test_the_same_frames_give_the_same_masks(shaped, camera, film):
