@@ -12,7 +12,7 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.errors import BadInput
@@ -49,6 +49,12 @@ WIDER_M, NARROWER_M, WIDEST_M = 0.012, 0.002, 0.05
 OUTSIDE_WIDER = 1.5
 """By how much the limits follow from frame to frame; outside it counts so much more."""
 
+HEAD_M, HAIR_M = 0.3, 0.06
+"""Hair stands off farther than clothes: so near to the head's middle, outside the shell at least so
+much is in doubt, and what is found there is no leak."""
+HEAD = 15
+"""The head's joint."""
+
 AROUND_M = 0.25
 """How much of the background is looked at."""
 
@@ -73,11 +79,13 @@ class _Shape(NamedTuple):
         fine: Its shape, finer than the picture.
         covered: How much of each pixel it covers.
         away: How far each pixel is outside of it, in pixels; inside negative.
+        hair: Which pixels may be hair.
     """
 
     fine: Float32[np.ndarray, "rows columns"]
     covered: Float32[np.ndarray, "height width"]
     away: Float32[np.ndarray, "height width"]
+    hair: Bool[np.ndarray, "height width"]
 
 
 class _Cut(NamedTuple):
@@ -112,6 +120,7 @@ class GrabCut:
     def __init__(self, shaped: ShapedBody) -> None:
         """Nothing is known about clothes and background yet."""
         self._shaped, self._shell, self._behind = shaped, Shell(shaped), Behind()
+        self._head = shaped.body.weights.argmax(axis=1) == HEAD
         self._tall_px: float | None = None
         self._wider_m = 0.0
         self._off_m = 0.012
@@ -166,7 +175,8 @@ class GrabCut:
             raise BadInput("the posed body is not in the picture")
         fine = self._shell.drawn(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
-        shape = _Shape(fine=fine, covered=covered, away=_away(covered > 0.5))
+        hair = _near(around.skin[self._head], camera, HEAD_M * around.px_per_m)
+        shape = _Shape(fine=fine, covered=covered, away=_away(covered > 0.5), hair=hair)
         if (shape.away < 0.0).sum() < 16:
             raise BadInput("the posed body is not in the picture")
         return around, shape
@@ -176,14 +186,15 @@ class GrabCut:
         inwards = around.known * KNOWN_M + (1.0 - around.known) * UNKNOWN_M + self._wider_m
         outwards = max(inwards, LEAST_OUTSIDE_M) + (OUTSIDE_WIDER - 1.0) * self._wider_m
         away = shape.away / around.px_per_m
-        doubtful = (away < outwards) & (away > -inwards)
+        near = away < np.where(shape.hair, max(outwards, HAIR_M), outwards)
+        doubtful = near & (away > -inwards)
         labels = np.full(away.shape, cv2.GC_BGD, np.uint8)
         labels[doubtful] = np.where(away[doubtful] < 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
         like, unlike = self._behind.compared(rgb, doubtful)
         labels[like], labels[unlike] = cv2.GC_PR_BGD, cv2.GC_PR_FGD
         labels[away <= -inwards] = cv2.GC_FGD
         margin = int(AROUND_M * around.px_per_m) + 1
-        rows, columns = np.nonzero(away < outwards)
+        rows, columns = np.nonzero(near)
         box = (
             slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
             slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
@@ -244,6 +255,7 @@ class GrabCut:
         trusted = around.known * CUT_OFF_M**2 / (CUT_OFF_M**2 + shell)
         apart = (cut.away - shape.away) / np.float32(around.px_per_m)
         leaked = np.maximum(apart**2 - np.float32(self._off_m**2), np.float32(0.0))
+        leaked[shape.hair & (apart < 0.0)] = 0.0
         cut_off = np.float32(CUT_OFF_M**2) + np.float32(trusted) * leaked
         return cut_off / (cut_off + np.float32(shell)) * (np.float32(1.0) - cut.sure)
 
@@ -264,6 +276,16 @@ def _mixed(
         way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
         covered = cv2.resize(shape.fine, size_px, interpolation=way)
     return weight * covered + (np.float32(1.0) - weight) * alpha
+
+
+def _near(
+    points: Float[np.ndarray, "points 3"], camera: Camera, radius_px: float
+) -> Bool[np.ndarray, "height width"]:
+    """The pixels around the middle of some points."""
+    x, y = camera.project(points.mean(axis=0, keepdims=True))[0]
+    width, height = camera.size_px
+    across, down = np.arange(width) + 0.5 - x, np.arange(height) + 0.5 - y
+    return across**2 + (down**2)[:, None] < radius_px**2
 
 
 def _away(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:

@@ -259,11 +259,11 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
     cut = np.zeros_like(shape)
     cut[:20, :30] = True
     cut[20:, :34] = True  # four centimetres too far
-    weight = find._weight_of_shell(
-        _Cut(person=cut, away=_away(cut), sure=np.zeros_like(covered), doubt_m=(0.05, 0.05)),
-        _Shape(fine=covered, covered=covered, away=away),
-        around,
-    )
+    found_cut = _Cut(person=cut, away=_away(cut), sure=0.0 * covered, doubt_m=(0.05, 0.05))
+    expected = _Shape(fine=covered, covered=covered, away=away, hair=np.zeros_like(shape))
+    weight = find._weight_of_shell(found_cut, expected, around)
+    hairy = find._weight_of_shell(found_cut, expected._replace(hair=~expected.hair), around)
+    assert hairy[35, 31:35].max() <= weight[35, 31:35].min()  # a bun is no leak
     assert weight.min() >= 0.0
     assert weight.max() <= 1.0
     found, leaked = weight[5, 25:35].mean(), weight[35, 25:35].mean()
@@ -273,6 +273,19 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
     else:
         assert abs(leaked - found) < 0.2
         assert leaked < 0.35
+
+
+def test_a_bun_of_hair_is_found_though_it_stands_off_far(shaped, camera, film):
+    find = GrabCut(shaped)
+    for index, yaw in enumerate(np.linspace(0.0, 1.0, 4)):
+        frame, pose, true = film(float(yaw), index)
+        head = camera.project(shaped.with_pose(pose).joints()[[15]])[0].astype(int)
+        top = int(np.flatnonzero(true[:, head[0]])[0])
+        bun = np.zeros(true.shape, np.uint8)
+        cv2.circle(bun, (int(head[0]), top), 5, 1, -1)
+        rgb = np.where((bun > 0)[..., None], np.uint8([25, 35, 200]), frame.rgb)
+        mask = find(replace(frame, rgb=rgb), pose, camera)
+    assert mask[(bun > 0) & ~true].mean() > 0.8
 
 
 def test_the_same_frames_give_the_same_masks(shaped, camera, film):
