@@ -1,7 +1,7 @@
 """What a command says while it works: a live line on a terminal, plain lines in a log."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
 from typing import final
@@ -63,14 +63,17 @@ class Console:
             self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report{beyond}")
 
     @contextmanager
-    def waiting(self, message: str) -> Iterator[None]:
-        """Something that takes a moment: a spinner on a terminal, a line in a log."""
+    def waiting(self, message: str) -> Iterator[Callable[[str], None]]:
+        """Something that takes a moment: a spinner on a terminal, a line in a log.
+
+        What is yielded says beside the spinner how far it is.
+        """
         if not self.live:
             self.say(message)
-            yield
+            yield lambda _: None
             return
-        with self._rich.status(escape(message)):
-            yield
+        with self._rich.status(escape(message)) as status:
+            yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
 
     def bar(self, label: str, total: float) -> "Bar":
         """A progress bar; use it in a `with` block."""

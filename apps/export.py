@@ -113,8 +113,8 @@ def _package(folder: Path, out: Path, console: Console) -> None:
         from avatar import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
-    with console.waiting("baking the avatar and checking its player"):
-        taken = snapshot(trainer, out, views(trainer.avatar.rig), mark=None)
+    with console.waiting("baking the avatar and checking its player") as tell:
+        taken = snapshot(trainer, out, views(trainer.avatar.rig), mark=None, tell=tell)
     if taken.exported is None:
         raise Stop(taken.refused or "nothing was written.", NO_PACKAGE)
     for warning in taken.exported.warnings:

@@ -234,14 +234,14 @@ def _taught(
     learnt, hasty = lesson.learn(recall=recall), recording.source.paced
     _check_learnt(learnt, recording)
     views, trainer = views_of(learnt.held, recording), learnt.trainer
-    with console.waiting("baking the avatar and checking its player"), lesson.saving():
+    with console.waiting("baking the avatar and checking its player") as tell, lesson.saving():
         mark = learnt.curve[-1] if learnt.curve else None
-        taken = snapshot(trainer, run.package, views, mark=mark, hasty=hasty)
+        taken = snapshot(trainer, run.package, views, mark=mark, hasty=hasty, tell=tell)
     learnt = lesson.scored(learnt)
     if hasty:
-        with console.waiting("baking the avatar more finely"):
+        with console.waiting("baking the avatar more finely") as tell:
             mark = learnt.curve[-1] if learnt.curve else None
-            taken = finer(taken, snapshot(trainer, run.package, views, mark=mark))
+            taken = finer(taken, snapshot(trainer, run.package, views, mark=mark, tell=tell))
     return learnt, taken
 
 

@@ -1,7 +1,7 @@
 """The avatar as it stands at this second, as a package that the player opens."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -40,6 +40,7 @@ def snapshot(
     *,
     mark: CurvePoint | None,
     hasty: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Snapshot:
     """Writes the package, whole or not at all; training may go on afterwards.
 
@@ -50,6 +51,7 @@ def snapshot(
         views: Poses and cameras to check it with (`views_of`).
         mark: How well held-out frames were rendered when that was last asked; goes with it.
         hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
+        tell: Hears how far its fine-tuning is.
 
     Raises:
         OSError: If the disk is full; what was there before stays.
@@ -65,6 +67,7 @@ def snapshot(
             views=views[:HASTY_VIEWS] if hasty else views,
             metrics=metrics,
             hasty=hasty,
+            progress=lambda share: tell(f"fine-tuned {share:.0%}"),
         )
     except ExportRefused as error:
         return Snapshot(exported=None, refused=str(error), ready_at=time.perf_counter())

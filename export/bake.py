@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Int32, Shaped, UInt, UInt8, UInt16
+from jaxtyping import Bool, Int32, Shaped, UInt8, UInt16
 
 from avatar.rig import Rig
 from export.bake_skin import skin_of
@@ -13,6 +13,8 @@ from export.hull import Hull, find_hull
 from export.lattice import FAINTEST, FieldAt, Lattice, read_field
 from export.tables import (
     BRICK,
+    COLOR_STEP,
+    DENSITY_STEP,
     NODES,
     SURFEL_BITS,
     THICKNESS_STEP_M,
@@ -20,6 +22,7 @@ from export.tables import (
     Surfels,
     Tables,
     density_codes,
+    rounded,
 )
 from export.tiers import TIERS
 from preprocess.kinematics import body_from_rest
@@ -33,9 +36,11 @@ VOXEL_SHARE = 0.53
 FINEST_M, COARSEST_M = 0.0038, 0.006
 HASTY = 1.5
 """How much coarser a package is that cannot wait."""
-COLOR_STEP, DENSITY_STEP, POSITION_STEP, NORMAL_STEP = 8, 16, 32, 7
-"""Codes are rounded to multiples of these: nobody sees it, and bytes halve. Steps of density are
-54 %, of positions a millimetre, of normals three degrees."""
+POSITION_STEP, NORMAL_STEP = 32, 7
+"""Codes are rounded to multiples of these, a millimetre and three degrees, so that they deflate
+well."""
+TUNED = 16
+"""Pictures that bricks are fine-tuned on, half a second each."""
 EMPTY = (
     f"The avatar is empty: its density is nowhere above {FAINTEST:g} per metre. "
     "No package was written. Train it longer (--resume), or check the masks."
@@ -51,17 +56,20 @@ class BakeConfig:
         surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
         hull_density: Density of the hull's level set, 1/m; less where the whole field is faint.
         tiers: Which qualities the package has; "hq" is always among them.
+        tuned: On how many pictures bricks are fine-tuned; 0 for none.
     """
 
     voxel_m: float = 0.004
     surfel_spacing_m: float = 0.006
     hull_density: float = 20.0
     tiers: tuple[str, ...] = tuple(TIERS)
+    tuned: int = 0
 
     @classmethod
     def for_cells(cls, finest_m: float) -> "BakeConfig":
-        """For a field whose finest cells are that long: about two voxels each."""
-        return cls(voxel_m=float(np.clip(VOXEL_SHARE * finest_m, FINEST_M, COARSEST_M)))
+        """For a field whose finest cells are that long: about two voxels each; fine-tuned."""
+        voxel_m = float(np.clip(VOXEL_SHARE * finest_m, FINEST_M, COARSEST_M))
+        return cls(voxel_m=voxel_m, tuned=TUNED)
 
     def hasty(self) -> "BakeConfig":
         """For a package that is wanted at once, and that a finer one will follow."""
@@ -70,6 +78,7 @@ class BakeConfig:
             voxel_m=min(HASTY * self.voxel_m, COARSEST_M),
             surfel_spacing_m=HASTY * self.surfel_spacing_m,
             tiers=("hq",),
+            tuned=0,
         )
 
 
@@ -177,16 +186,6 @@ def _morton(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "points"
             set_bits = (codes[:, axis] >> (6 + bit) & 1).astype(np.int32)
             order |= set_bits << (3 * bit + axis)
     return order
-
-
-def rounded(
-    codes: UInt[np.ndarray, "*batch"], step: int, largest: int
-) -> UInt[np.ndarray, "*batch"]:
-    """The next multiples of a step that are not above the largest code."""
-    most = largest // step
-    return (np.minimum((codes.astype(np.uint32) + step // 2) // step, most) * step).astype(
-        codes.dtype
-    )
 
 
 def _bricks(lattice: Lattice, reached: Bool[np.ndarray, "x y z"]) -> Bricks:

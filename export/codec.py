@@ -212,8 +212,16 @@ def _bricks(
     blocks: UInt8[np.ndarray, "bytes"], voxels: UInt8[np.ndarray, "4 bricks 8 8 8"], layout: Layout
 ) -> Bricks:
     index = _numbered(blocks, layout.brick_counts, layout.bricks)
-    voxels = _with_green(cube_sums(voxels))
-    core = np.pad(np.moveaxis(voxels, 0, -1), [(1, 0), *[(0, 0)] * 4])
+    core = np.moveaxis(_with_green(cube_sums(voxels)), 0, -1)
+    whole = with_borders(index, np.pad(core, [(1, 0), *[(0, 0)] * 4]))
+    low = np.array(layout.brick_low, dtype=np.float32)
+    return Bricks(low=low, voxel_m=layout.voxel_m, index=index, voxels=whole)
+
+
+def with_borders(
+    index: Int32[np.ndarray, "bx by bz"], core: UInt8[np.ndarray, "bricks 8 8 8 4"]
+) -> UInt8[np.ndarray, "bricks 9 9 9 4"]:
+    """Bricks' own voxels (the empty one first), and after them the first layers of neighbours."""
     whole = np.zeros((len(core), NODES, NODES, NODES, 4), dtype=np.uint8)
     padded = np.pad(index, [(0, 1)] * 3)
     place = np.argwhere(index > 0)
@@ -222,8 +230,7 @@ def _bricks(
         target = tuple(slice(BRICK, NODES) if s else slice(0, BRICK) for s in step)
         source = tuple(slice(0, 1) if s else slice(0, BRICK) for s in step)
         whole[(slice(1, None), *target)] = core[neighbour][(slice(None), *source)]
-    low = np.array(layout.brick_low, dtype=np.float32)
-    return Bricks(low=low, voxel_m=layout.voxel_m, index=index, voxels=whole)
+    return whole
 
 
 def _skin(

@@ -4,6 +4,7 @@ Written after the tables and the rules alone, with arrays of vectors and numpy's
 shares no code with the graph.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
 from export.twin_march import PosedNodes, Rays, carried, carried_in_tetrahedra, march, sampled
 
 FAR = 2**31 - 1
+
+Marched = Callable[[PosedNodes, Rays], Float32[np.ndarray, "rays 4"]]
+"""Premultiplied colour and alpha of the first layer's rays."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,18 +41,15 @@ class Shot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Posed:
-    """The skin in the camera's frame, and the hull with the inverse of its derivative there.
+    """The skin and, linear in tetrahedra, the hull in the camera's frame.
 
-    `splatted` is a coarser `camera`, linear in tetrahedra, and `facing` what is made of it: the
-    ray to each surfel along its normal in canonical space, negative where it faces the camera.
+    `facing` is the ray to each surfel along its normal in canonical space, negative where it faces
+    the camera.
     """
 
     nodes: PosedNodes
     splatted: Float32[np.ndarray, "surfels 3"]
     facing: Float32[np.ndarray, "surfels"]
-    camera: Float32[np.ndarray, "surfels 3"]
-    inverse: Float32[np.ndarray, "surfels 3 3"]
-    sound: Bool[np.ndarray, "surfels"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,16 +61,49 @@ class _Before:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Seen:
-    """A layer: pictures of its pixels, depths at which rays enter the hull, ends along them."""
+class Look:
+    """Where a picture's rays go through canonical space, and what the first layer shows.
 
-    colors: Float32[np.ndarray, "pixels 4"]
-    depth: Float32[np.ndarray, "pixels"]
-    end: Float32[np.ndarray, "pixels"]
+    Attributes:
+        pixel: Numbers of the covered pixels, ascending.
+        nodes: The skin in this pose.
+        first: Their rays.
+        seen: What these show: premultiplied colour and alpha.
+        again: Which of them have a second layer, ascending.
+        second: The rays of that.
+    """
+
+    pixel: Int64[np.ndarray, "pixels"]
+    nodes: PosedNodes
+    first: Rays
+    seen: Float32[np.ndarray, "pixels 4"]
+    again: Int64[np.ndarray, "pixels2"]
+    second: Rays
 
 
 def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied colour and alpha in [0, 1]."""
+    width, height = shot.size_px
+    look = look_at(tables, rules, shot)
+    picture = np.zeros((width * height, 4), dtype=np.float32)
+    picture[look.pixel] = look.seen
+    ones = np.ones(len(look.again))
+    behind = sampled(tables.bricks, look.second, ones, rules.second_block, np.inf).colors
+    picture[look.pixel[look.again]] += behind * (1.0 - look.seen[look.again, 3:])
+    return picture.reshape(height, width, 4)
+
+
+def look_at(
+    tables: Tables, rules: DrawingRules, shot: Shot, marched: Marched | None = None
+) -> Look:
+    """Finds the rays of both layers.
+
+    Args:
+        tables: What is drawn.
+        rules: How.
+        shot: From where, in which pose.
+        marched: What the first layer's rays show, if not by `twin_march.march`.
+    """
     width, height = shot.size_px
     posed = _pose(tables, rules, shot)
     side = _side(tables, rules, shot, posed)
@@ -78,25 +112,28 @@ def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray,
     buffer = np.full(cells, FAR, dtype=np.int64)
     np.minimum.at(buffer.reshape(-1), cell, key)
     filled = _without_holes(buffer, tables, rules, side).ravel()
-    picture = np.zeros((width * height, 4), dtype=np.float32)
     covered = np.flatnonzero(filled < FAR)
-    first = _shade(tables, rules, shot, posed, covered, filled[covered], None)
-    picture[covered] = first.colors
+    first, depth = _entering(tables, rules, shot, posed, covered, filled[covered], None)
+    if marched is None:
+        seen = march(tables.bricks, rules, posed.nodes, first, shot.samples)
+    else:
+        seen = marched(posed.nodes, first)
+    again, second = covered[:0], Rays(*(part[:0] for part in first))
     if rules.layers == 2:
-        passed = 1.0 - picture[:, 3]
         limit = np.full((height, width), 1e6, dtype=np.float32)
-        limit.reshape(-1)[covered] = first.depth + np.float32(rules.gap_m)
-        limit.reshape(-1)[passed <= rules.transmitted] = 1e6
+        deeper = depth + np.float32(rules.gap_m)
+        limit.reshape(-1)[covered] = np.where(1.0 - seen[:, 3] <= rules.transmitted, 1e6, deeper)
         behind = deep_enough > np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
         buffer = np.full(cells, FAR, dtype=np.int64)
         np.minimum.at(buffer.reshape(-1), cell[behind], key[behind])
         keys = buffer[side:-side, side:-side].ravel()
-        again = np.flatnonzero(keys < FAR)
-        place = np.searchsorted(covered, again)
-        before = _Before(surfel=_surfel(filled[again]), end=first.end[place])
-        second = _shade(tables, rules, shot, posed, again, keys[again], before)
-        picture[again] += second.colors * passed[again, None]
-    return picture.reshape(height, width, 4)
+        pixel = np.flatnonzero(keys < FAR)
+        again = np.searchsorted(covered, pixel)
+        before = _Before(surfel=_surfel(filled[pixel]), end=first.end[again])
+        second, _ = _entering(tables, rules, shot, posed, pixel, keys[pixel], before)
+    return Look(
+        pixel=covered, nodes=posed.nodes, first=first, seen=seen, again=again, second=second
+    )
 
 
 def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
@@ -104,10 +141,6 @@ def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
     blended = (nodes.weights.T @ shot.bones.reshape(24, 12)).reshape(-1, 3, 4)
     node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
     there = PosedNodes(nodes, node_camera)
-    camera, derivative = carried(there, tables.surfels.positions)
-    volume = np.linalg.det(derivative)
-    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
-    inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
     splatted, edges = carried_in_tetrahedra(there, tables.surfels.positions)
     flat = np.abs(np.linalg.det(edges)) < 1e-12
     from_eye = np.linalg.solve(np.where(flat[:, None, None], np.eye(3), edges), splatted[..., None])
@@ -116,10 +149,22 @@ def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
         nodes=there,
         splatted=splatted,
         facing=np.where(flat, 0.0, facing).astype(np.float32),
-        camera=camera,
-        inverse=inverse.astype(np.float32),
-        sound=sound,
     )
+
+
+def _unposed(
+    rules: DrawingRules, posed: _Posed, points: Float32[np.ndarray, "points 3"]
+) -> tuple[
+    Float32[np.ndarray, "points 3"],
+    Float32[np.ndarray, "points 3 3"],
+    Bool[np.ndarray, "points"],
+]:
+    """Where points are in the camera's frame, the inverse derivative, and where it is sound."""
+    camera, derivative = carried(posed.nodes, points)
+    volume = np.linalg.det(derivative)
+    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
+    inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
+    return camera, inverse.astype(np.float32), sound
 
 
 def _surfel(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
@@ -185,7 +230,7 @@ def _without_holes(
     return np.where(keys - (steps << SURFEL_BITS) > neighbours, neighbours, keys)
 
 
-def _shade(
+def _entering(
     tables: Tables,
     rules: DrawingRules,
     shot: Shot,
@@ -193,20 +238,20 @@ def _shade(
     pixel: Int64[np.ndarray, "pixels"],
     key: Int64[np.ndarray, "pixels"],
     before: _Before | None,
-) -> _Seen:
-    """What covered pixels see."""
+) -> tuple[Rays, Float32[np.ndarray, "pixels"]]:
+    """Rays behind covered pixels, and the depths at which they enter the hull."""
     surfels, surfel = tables.surfels, _surfel(key)
     row, column = np.divmod(pixel, shot.size_px[0])
     plane = (np.stack([column, row], axis=1) + 0.5 - shot.center) / shot.focal
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    inverse, sound = posed.inverse[surfel], posed.sound[surfel]
-    along = (posed.camera[surfel] * ray).sum(axis=1)
+    camera, inverse, sound = _unposed(rules, posed, surfels.positions[surfel])
+    along = (camera * ray).sum(axis=1)
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
     # where the skin is folded, the hull is looked at from straight above
     direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
-    nearest = ray * along[:, None] - posed.camera[surfel]
+    nearest = ray * along[:, None] - camera
     beside = np.einsum("nij,nj->ni", inverse, nearest)  # of the surfel, where the ray is closest
     beside = np.where(sound[:, None], beside, np.float32(0.0))
     falling = (normal * direction).sum(axis=1)
@@ -221,15 +266,12 @@ def _shade(
     length = thickness * np.minimum((1.0 + rules.grazing * sine) / cosine, rules.lengthened)
     end = begin + np.minimum(length + lead, rules.longest_m)
     if before is not None:
-        apart = np.linalg.norm(surfels.positions[surfel] - surfels.positions[before.surfel], axis=1)
-        in_camera = np.linalg.norm(posed.camera[surfel] - posed.camera[before.surfel], axis=1)
+        first = surfels.positions[before.surfel]
+        apart = np.linalg.norm(surfels.positions[surfel] - first, axis=1)
+        in_camera = np.linalg.norm(camera - carried(posed.nodes, first)[0], axis=1)
         one_sheet = apart < in_camera * rules.same_share + rules.same_m
         later = np.minimum(np.maximum(begin, before.end), end)
         begin = np.where(one_sheet, later, begin)
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
-    rays = Rays(ray, begin, end, start, direction)
-    if before is None:
-        colors = march(tables.bricks, rules, posed.nodes, rays, shot.samples)
-    else:
-        colors = sampled(tables.bricks, rays, np.ones(len(ray)), rules.second_block, np.inf).colors
-    return _Seen(colors=colors, depth=enter * ray[:, 2], end=end)
+    rays = Rays(*(part.astype(np.float32) for part in (ray, begin, end, start, direction)))
+    return rays, (enter * ray[:, 2]).astype(np.float32)

@@ -42,10 +42,9 @@ def carried(
     for corner in np.ndindex(2, 2, 2):
         below = nodes.index[tuple((base + np.array([*corner[:2], 0])).T)]
         there = posed.camera[below + corner[2]]
-        shares = np.where(corner, part, 1 - part)
-        moved += there * shares.prod(axis=1, keepdims=True)
-        for axis in range(3):
-            others = np.delete(shares, axis, axis=1).prod(axis=1)
+        x, y, z = np.where(corner, part, 1 - part).T
+        moved += there * (x * y * z)[:, None]
+        for axis, others in enumerate((y * z, x * z, x * y)):
             sign = (2 * corner[axis] - 1) / nodes.step_m[axis]
             derivative[:, :, axis] += there * (others * sign)[:, None]
     return moved, derivative
@@ -128,11 +127,8 @@ def march(
     scale = -(-samples // rules.samples)
     for turn in range(rules.blocks * scale):
         if turn > 0:
-            rest = _led_back(rules, posed, rest)
-        longest = rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
-        if turn > 0 and turn == rules.blocks * scale - 1:
-            longest = rules.longest_m
-        block = sampled(bricks, rest, light[alive], rules.block, longest)
+            rest = led_back(rules, posed, rest)
+        block = sampled(bricks, rest, light[alive], rules.block, longest(rules, samples, turn))
         colors[alive] += block.colors
         light[alive] = block.light
         rest = rest._replace(
@@ -143,7 +139,15 @@ def march(
     return colors
 
 
-def _led_back(rules: DrawingRules, posed: PosedNodes, rays: Rays) -> Rays:
+def longest(rules: DrawingRules, samples: int, turn: int) -> float:
+    """How far apart the samples of a ray's `turn`-th block may be, metres."""
+    scale = -(-samples // rules.samples)
+    if turn > 0 and turn == rules.blocks * scale - 1:
+        return rules.longest_m
+    return rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
+
+
+def led_back(rules: DrawingRules, posed: PosedNodes, rays: Rays) -> Rays:
     """Canonical starts and directions after a Newton step."""
     camera, derivative = carried(posed, rays.start)
     volume = np.linalg.det(derivative)

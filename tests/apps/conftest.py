@@ -121,11 +121,11 @@ def call_play(capsys) -> Command:
 def without_baking(monkeypatch) -> None:
     """Leaves out the seconds that baking takes, where a test is not about the package."""
 
-    def export_nothing(avatar, path, *, views, metrics, hasty):
+    def export_nothing(avatar, path, *, views, metrics, hasty, progress):
         path.write_bytes(b"stand-in")
         return ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
-            largest_difference=0.0, warnings=(),
+            largest_difference=0.0, tuning=None, warnings=(),
         )  # fmt: skip
 
     monkeypatch.setattr(snapshot, "export_avatar", export_nothing)

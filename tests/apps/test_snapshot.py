@@ -8,7 +8,7 @@ from export.build import ExportReport
 
 WRITTEN = ExportReport(
     path=Path("a.iavatar"), bytes=9, seconds=1.0, psnr_to_renderer={"hq": 40.0},
-    largest_difference=0.0, warnings=(),
+    largest_difference=0.0, tuning=None, warnings=(),
 )  # fmt: skip
 HASTY = Snapshot(exported=WRITTEN, refused=None, ready_at=10.0)
 LATER = Snapshot(exported=dataclasses.replace(WRITTEN, bytes=20), refused=None, ready_at=14.0)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
-from export.bake import rounded
 from export.skin import finer_nodes, nodes_of
+from export.tables import rounded
 
 
 @pytest.fixture(scope="module")

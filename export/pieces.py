@@ -1,0 +1,130 @@
+"""Where the player's samples lie in the bricks, whatever these hold: pieces of rays."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from export.rules import DrawingRules
+from export.tables import Bricks
+from export.twin import Look
+from export.twin_march import PosedNodes, Rays, led_back, longest
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pieces:
+    """Blocks of samples along rays, as `twin_march.march` follows those that never end.
+
+    Attributes:
+        first: The first piece of each ray, in the order in which light passes them; and the end.
+        start: Where pieces begin, in voxels of the lattice.
+        slope: Voxels from one sample to the next.
+        step_m: The same along the ray, metres.
+        count: Samples.
+        layer: 0, or 1 for the second depth layer.
+    """
+
+    first: Int64[np.ndarray, "rays_and_one"]
+    start: Float32[np.ndarray, "pieces 3"]
+    slope: Float32[np.ndarray, "pieces 3"]
+    step_m: Float32[np.ndarray, "pieces"]
+    count: Int32[np.ndarray, "pieces"]
+    layer: Int32[np.ndarray, "pieces"]
+
+    @property
+    def rays(self) -> int:
+        """How many there are."""
+        return len(self.first) - 1
+
+    @classmethod
+    def of_first(
+        cls, rays: Rays, posed: PosedNodes, bricks: Bricks, rules: DrawingRules
+    ) -> "Pieces":
+        """The first layer's, of these rays in their order."""
+        blocks = list(_blocks(rays, posed, rules))
+        number = np.concatenate([ray for ray, _, _ in blocks])
+        step_m = np.concatenate([step for _, _, step in blocks])
+        start = np.concatenate([rest.start for _, rest, _ in blocks])
+        direction = np.concatenate([rest.direction for _, rest, _ in blocks])
+        return cls._sorted(
+            number, len(rays.begin), bricks, start, direction, step_m, (rules.block, 0)
+        )
+
+    @classmethod
+    def of_second(cls, look: Look, bricks: Bricks, rules: DrawingRules) -> "Pieces":
+        """The second layer's, of all rays of a look: none where there is only one layer."""
+        rays, count = look.second, rules.second_block
+        step_m = (rays.end - rays.begin) / np.float32(count)
+        return cls._sorted(
+            look.again, len(look.pixel), bricks, rays.start, rays.direction, step_m, (count, 1)
+        )
+
+    @classmethod
+    def _sorted(
+        cls,
+        number: Int64[np.ndarray, "pieces"],
+        rays: int,
+        bricks: Bricks,
+        start: Float32[np.ndarray, "pieces 3"],
+        direction: Float32[np.ndarray, "pieces 3"],
+        step_m: Float32[np.ndarray, "pieces"],
+        count_and_layer: tuple[int, int],
+    ) -> "Pieces":
+        """Ray by ray; the pieces of each stay in their order."""
+        order, voxel_m = np.argsort(number, kind="stable"), np.float32(bricks.voxel_m)
+        count, layer = count_and_layer
+        return cls(
+            first=np.searchsorted(number[order], np.arange(rays + 1)).astype(np.int64),
+            start=((start - bricks.low) / voxel_m)[order],
+            slope=(direction * (step_m / voxel_m)[:, None])[order],
+            step_m=step_m[order],
+            count=np.full(len(number), count, dtype=np.int32),
+            layer=np.full(len(number), layer, dtype=np.int32),
+        )
+
+    def followed_by(self, behind: "Pieces") -> "Pieces":
+        """The same rays, with further pieces behind those that they have."""
+        rays = np.arange(self.rays)
+        owners = [np.repeat(rays, np.diff(pieces.first)) for pieces in (self, behind)]
+        order = np.argsort(np.concatenate(owners), kind="stable")
+        columns = {
+            name: np.concatenate([getattr(self, name), getattr(behind, name)])[order]
+            for name in _COLUMNS
+        }
+        return Pieces(first=self.first + behind.first, **columns)
+
+    @classmethod
+    def joined(cls, many: "Sequence[Pieces]") -> "Pieces":
+        """The rays of many looks, one after the other."""
+        offsets = np.cumsum([0, *(len(pieces.step_m) for pieces in many)])
+        starts = [pieces.first[:-1] + o for pieces, o in zip(many, offsets[:-1], strict=True)]
+        columns = {
+            name: np.concatenate([getattr(pieces, name) for pieces in many]) for name in _COLUMNS
+        }
+        return cls(first=np.concatenate([*starts, offsets[-1:]]), **columns)
+
+
+_COLUMNS = [field.name for field in fields(Pieces) if field.name != "first"]
+"""What there is one of for each piece."""
+
+
+def _blocks(
+    rays: Rays, posed: PosedNodes, rules: DrawingRules
+) -> Iterator[tuple[Int64[np.ndarray, "pieces"], Rays, Float32[np.ndarray, "pieces"]]]:
+    """Numbers of rays, what is left of them, and the steps of their next block."""
+    number, rest = np.arange(len(rays.begin)), rays
+    for turn in range(rules.blocks):
+        if turn > 0:
+            rest = led_back(rules, posed, rest)
+        step_m = np.minimum(
+            (rest.end - rest.begin) / np.float32(rules.block),
+            np.float32(longest(rules, rules.samples, turn)),
+        )
+        yield number, rest, step_m
+        way = step_m * np.float32(rules.block)
+        rest = rest._replace(
+            begin=rest.begin + way, start=rest.start + rest.direction * way[:, None]
+        )
+        going = rest.begin < rest.end - 1e-5
+        number, rest = number[going], Rays(*(part[going] for part in rest))
