@@ -40,6 +40,7 @@ def snapshot(
     *,
     mark: CurvePoint | None,
     hasty: bool = False,
+    fine_tuned: bool = True,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Snapshot:
     """Writes the package, whole or not at all; training may go on afterwards.
@@ -51,7 +52,8 @@ def snapshot(
         views: Poses and cameras to check it with (`views_of`).
         mark: How well held-out frames were rendered when that was last asked; goes with it.
         hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
-        tell: Hears how far its fine-tuning is.
+        fine_tuned: Whether there are ten seconds more, for a better likeness.
+        tell: Hears how far that is.
 
     Raises:
         OSError: If the disk is full; what was there before stays.
@@ -67,6 +69,7 @@ def snapshot(
             views=views[:HASTY_VIEWS] if hasty else views,
             metrics=metrics,
             hasty=hasty,
+            fine_tuned=fine_tuned,
             progress=lambda share: tell(f"fine-tuned {share:.0%}"),
         )
     except ExportRefused as error:

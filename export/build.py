@@ -87,6 +87,7 @@ def export_avatar(
     renderer: Callable[[Avatar, BodyPose, Camera], Picture] = render,
     config: BakeConfig | None = None,
     hasty: bool = False,
+    fine_tuned: bool = True,
     progress: Progress = lambda _: None,
 ) -> ExportReport:
     """Writes an avatar's package, or nothing.
@@ -100,6 +101,8 @@ def export_avatar(
         renderer: The exact picture of an avatar.
         config: How finely to bake; follows the field's own finest cells if None.
         hasty: Whether it is wanted at once: coarser, with one quality alone and not fine-tuned.
+        fine_tuned: Whether bricks are fine-tuned against the renderer's pictures, some ten
+            seconds; a hasty package's never are.
         progress: Told how much of the fine-tuning is done, from 0 to 1. Ctrl-C meanwhile ends that
             alone.
 
@@ -119,6 +122,7 @@ def export_avatar(
         return rgb.cpu(), density.cpu()
 
     config = config or BakeConfig.for_cells(finest_m)
+    config = config if fine_tuned else replace(config, tuned=0)
     return export_field(
         field_at,
         avatar.rig,

@@ -122,7 +122,7 @@ class Viewer:
             return
         try:
             views = views_of(lesson.held, self._recording)
-            taken = snapshot(trainer, self._run.package, views, mark=mark)
+            taken = snapshot(trainer, self._run.package, views, mark=mark, fine_tuned=False)
         except OSError as error:
             self.page.tell("The package could not be written", str(error))
             return

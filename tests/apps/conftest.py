@@ -121,7 +121,7 @@ def call_play(capsys) -> Command:
 def without_baking(monkeypatch) -> None:
     """Leaves out the seconds that baking takes, where a test is not about the package."""
 
-    def export_nothing(avatar, path, *, views, metrics, hasty, progress):
+    def export_nothing(avatar, path, *, views, metrics, hasty, fine_tuned, progress):
         path.write_bytes(b"stand-in")
         return ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
