@@ -93,7 +93,10 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
 
 
 def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
-    rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
+    known = state["rig"]
+    # checkpoints of old know of nothing that is inside
+    known.setdefault("inside", torch.zeros(known["distance"].shape, dtype=torch.bool))
+    rig = Rig(**{name: tensor.numpy() for name, tensor in known.items()})
     trainer = Trainer(rig, TrainConfig(**state["config"]), device)
     with torch.no_grad():
         for field, name in ((trainer.field, "field"), (trainer.avatar.field, "mean")):

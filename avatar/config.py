@@ -8,6 +8,10 @@ COARSEST_M = 0.13
 """Cells of the coarsest hash level: 16 along a two-metre box."""
 ENOUGH_FRAMES = 24
 """So many frames, all round, determine the detail that their pixels show."""
+FEWEST = 4.0
+"""Surfaces are smoothed as for a quarter of that many at the most."""
+FIRM_WEIGHT, SOLID_WEIGHT = 0.75, 0.075
+"""Of both terms, if there were hardly any frames; less, the nearer they come to being enough."""
 Skipping = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
@@ -51,6 +55,15 @@ class TrainConfig:
     """Points at which that opacity is measured in each step."""
     variation_weight: float = 0.025
     """Of the total variation of opacity; 0 turns the term off."""
+    first_variation: float = 1.0
+    """So many times that weight at first: it falls to it as the learning rate falls."""
+    firm_weight: float = 0.0
+    """Of the double well of opacity, at the end; it grows as the learning rate falls. Where total
+    variation is asked for strongly, it keeps surfaces from becoming fog."""
+    solid_weight: float = 0.0
+    """Of the opacity deep under the body's skin, which must be solid; 0 turns the term off."""
+    solid_points: int = 128
+    """Points at which that opacity is measured in each step."""
     variation_pairs: int = 128
     """Pairs of points at which that variation is measured in each step."""
     occupancy_every: int = 16
@@ -87,6 +100,10 @@ class TrainConfig:
                 "empty_weight=0 or empty_term='global'."
             )
 
+    def variation_at(self, firm_share: float) -> float:
+        """The weight of total variation when surfaces have become firm so far, in [0, 1]."""
+        return self.variation_weight * self.first_variation ** (1.0 - firm_share)
+
     @classmethod
     def within(
         cls,
@@ -104,13 +121,15 @@ class TrainConfig:
             footprint_m: What one pixel covers on the body, metres.
             frames: How many frames there are, if that is known. Few of them, seen in poses that
                 are a little off, do not determine the finest detail: what they leave open would
-                be noise, in which no pose can be refined. So detail is coarser, and surfaces are
-                asked to be smoother.
+                be noise, in which no pose can be refined. So detail is coarser; surfaces are asked
+                to be smoother, most of all at first, while poses are found; the body is solid
+                inside; and what poses do not agree upon is no fog in the end, but firm.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
         too_few = 1.0 if frames is None else max(1.0, ENOUGH_FRAMES / max(frames, 1))
         footprint_m *= too_few**0.5
+        few = min(too_few, FEWEST)
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         wanted = 4.0 * 2.0 / finest_m**2
@@ -120,7 +139,10 @@ class TrainConfig:
             step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,
-            variation_weight=cls.variation_weight * too_few,
+            variation_weight=cls.variation_weight * few**2,
+            first_variation=few,
+            firm_weight=FIRM_WEIGHT * (1.0 - 1.0 / few),
+            solid_weight=SOLID_WEIGHT * (1.0 - 1.0 / few),
             seed=seed,
             hold_every=hold_every,
         )

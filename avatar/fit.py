@@ -39,7 +39,9 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
     for frame in held:
         prepared = prepare(frame.observation, avatar.rig)
         poses.put(replay.add(prepared), prepared.pose)
-    config = dataclasses.replace(trainer.config, empty_weight=0.0, rays=2 * RAYS_A_CORRECTION)
+    config = dataclasses.replace(
+        trainer.config, empty_weight=0.0, solid_weight=0.0, rays=2 * RAYS_A_CORRECTION
+    )
     sampler = CanonicalSampler(field.backend, avatar.occupancy, config)
     generator = torch.Generator(device=device).manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS * len(held) / 2)

@@ -30,6 +30,8 @@ FIRM_DENSITY = 20.0
 """What is denser than this, in 1/m, counts as solid when pieces are told apart."""
 SKIN_M = 0.03
 """A piece of the person lies about this close to the skin; what floats does not."""
+SOLID_M = 0.015
+"""Deeper under the body's skin than this everybody is solid, however the body fits."""
 SPECK = 0.003
 """Pieces with less near the skin than this share of the largest are no part of the person."""
 
@@ -55,6 +57,8 @@ class Occupancy:
         )
         self.band: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
+        self._solid = torch.from_numpy(rig.inside & (rig.distance > SOLID_M)).to(device)
+        self._solid = self._solid.flatten().nonzero()[:, 0]
         self._near_skin = rig.distance <= SKIN_M
         self._known_empty: tuple[int, Tensor] | None = None
 
@@ -109,6 +113,10 @@ class Occupancy:
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
         return self._somewhere_in(self._draw(self._empty(), count, generator), generator)
+
+    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Random points deep under the skin, at most `count`."""
+        return self._somewhere_in(self._draw(self._solid, count, generator), generator)
 
     def _empty(self) -> Int64[Tensor, "cells"]:
         """Cells of the band that hold nothing: looked up when the occupancy has changed."""

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
+from avatar.normals import vertex_normals
 from avatar.rig import PARTS
 from preprocess.body import ShapedBody
 
@@ -55,7 +56,7 @@ class SkinPatches:
         Left out is what nobody sees: the mouth's inside, and the soles.
         """
         weights = shaped.body.weights
-        normals, areas = _vertex_normals(shaped.vertices, shaped.body.faces)
+        normals, areas = vertex_normals(shaped.vertices, shaped.body.faces)
         parts = PARTS[weights.argmax(axis=1)]
         sides = _sides(normals, parts)
         voxels = np.floor(shaped.vertices / PATCH_M).astype(np.int64)
@@ -117,20 +118,6 @@ def in_front(
     steep = np.clip(cosine, 0.1, 1.0)
     slope = cell_m * np.sqrt(1.0 - steep**2) / steep
     return faces & (depth <= nearest[flat] + slack_m + slope)
-
-
-def _vertex_normals(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices"]]:
-    """Outward unit normals, and each vertex's share of the surface in square metres."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    doubled = np.cross(b - a, c - a)
-    normals, areas = np.zeros_like(vertices), np.zeros(len(vertices))
-    for k in range(3):
-        np.add.at(normals, faces[:, k], doubled)
-        np.add.at(areas, faces[:, k], np.linalg.norm(doubled, axis=1) / 6.0)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return normals, areas
 
 
 def _sides(

@@ -5,9 +5,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
 from scipy.ndimage import maximum_filter
 
+from avatar.normals import vertex_normals
 from avatar.skinning import distance_volume, skinning_volume
 from preprocess.body import ShapedBody
 from preprocess.kinematics import body_from_rest, world_from_body
@@ -57,6 +58,7 @@ class Rig:
         box_low, box_high: Corners of the canonical box, metres.
         weights: Skinning weights on nodes `low + (i, j, k) / (count - 1) * (high - low)`.
         distance: Distance from each occupancy cell's centre to the body's skin, metres.
+        inside: Whether that centre lies under the skin.
         seeds: Canonical points of the skin, one per 2-cm voxel and body part: where root finding
             starts.
         seed_weights: Their skinning weights.
@@ -70,6 +72,7 @@ class Rig:
     box_high: Float32[np.ndarray, "3"]
     weights: Float32[np.ndarray, "x y z 24"]
     distance: Float32[np.ndarray, "cx cy cz"]
+    inside: Bool[np.ndarray, "cx cy cz"]
     seeds: Float32[np.ndarray, "seeds 3"]
     seed_weights: Float32[np.ndarray, "seeds 24"]
     seed_parts: Int32[np.ndarray, "seeds"]
@@ -89,6 +92,10 @@ class Rig:
         low = (vertices.min(axis=0) - margin_m).astype(np.float32)
         high = (vertices.max(axis=0) + margin_m).astype(np.float32)
         seeds = _seeds(vertices, body.weights)
+        normals, _ = vertex_normals(vertices, body.faces)
+        distance, inside = distance_volume(
+            vertices, normals, low, high, OCCUPANCY_CELL_M, margin_m + 0.02
+        )
         return cls(
             rest_joints=shaped.joints,
             parents=body.parents,
@@ -98,7 +105,8 @@ class Rig:
             weights=skinning_volume(
                 vertices, body.weights, low, high, WEIGHT_CELL_M, margin_m + 0.05
             ),
-            distance=distance_volume(vertices, low, high, OCCUPANCY_CELL_M, margin_m + 0.02),
+            distance=distance,
+            inside=inside,
             seeds=vertices[seeds].astype(np.float32),
             seed_weights=body.weights[seeds].astype(np.float32),
             seed_parts=PARTS[body.weights[seeds].argmax(axis=1)].astype(np.int32),

@@ -26,6 +26,10 @@ class Sampler(Protocol):
         """Canonical points that should hold nothing, at most `count`."""
         ...
 
+    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Canonical points where the body is solid, at most `count`."""
+        ...
+
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Learns that a slot holds another frame from now on.
 
@@ -64,6 +68,10 @@ class CanonicalSampler:
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing."""
         return self._occupancy.empty_points(count, generator)
+
+    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Random points deep under the skin."""
+        return self._occupancy.solid_points(count, generator)
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Nothing to learn: canonical occupancy is every pose's."""

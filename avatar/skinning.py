@@ -75,15 +75,33 @@ def _smoothed(
 
 def distance_volume(
     vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
     low: Float[np.ndarray, "3"],
     high: Float[np.ndarray, "3"],
     cell_m: float,
     reach_m: float,
-) -> Float32[np.ndarray, "x y z"]:
-    """Unsigned distance in metres from each cell's centre to the nearest vertex; 1 beyond reach."""
+) -> tuple[Float32[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
+    """How far each cell's centre is from the skin, and whether it lies under it.
+
+    Args:
+        vertices: Canonical vertices, metres.
+        normals: Outward, at the vertices.
+        low, high: Corners of the box, metres.
+        cell_m: About the edge of a cell, metres.
+        reach_m: Cells farther than this from every vertex count as 1 m away, and outside.
+
+    Returns:
+        Unsigned distance to the nearest vertex, metres; and whether the centre is on the inner side
+        of that vertex, which is right wherever it is farther off than vertices from each other.
+    """
     shape = volume_shape(low, high, cell_m)
     size = (high - low) / shape
     axes = [low[k] + (np.arange(shape[k]) + 0.5) * size[k] for k in range(3)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance_m, _ = KDTree(vertices).query(centers, distance_upper_bound=reach_m, workers=-1)
-    return np.minimum(distance_m, 1.0).astype(np.float32).reshape(shape)
+    distance_m, nearest = KDTree(vertices).query(centers, distance_upper_bound=reach_m, workers=-1)
+    near = np.flatnonzero(np.isfinite(distance_m))
+    away = centers[near] - vertices[nearest[near]]
+    inside = np.zeros(len(centers), dtype=bool)
+    inside[near] = np.einsum("ca,ca->c", away, normals[nearest[near]]) < 0.0
+    distance_m = np.minimum(distance_m, 1.0).astype(np.float32)
+    return distance_m.reshape(shape), inside.reshape(shape)

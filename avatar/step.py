@@ -7,18 +7,13 @@ import torch
 from jaxtyping import Float32, Int32
 from torch import Tensor
 
+from avatar import priors
 from avatar.config import TrainConfig
 from avatar.field import Field
 from avatar.kernels.backend import CellTables, Grid, Samples
-from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.refine import PULLING_M, PoseTable
 from avatar.replay import Batch
 from avatar.sampling import Sampler
-
-OPACITY_M = 0.01
-"""Emptiness and variation are those of the opacity of one centimetre, as in the paper's code."""
-APART_M = 0.01
-"""Standard deviation of the way from one point of a pair to the other, along each axis."""
 
 
 class StepResult(NamedTuple):
@@ -42,6 +37,7 @@ def gradients(
     config: TrainConfig,
     *,
     hard_share: float,
+    firm_share: float = 0.0,
     remember: Grid | None = None,
     poses: PoseTable | None = None,
     generator: torch.Generator,
@@ -56,6 +52,8 @@ def gradients(
         config: The recipe.
         hard_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
             must be found before it can be hard.
+        firm_share: How far, in [0, 1], surfaces have come from being found (smooth, and fog where
+            poses do not agree yet) to being firm.
         remember: Whose cached densities the samples' raise, if any.
         poses: Whose wrenches take up what pulls the samples, if poses are refined.
         generator: Of backgrounds, empty points and pairs, on the field's device.
@@ -66,75 +64,37 @@ def gradients(
         if config.empty_weight
         else samples.points[:0]
     )
-    pairs = _pairs(samples.points, config, generator)
-    seen = field.forward(torch.cat([samples.points, empty, pairs]))
-    count, until = len(samples.points), len(samples.points) + len(empty)
+    pairs = priors.pairs(samples.points, config, generator)
+    solid = (
+        sampler.solid_points(config.solid_points, generator).to(samples.points)
+        if config.solid_weight
+        else samples.points[:0]
+    )
+    asked = [samples.points, empty, pairs, solid]
+    seen = field.forward(torch.cat(asked))
+    raw, raw_empty, raw_pairs, raw_solid = seen.raw.split([len(points) for points in asked])
+    count = len(raw)
     background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
     _, loss, grad = field.backend.composite_loss(
-        seen.raw[:count], samples, config.step_m, batch.target, background,
+        raw, samples, config.step_m, batch.target, background,
         config.alpha_weight, config.hard_weight * hard_share,
     )  # fmt: skip
-    grad_empty = _grad_of_emptiness(seen.raw[count:until], config.empty_weight)
-    grad_pairs = _grad_of_variation(seen.raw[until:], config.variation_weight)
-    grad_features = field.backward(seen, torch.cat([grad, grad_empty, grad_pairs]))
+    grad_pairs = priors.variation(raw_pairs, config.variation_at(firm_share))
+    if config.firm_weight:
+        grad_pairs += priors.double_well(raw_pairs, config.firm_weight * firm_share)
+    grads = [
+        grad,
+        priors.emptiness(raw_empty, config.empty_weight),
+        grad_pairs,
+        priors.solidity(raw_solid, config.solid_weight),
+    ]
+    grad_features = field.backward(seen, torch.cat(grads))
     if poses is not None and count:
         _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells, loss)
     if remember is not None:
-        log_density = seen.raw[:count, 3].contiguous()
+        log_density = raw[:, 3].contiguous()
         field.backend.keep_highest(seen.points[:count], log_density, remember)
     return StepResult(loss, count)
-
-
-def _grad_of_emptiness(raw: Float32[Tensor, "points 4"], weight: float) -> Tensor:
-    """Gradient of the mean opacity of one centimetre, 1 - exp(-σ · 1 cm) (the paper's §3.4)."""
-    grad = torch.zeros_like(raw)
-    grad[:, 3] = weight / max(len(raw), 1) * _opacity(raw).slope
-    return grad
-
-
-def _pairs(
-    points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
-) -> Float32[Tensor, "points 3"]:
-    """Samples drawn at random, and after them a point near each: none if there is no weight."""
-    count = config.variation_pairs if config.variation_weight and len(points) else 0
-    size = (count, 3)
-    chosen = torch.randint(
-        max(len(points), 1), size[:1], generator=generator, device=generator.device
-    )
-    apart = APART_M * torch.randn(size, generator=generator, device=generator.device)
-    first = points[chosen.to(points.device)]
-    return torch.cat([first, first + apart.to(points)])
-
-
-def _grad_of_variation(raw: Float32[Tensor, "points 4"], weight: float) -> Tensor:
-    """Gradient of the mean |α - α'| over pairs of points, α the opacity of one centimetre.
-
-    The total variation of a solid is its surface (Rudin, Osher and Fatemi 1992), and of all
-    surfaces that explain the pictures the smallest is the least ragged one. An edge may be as sharp
-    as it likes.
-
-    Args:
-        raw: First points of the pairs, then second ones.
-        weight: Of the term.
-    """
-    grad, count = torch.zeros_like(raw), len(raw) // 2
-    opacity = _opacity(raw)
-    sign = torch.sign(opacity.value[:count] - opacity.value[count:])
-    grad[:, 3] = weight / max(count, 1) * torch.cat([sign, -sign]) * opacity.slope
-    return grad
-
-
-class _Opacity(NamedTuple):
-    """Opacity of one centimetre, 1 - exp(-σ · 1 cm), and its slope over log density."""
-
-    value: Float32[Tensor, "points"]
-    slope: Float32[Tensor, "points"]
-
-
-def _opacity(raw: Float32[Tensor, "points 4"]) -> _Opacity:
-    optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * OPACITY_M
-    through = torch.exp(-optical)
-    return _Opacity(1.0 - through, optical * through)
 
 
 def _pull(

@@ -123,9 +123,11 @@ class Trainer:
         Args:
             rate: Factor of the learning rates, in (0, 1].
             hard_share: Share of the hard-surface loss's weight, in [0, 1].
-            pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None.
+            pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None. As it falls,
+                surfaces become firm.
         """
         config, field = self.config, self.field
+        falling = rate if pose_rate is None else pose_rate
         batch = self.replay.draw(config.rays, self._generator)
         remembers = self.steps % config.occupancy_every < 2
         refines = config.refine_poses and self.steps % self.poses.every == 0
@@ -133,6 +135,7 @@ class Trainer:
         result = gradients(
             field, self.sampler, self.replay.cells, batch, config,
             hard_share=hard_share,
+            firm_share=1.0 - falling,
             remember=self.avatar.occupancy.grid if remembers else None,
             poses=self.poses if refines else None,
             generator=self._generator,
@@ -142,7 +145,7 @@ class Trainer:
         self.optimizer.step()
         field.table_grad.zero_()
         if refines:
-            self._correct_poses(rate if pose_rate is None else pose_rate)
+            self._correct_poses(falling)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
             self._update_occupancy()

@@ -85,13 +85,14 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
     centers = np.stack(
         np.meshgrid(*(np.linspace(-0.95, 0.95, 20) * side for side in high), indexing="ij"), axis=-1
     )
+    off_axis = np.linalg.norm(centers[..., 1:], axis=-1)
     turn, along = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 16, False), np.linspace(-0.2, 0.2, 16))
     seeds = np.stack([along, 0.05 * np.cos(turn), 0.05 * np.sin(turn)], axis=-1).reshape(-1, 3)
     rig = Rig(
         rest_joints=np.zeros((24, 3)), parents=np.full(24, -1),
         canonical_rotations=np.zeros((23, 3)),
         box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
-        distance=np.abs(np.linalg.norm(centers[..., 1:], axis=-1) - 0.05).astype(np.float32),
+        distance=np.abs(off_axis - 0.05).astype(np.float32), inside=off_axis < 0.05,
         seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * POINTS],
         seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
     )  # fmt: skip

@@ -46,6 +46,10 @@ class PosedSampler:
         """What is known to be empty."""
         return self._emptiness.empty_points(count, generator)
 
+    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """None: the paper asks nothing of them."""
+        return torch.zeros(0, 3, device=generator.device)
+
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Both parts learn of the frame."""
         self._warp.admit(slot, bones)
@@ -78,6 +82,10 @@ class GloballySparse:
         """Random points of the whole box."""
         place = torch.rand(count, 3, generator=generator, device=generator.device)
         return self._low + place.to(self._low.device) * (self._high - self._low)
+
+    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """The other's."""
+        return self._sampler.solid_points(count, generator)
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """The other learns of it."""

@@ -213,3 +213,10 @@ def test_a_checkpoint_from_before_there_was_a_mean_shows_what_was_learnt(saved, 
     again, _ = checkpoint.load(damaged(saved, lambda state: state.pop("mean")), CPU)
     shown = zip(again.avatar.field.parameters(), trainer.field.parameters(), strict=True)
     assert all(torch.equal(ours, theirs) for ours, theirs in shown)
+
+
+def test_a_checkpoint_from_before_anything_was_inside_knows_of_nothing_solid(saved, trainer):
+    again, _ = checkpoint.load(damaged(saved, lambda state: state["rig"].pop("inside")), CPU)
+    assert not again.avatar.rig.inside.any()
+    assert again.avatar.rig.inside.shape == trainer.avatar.rig.inside.shape
+    assert len(again.avatar.occupancy.solid_points(10, torch.Generator())) == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.occupancy import OPACITY, Occupancy, grown, specks
+from avatar.occupancy import OPACITY, SOLID_M, Occupancy, grown, specks
 
 CPU = torch.device("cpu")
 STEP_M = 0.01
@@ -116,3 +116,11 @@ def test_one_piece_has_no_specks():
     firm = torch.zeros(8, 8, 8, dtype=torch.bool)
     firm[2:5, 2:5, 2:5] = True
     assert int(specks(firm, np.ones(firm.shape, dtype=bool)).sum()) == 0
+
+
+def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
+    points = occupancy.solid_points(500, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 500
+    assert rig.inside[tuple(cell.T.numpy())].all()
+    assert (rig.distance[tuple(cell.T.numpy())] > SOLID_M).all()

@@ -155,3 +155,26 @@ def test_body_parts_mirror():
     for left, right in pairs:
         assert (PARTS[left] == PARTS[right]) == (PARTS[left] == 0)
         assert (PARTS[left] == PARTS[PARENTS[left]]) == (PARTS[right] == PARTS[PARENTS[right]])
+
+
+def winding_number(points, vertices, faces) -> np.ndarray:
+    """How often a closed mesh winds about each point: its solid angle over 4π.
+
+    Van Oosterom and Strackee 1983.
+    """
+    a, b, c = (vertices[faces[:, k]][None] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+    volume = np.einsum("pfk,pfk->pf", a, np.cross(b, c))
+    ab, bc, ca = ((x * y).sum(axis=-1) for x, y in ((a, b), (b, c), (c, a)))
+    angle = 2.0 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return angle.sum(axis=1) / (4.0 * np.pi)
+
+
+def test_what_is_inside_is_where_the_skin_winds_about_it(rig, skin, shaped, rng):
+    shape = np.array(rig.distance.shape)
+    off_skin = np.argwhere((rig.distance > 0.015) & (rig.distance < 0.1))
+    cell = off_skin[rng.integers(len(off_skin), size=200)]
+    centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
+    inside = winding_number(centers, skin, shaped.body.faces) > 0.5
+    assert 0.05 < inside.mean() < 0.5
+    assert (rig.inside[tuple(cell.T)] == inside).mean() > 0.99

@@ -96,7 +96,7 @@ def test_a_node_on_a_vertex_is_not_taken_by_it_alone():
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 3))
 def test_the_distance_to_a_single_vertex_is_exact(place):
     vertex = np.array(place)
-    distance = distance_volume(vertex[None], LOW, HIGH, CELL_M, 0.3)
+    distance, _ = distance_volume(vertex[None], np.eye(3)[:1], LOW, HIGH, CELL_M, 0.3)
     shape = np.array(distance.shape)
     index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     expected = np.linalg.norm(LOW + (index + 0.5) / shape * (HIGH - LOW) - vertex, axis=-1)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avatar import step as step_module
+from avatar import priors
 from avatar.config import TrainConfig
 from avatar.kernels import reference
 from avatar.kernels.backend import Marching, Samples
@@ -16,10 +16,12 @@ from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
 from avatar.trainer import Trainer
 
+FIRM_SHARE = 0.25
+"""Far from 0 and 1, so that no term may be left out."""
 CONFIG = TrainConfig(
     rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
     empty_weight=0.3, hard_weight=0.1, variation_weight=0.2, variation_pairs=16,
-    most_samples=256,
+    first_variation=3.0, firm_weight=0.4, solid_weight=0.1, solid_points=24, most_samples=256,
 )  # fmt: skip
 
 
@@ -33,10 +35,10 @@ def trainer(rig, clip):
     return trainer
 
 
-def mean_loss(trainer, parameters, samples, empty, pairs, batch, background):
+def mean_loss(trainer, parameters, samples, empty, pairs, solid, batch, background):
     """The whole loss of a step, differentiable, in whatever precision the parameters have."""
     table, first, first_bias, second, second_bias = parameters
-    points = torch.cat([samples.points, empty, pairs]).to(table.dtype)
+    points = torch.cat([samples.points, empty, pairs, solid]).to(table.dtype)
     features = reference.encode(points, table, trainer.avatar.field.levels)
     hidden = torch.relu(features @ first + first_bias)
     raw = hidden @ second + second_bias
@@ -47,12 +49,15 @@ def mean_loss(trainer, parameters, samples, empty, pairs, batch, background):
         CONFIG.alpha_weight, CONFIG.hard_weight,
     ).mean()  # fmt: skip
     density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
-    opacity = 1.0 - torch.exp(-density * step_module.OPACITY_M)
-    loss = loss + CONFIG.empty_weight * opacity[: len(empty)].mean()
+    opacity = 1.0 - torch.exp(-density * priors.OPACITY_M)
+    of_empty, of_pairs, of_solid = opacity.split([len(empty), len(pairs), len(solid)])
+    loss = loss + CONFIG.empty_weight * of_empty.mean()
+    loss = loss - CONFIG.solid_weight * of_solid.log().mean()
     if len(pairs) == 0:
         return loss
-    one, other = opacity[len(empty) :].chunk(2)
-    return loss + CONFIG.variation_weight * (one - other).abs().mean()
+    one, other = of_pairs.chunk(2)
+    variation = 0.2 * 3.0**0.75 * (one - other).abs().mean()
+    return loss + variation + 0.4 * FIRM_SHARE * (of_pairs * (1.0 - of_pairs)).mean()
 
 
 def one_step(trainer, backend):
@@ -64,7 +69,7 @@ def one_step(trainer, backend):
     field.table_grad.zero_()
     gradients(
         field, CanonicalSampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
-        hard_share=1.0, generator=generator,
+        hard_share=1.0, firm_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
     how = Marching(CONFIG.step_m, CONFIG.grace_m, CONFIG.most_samples)
@@ -72,11 +77,12 @@ def one_step(trainer, backend):
     empty = occupancy.empty_points(CONFIG.empty_points, generator)
     drawn = CONFIG.variation_pairs if len(samples.points) else 0
     chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
-    apart = step_module.APART_M * torch.randn(drawn, 3, generator=generator)
+    apart = priors.APART_M * torch.randn(drawn, 3, generator=generator)
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
+    solid = occupancy.solid_points(CONFIG.solid_points, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
-    return grads, (samples, empty, pairs, batch, background)
+    return grads, (samples, empty, pairs, solid, batch, background)
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
@@ -108,9 +114,11 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
 
 
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
-    """Rays that miss everything: no crash, and no gradient but that of emptiness."""
+    """Rays that miss everything: no crash, and no gradient but those of the priors."""
     trainer.avatar.occupancy.grid.occupied.zero_()
-    (_, first, *_), (samples, empty, pairs, batch, background) = one_step(trainer, NumbaBackend())
+    (_, first, *_), (samples, empty, pairs, _, batch, background) = one_step(
+        trainer, NumbaBackend()
+    )
     assert isinstance(samples, Samples)
     assert len(samples.points) == 0
     assert torch.isfinite(first).all()

@@ -1,0 +1,94 @@
+"""What opacity is asked to be where no ray tells: empty off the body, solid deep in it, and firm.
+
+All terms speak of the opacity of one centimetre, α = 1 - exp(-σ · 1 cm), as in the paper's code,
+and of log density s; dα/ds = σ · 1 cm · (1 - α). Each function gives the gradient of a mean.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.config import TrainConfig
+from avatar.kernels.reference import MAX_LOG_DENSITY
+
+OPACITY_M = 0.01
+APART_M = 0.01
+"""Standard deviation of the way from one point of a pair to the other, along each axis."""
+LEAST_OPACITY = 1e-6
+
+
+class Opacity(NamedTuple):
+    """Opacity of one centimetre and its slope over log density."""
+
+    value: Float32[Tensor, "points"]
+    slope: Float32[Tensor, "points"]
+
+    @classmethod
+    def of(cls, raw: Float32[Tensor, "points 4"]) -> "Opacity":
+        """From a field's raw numbers."""
+        optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * OPACITY_M
+        through = torch.exp(-optical)
+        return cls(1.0 - through, optical * through)
+
+
+def emptiness(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor, "points 4"]:
+    """Of the mean α where nothing should be (the paper's §3.4)."""
+    return _of_density(raw, weight / max(len(raw), 1) * Opacity.of(raw).slope)
+
+
+def solidity(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor, "points 4"]:
+    """Of the mean -log α where something must be: cross-entropy, which pulls at nothing, too."""
+    opacity = Opacity.of(raw)
+    slope = opacity.slope / opacity.value.clamp(min=LEAST_OPACITY)
+    return _of_density(raw, -weight / max(len(raw), 1) * slope)
+
+
+def pairs(
+    points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
+) -> Float32[Tensor, "points 3"]:
+    """Samples drawn at random, and after them a point near each: none if there is no weight."""
+    count = config.variation_pairs if config.variation_weight and len(points) else 0
+    size = (count, 3)
+    chosen = torch.randint(
+        max(len(points), 1), size[:1], generator=generator, device=generator.device
+    )
+    apart = APART_M * torch.randn(size, generator=generator, device=generator.device)
+    first = points[chosen.to(points.device)]
+    return torch.cat([first, first + apart.to(points)])
+
+
+def variation(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor, "points 4"]:
+    """Of the mean |α - α'| over pairs of points.
+
+    The total variation of a solid is its surface (Rudin, Osher and Fatemi 1992), and of all
+    surfaces that explain the pictures the smallest is the least ragged one. An edge may be as sharp
+    as it likes; but of what a ray needs not one half as opaque and twice as thick is as good.
+
+    Args:
+        raw: First points of the pairs, then second ones.
+        weight: Of the term.
+    """
+    count, opacity = len(raw) // 2, Opacity.of(raw)
+    sign = torch.sign(opacity.value[:count] - opacity.value[count:])
+    return _of_density(raw, weight / max(count, 1) * torch.cat([sign, -sign]) * opacity.slope)
+
+
+def double_well(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor, "points 4"]:
+    """Of the mean α (1 - α), which is least where all is solid or nothing.
+
+    With total variation beside it the least fog and the smallest surface are sought together, as
+    between two phases of a fluid (Modica and Mortola 1977).
+    """
+    opacity = Opacity.of(raw)
+    return _of_density(raw, weight / max(len(raw), 1) * (1.0 - 2.0 * opacity.value) * opacity.slope)
+
+
+def _of_density(
+    raw: Float32[Tensor, "points 4"], slope: Float32[Tensor, "points"]
+) -> Float32[Tensor, "points 4"]:
+    """No gradient for colours."""
+    grad = torch.zeros_like(raw)
+    grad[:, 3] = slope
+    return grad
