@@ -8,10 +8,13 @@ COARSEST_M = 0.13
 """Cells of the coarsest hash level: 16 along a two-metre box."""
 ENOUGH_FRAMES = 24
 """So many frames, all round, determine the detail that their pixels show."""
-FEWEST = 4.0
-"""Surfaces are smoothed as for a quarter of that many at the most."""
-FIRM_WEIGHT, SOLID_WEIGHT = 0.75, 0.075
-"""Of both terms, if there were hardly any frames; less, the nearer they come to being enough."""
+SCANT_FRAMES = 12
+"""Fewer do not tell a pose's error from the body's shape: what they leave open becomes fog, unless
+surfaces are asked to be firm. Asked of twelve frames in exact poses it cost 0.5 dB."""
+FEWEST, SCANTEST = 4.0, 1.5
+"""Both count no further than to a quarter, and to two thirds."""
+FIRM_WEIGHT, SOLID_WEIGHT = 1.5, 0.15
+"""Of both terms, times the share by which frames are fewer than `SCANT_FRAMES`."""
 Skipping = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
@@ -122,14 +125,17 @@ class TrainConfig:
             frames: How many frames there are, if that is known. Few of them, seen in poses that
                 are a little off, do not determine the finest detail: what they leave open would
                 be noise, in which no pose can be refined. So detail is coarser; surfaces are asked
-                to be smoother, most of all at first, while poses are found; the body is solid
-                inside; and what poses do not agree upon is no fog in the end, but firm.
+                to be smoother. Of fewer than a dozen they are, most of all at first, while poses
+                are found; the body is solid inside; and what poses do not agree upon is no fog in
+                the end, but firm.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
         too_few = 1.0 if frames is None else max(1.0, ENOUGH_FRAMES / max(frames, 1))
         footprint_m *= too_few**0.5
         few = min(too_few, FEWEST)
+        scant = 1.0 if frames is None else SCANT_FRAMES / max(frames, 1)
+        scant = min(max(scant, 1.0), SCANTEST)
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         wanted = 4.0 * 2.0 / finest_m**2
@@ -139,10 +145,10 @@ class TrainConfig:
             step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,
-            variation_weight=cls.variation_weight * few**2,
-            first_variation=few,
-            firm_weight=FIRM_WEIGHT * (1.0 - 1.0 / few),
-            solid_weight=SOLID_WEIGHT * (1.0 - 1.0 / few),
+            variation_weight=cls.variation_weight * few * scant**3,
+            first_variation=scant**3,
+            firm_weight=FIRM_WEIGHT * (1.0 - 1.0 / scant),
+            solid_weight=SOLID_WEIGHT * (1.0 - 1.0 / scant),
             seed=seed,
             hold_every=hold_every,
         )

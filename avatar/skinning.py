@@ -100,8 +100,9 @@ def distance_volume(
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     distance_m, nearest = KDTree(vertices).query(centers, distance_upper_bound=reach_m, workers=-1)
     near = np.flatnonzero(np.isfinite(distance_m))
-    away = centers[near] - vertices[nearest[near]]
+    closest = np.asarray(nearest)[near]
+    away = centers[near] - vertices[closest]
     inside = np.zeros(len(centers), dtype=bool)
-    inside[near] = np.einsum("ca,ca->c", away, normals[nearest[near]]) < 0.0
+    inside[near] = np.einsum("ca,ca->c", away, normals[closest]) < 0.0
     distance_m = np.minimum(distance_m, 1.0).astype(np.float32)
     return distance_m.reshape(shape), inside.reshape(shape)

@@ -67,13 +67,16 @@ def test_the_fewer_the_frames_the_smoother_surfaces_are_asked_to_be():
         for frames in (None, 120, 24, 12, 6)
     ]
     usual = TrainConfig().variation_weight
-    assert weights == pytest.approx([usual, usual, usual, 4.0 * usual, 16.0 * usual])
+    assert weights == pytest.approx([usual, usual, usual, 2.0 * usual, 13.5 * usual])
 
 
 def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
     usual = TrainConfig.within(60.0, footprint_m=0.004)
     for frames in (24, 25, 1000):
         assert TrainConfig.within(60.0, footprint_m=0.004, frames=frames) == usual
+    dozen = TrainConfig.within(60.0, footprint_m=0.004, frames=12)
+    assert dozen.firm_weight == dozen.solid_weight == 0.0
+    assert dozen.first_variation == 1.0
     assert usual.firm_weight == usual.solid_weight == 0.0
     assert usual.variation_at(0.0) == usual.variation_at(1.0) == usual.variation_weight
 
@@ -82,4 +85,4 @@ def test_surfaces_are_smoothest_at_first():
     few = TrainConfig.within(60.0, footprint_m=0.004, frames=8)
     weights = [few.variation_at(share) for share in (0.0, 0.5, 1.0)]
     assert weights[2] == few.variation_weight < weights[1] < weights[0]
-    assert weights[0] == pytest.approx(3.0 * few.variation_weight)
+    assert weights[0] == pytest.approx(1.5**3 * few.variation_weight)
