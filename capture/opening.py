@@ -42,18 +42,23 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
     if list_images(path) and not videos:
         return ImageFolder(path, selection)
     if len(videos) != 1:
-        if videos:
-            found, advice = ", ".join(file.name for file in videos), "Name the video itself."
-        else:
-            endings = {file.suffix.lower() for file in path.iterdir() if file.suffix}
-            found = f"files ending in {', '.join(sorted(endings))}" if endings else "neither"
-            heic = "HEIC pictures must be converted, to JPEG or PNG."
-            advice = heic if endings & HEIC else "Name the folder that holds them."
-        raise BadInput(
-            f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
-            f"{found}. {advice}"
-        )
+        raise _unclear(path, videos)
     return VideoFile(videos[0], selection)
+
+
+def _unclear(path: Path, videos: list[Path]) -> BadInput:
+    """What is said of a folder that is neither pictures nor one video."""
+    if videos:
+        found, advice = ", ".join(file.name for file in videos), "Name the video itself."
+    else:
+        endings = {file.suffix.lower() for file in path.iterdir() if file.suffix}
+        found = f"files ending in {', '.join(sorted(endings))}" if endings else "neither"
+        heic = "HEIC pictures must be converted, to JPEG or PNG."
+        advice = heic if endings & HEIC else "Name the folder that holds them."
+    return BadInput(
+        f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
+        f"{found}. {advice}"
+    )
 
 
 def open_live(

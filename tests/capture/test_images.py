@@ -110,8 +110,10 @@ def test_a_repeated_picture_is_flagged(tmp_path):
 
 
 def test_a_folder_without_pictures_is_refused(tmp_path):
-    (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(BadInput, match="found neither"):
+        open_source(tmp_path)
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(BadInput, match=r"found files ending in \.txt"):
         open_source(tmp_path)
 
 
