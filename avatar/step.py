@@ -56,38 +56,19 @@ def gradients(
             poses do not agree yet) to being firm.
         remember: Whose cached densities the samples' raise, if any.
         poses: Whose wrenches take up what pulls the samples, if poses are refined.
-        generator: Of backgrounds, empty points and pairs, on the field's device.
+        generator: Of backgrounds and of the points that are asked, on the field's device.
     """
     samples = sampler.samples(batch.rays, cells)
-    empty = (
-        sampler.empty_points(config.empty_points, generator).to(samples.points)
-        if config.empty_weight
-        else samples.points[:0]
-    )
-    pairs = priors.pairs(samples.points, config, generator)
-    solid = (
-        sampler.solid_points(config.solid_points, generator).to(samples.points)
-        if config.solid_weight
-        else samples.points[:0]
-    )
-    asked = [samples.points, empty, pairs, solid]
-    seen = field.forward(torch.cat(asked))
-    raw, raw_empty, raw_pairs, raw_solid = seen.raw.split([len(points) for points in asked])
+    asked = _asked(sampler, samples.points, config, generator)
+    seen = field.forward(torch.cat([samples.points, *asked]))
+    raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
     background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
     _, loss, grad = field.backend.composite_loss(
         raw, samples, config.step_m, batch.target, background,
         config.alpha_weight, config.hard_weight * hard_share,
     )  # fmt: skip
-    grad_pairs = priors.variation(raw_pairs, config.variation_at(firm_share))
-    if config.firm_weight:
-        grad_pairs += priors.double_well(raw_pairs, config.firm_weight * firm_share)
-    grads = [
-        grad,
-        priors.emptiness(raw_empty, config.empty_weight),
-        grad_pairs,
-        priors.solidity(raw_solid, config.solid_weight),
-    ]
+    grads = [grad, *_grads_asked(raw_asked, config, firm_share)]
     grad_features = field.backward(seen, torch.cat(grads))
     if poses is not None and count:
         _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells, loss)
@@ -95,6 +76,40 @@ def gradients(
         log_density = raw[:, 3].contiguous()
         field.backend.keep_highest(seen.points[:count], log_density, remember)
     return StepResult(loss, count)
+
+
+def _asked(
+    sampler: Sampler,
+    points: Float32[Tensor, "samples 3"],
+    config: TrainConfig,
+    generator: torch.Generator,
+) -> list[Float32[Tensor, "_ 3"]]:
+    """Points at which opacity is asked for, besides the rays': empty ones, pairs, solid ones."""
+    none = points[:0]
+    return [
+        sampler.empty_points(config.empty_points, generator).to(points)
+        if config.empty_weight
+        else none,
+        priors.pairs(points, config, generator),
+        sampler.solid_points(config.solid_points, generator).to(points)
+        if config.solid_weight
+        else none,
+    ]
+
+
+def _grads_asked(
+    raw: list[Float32[Tensor, "_ 4"]], config: TrainConfig, firm_share: float
+) -> list[Float32[Tensor, "_ 4"]]:
+    """The gradients of what `_asked` asks, in its order."""
+    empty, pairs, solid = raw
+    grad_pairs = priors.variation(pairs, config.variation_at(firm_share))
+    if config.firm_weight:
+        grad_pairs += priors.double_well(pairs, config.firm_weight * firm_share)
+    return [
+        priors.emptiness(empty, config.empty_weight),
+        grad_pairs,
+        priors.solidity(solid, config.solid_weight),
+    ]
 
 
 def _pull(

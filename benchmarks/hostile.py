@@ -1,6 +1,6 @@
 """Ten thousand damaged, hostile and random files through every reader.
 
-    python -m benchmarks.hostile [--files 10000] [--seed 0] [--keep DIR]
+    python -m benchmarks.hostile [--files 10000] [--seed 0] [--package FILE | --no-packages]
 
 Small whole files of each kind are made, and of these files with bytes changed, left out, exchanged,
 calls of something put in; archives and packages changed inside, with sums that are right; JSON with
@@ -10,11 +10,7 @@ that names the file, nothing run, no more memory than the cap, nothing that hang
 """
 
 import argparse
-import gzip
-import hashlib
-import io
 import json
-import pickle
 import resource
 import shutil
 import signal
@@ -22,8 +18,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zipfile
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +27,7 @@ import numpy as np
 
 from benchmarks.hardware import Hardware
 from benchmarks.hostile_seeds import make_seeds
-from benchmarks.mutations import mutated, mutated_json, mutated_zip, random_opcodes
+from benchmarks.mutations import bomb, changed
 
 SHARES = {
     "pickles": 30, "poses": 25, "masks": 12, "cameras": 12, "bodies": 7, "captures": 6,
@@ -44,7 +38,6 @@ BOMB_EVERY = 500
 CAP_MB = 1100
 """Of one file: 1 GiB, which is what a stranger's file may unpack to, and some for its records."""
 HANGS_AFTER_S = 60
-ZIPS = (".npz", ".pt", ".r3d", ".iavatar")
 RUNS = (
     "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.", "socket.",
     "webbrowser.",
@@ -65,65 +58,6 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 # --- files ---------------------------------------------------------------------------------------
-
-
-def bomb(rng: np.random.Generator) -> bytes:
-    """A small file that unpacks to more than the cap."""
-    zeros = bytes(64 << 20)
-    way = int(rng.integers(0, 4))
-    if way == 0:
-        packer = zlib.compressobj(9)
-        return b"".join(packer.compress(zeros) for _ in range(24)) + packer.flush()
-    if way == 1:
-        stream = io.BytesIO()
-        with gzip.GzipFile(fileobj=stream, mode="wb") as file:
-            for _ in range(24):
-                file.write(zeros)
-        return stream.getvalue()
-    if way == 2:
-        thing: Any = [0.0]
-        for _ in range(30):
-            thing = [thing] * 10
-        return pickle.dumps(thing)
-    stream = io.BytesIO()
-    header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 33, 3)}
-    np.lib.format.write_array_header_1_0(stream, header)
-    return stream.getvalue() + bytes(64)
-
-
-def changed(whole: bytes, name: str, others: list[bytes], rng: np.random.Generator) -> bytes:
-    """One file made hostile, as its kind allows."""
-    ending = Path(name).suffix
-    if ending == ".iavatar":
-        return resealed(whole, rng)
-    if ending in ZIPS and whole.startswith(b"PK") and rng.random() < 0.7:
-        return mutated_zip(whole, rng)
-    if ending == ".json" and rng.random() < 0.7:
-        return mutated_json(whole, rng)
-    if ending == ".pkl" and rng.random() < 0.15:
-        return random_opcodes(rng)
-    return mutated(whole, others, rng)
-
-
-def resealed(whole: bytes, rng: np.random.Generator) -> bytes:
-    """A package changed inside, or outside; mostly with sums that say it is right."""
-    if rng.random() < 0.2:
-        return mutated(whole, [whole], rng)
-    data = mutated_zip(whole, rng)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = {name: archive.read(name) for name in archive.namelist()}
-    try:
-        manifest = json.loads(entries["manifest.json"])
-        for name in manifest["sha256"]:
-            manifest["sha256"][name] = hashlib.sha256(entries[name]).hexdigest()
-    except (KeyError, TypeError, ValueError):
-        return data
-    entries["manifest.json"] = json.dumps(manifest).encode()
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, content in entries.items():
-            archive.writestr(name, content)
-    return stream.getvalue()
 
 
 def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Generator) -> Path:
@@ -290,6 +224,7 @@ def package_of(film: Path, scratch: Path) -> Path:
 
 
 def main() -> None:
+    """The benchmark; exits with 1 if anything went wrong."""
     if sys.argv[1:2] == ["--batch"]:
         seeds, start, stop, seed = sys.argv[2:]
         batch(Path(seeds), int(start), int(stop), int(seed))

@@ -1,12 +1,18 @@
 """Whole files made into damaged, hostile and random ones."""
 
+import gzip
+import hashlib
 import io
 import json
 import pickle
 import zipfile
+import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+ZIPS = (".npz", ".pt", ".r3d", ".iavatar")
 
 CALLS = (
     b"cos\nsystem\n(S'true'\ntR", b"cbuiltins\neval\n(S'1'\ntR", b"(S'true'\nios\nsystem\n",
@@ -22,6 +28,41 @@ STRANGE: tuple[Any, ...] = (
     [[]], [0.0] * 9, "x" * 3000,
 )  # fmt: skip
 """What stands in place of a value of JSON."""
+
+
+def changed(whole: bytes, name: str, others: list[bytes], rng: np.random.Generator) -> bytes:
+    """One file made hostile, as its kind allows."""
+    ending = Path(name).suffix
+    if ending == ".iavatar":
+        return resealed(whole, rng)
+    if ending in ZIPS and whole.startswith(b"PK") and rng.random() < 0.7:
+        return mutated_zip(whole, rng)
+    if ending == ".json" and rng.random() < 0.7:
+        return mutated_json(whole, rng)
+    if ending == ".pkl" and rng.random() < 0.15:
+        return random_opcodes(rng)
+    return mutated(whole, others, rng)
+
+
+def resealed(whole: bytes, rng: np.random.Generator) -> bytes:
+    """A package changed inside, or outside; mostly with sums that say it is right."""
+    if rng.random() < 0.2:
+        return mutated(whole, [whole], rng)
+    data = mutated_zip(whole, rng)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    try:
+        manifest = json.loads(entries["manifest.json"])
+        for name in manifest["sha256"]:
+            manifest["sha256"][name] = hashlib.sha256(entries[name]).hexdigest()
+    except (KeyError, TypeError, ValueError):
+        return data
+    entries["manifest.json"] = json.dumps(manifest).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
 
 
 def mutated(whole: bytes, others: list[bytes], rng: np.random.Generator) -> bytes:
@@ -103,3 +144,27 @@ def random_opcodes(rng: np.random.Generator) -> bytes:
     calls = [CALLS[int(n)] if n < len(CALLS) else b"" for n in rng.integers(0, 60, 40)]
     mixed = (opcodes[c] + part + call for c, part, call in zip(chosen, parts, calls, strict=True))
     return b"\x80\x04" + b"".join(mixed) + b"."
+
+
+def bomb(rng: np.random.Generator) -> bytes:
+    """A small file that unpacks to more than the cap."""
+    zeros = bytes(64 << 20)
+    way = int(rng.integers(0, 4))
+    if way == 0:
+        packer = zlib.compressobj(9)
+        return b"".join(packer.compress(zeros) for _ in range(24)) + packer.flush()
+    if way == 1:
+        stream = io.BytesIO()
+        with gzip.GzipFile(fileobj=stream, mode="wb") as file:
+            for _ in range(24):
+                file.write(zeros)
+        return stream.getvalue()
+    if way == 2:
+        thing: Any = [0.0]
+        for _ in range(30):
+            thing = [thing] * 10
+        return pickle.dumps(thing)
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 33, 3)}
+    np.lib.format.write_array_header_1_0(stream, header)
+    return stream.getvalue() + bytes(64)

@@ -75,7 +75,17 @@ def pushed(
     return push
 
 
-def _follow(pieces, rules, index, density, color, wanted, out, push) -> None:
+def _follow(
+    pieces: Pieces,
+    rules: DrawingRules,
+    index: Int32[np.ndarray, "bx by bz"],
+    density: Float32[np.ndarray, "voxels"],
+    color: Float32[np.ndarray, "voxels 3"],
+    wanted: Float32[np.ndarray, "rays 4"],
+    out: Float32[np.ndarray, "rays 4"],
+    push: Push | None,
+) -> None:
+    """Shows every ray in `out`, and adds to `push` what it would change, if there is one."""
     samples = np.concatenate([[0], np.cumsum(pieces.count, dtype=np.int64)])[pieces.first]
     most = int(np.diff(samples).max(initial=0)) + 1
     blocks = int(np.diff(pieces.first).max(initial=0)) + 1
