@@ -15,8 +15,8 @@ from apps.solving.job import SolveJob
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.growing import IDLE_S
-from preprocess.segmenter import segmenter_name
-from preprocess.stature import LEAST_CM, MOST_CM
+from preprocess.fit.stature import LEAST_CM, MOST_CM
+from preprocess.masks.segmenter import segmenter_name
 
 LEARNABLE_PX = 540
 """Longer side of the pictures that a minute is enough for."""

@@ -6,7 +6,9 @@ from pathlib import Path
 from capture.errors import BadInput
 from capture.source import Source
 from preprocess.body import ShapedBody
-from preprocess.body_fit import (
+from preprocess.camera_file import CameraTrack
+from preprocess.doctor.claim import Claim
+from preprocess.fit.body_fit import (
     UNFITTED,
     BodyFit,
     are_alike,
@@ -14,13 +16,11 @@ from preprocess.body_fit import (
     fit_to_person,
     is_foreign,
 )
-from preprocess.camera_file import CameraTrack
-from preprocess.doctor.claim import Claim
-from preprocess.growing_fit import GrowingFit
-from preprocess.masks import Masks
+from preprocess.fit.growing import GrowingFit
+from preprocess.fit.stature import as_tall, farther, height_of
+from preprocess.masks.files import Masks
 from preprocess.person_file import read_person
 from preprocess.pose import Motion
-from preprocess.stature import as_tall, farther, height_of
 
 SAME_CM = 1.5
 """A stated height that is so near to the avatar's own says the same."""

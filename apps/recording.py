@@ -23,17 +23,17 @@ from preprocess.body_file import load_body
 from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
+from preprocess.fit.growing import GrowingFit
+from preprocess.fit.refit import Refit
 from preprocess.focal import focal_from_masks
-from preprocess.growing_fit import GrowingFit
 from preprocess.live import LiveParts
-from preprocess.masks import Masks, masks_in_poses, open_masks
+from preprocess.masks.files import Masks, masks_in_poses, open_masks
+from preprocess.masks.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, observer
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
-from preprocess.refit import Refit
-from preprocess.segmenter import OURS, Segmenter, make_segmenter, segmenter_name
 from preprocess.shape import shaped_for
 from preprocess.upright import upright_cameras
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from preprocess.body_fit import BodyFit
 from preprocess.camera_file import CameraTrack
-from preprocess.masks import Masks
+from preprocess.fit.body_fit import BodyFit
+from preprocess.masks.files import Masks
 
 
 def notes_of(

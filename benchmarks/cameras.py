@@ -30,10 +30,10 @@ from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.camera_file import CameraTrack, read_cameras
 from preprocess.doctor.claim import Claim
+from preprocess.fit.stature import as_tall, farther, height_of
 from preprocess.pose_file import read_motion
 from preprocess.solve.gates import similarity
 from preprocess.solve.solved import Solved
-from preprocess.stature import as_tall, farther, height_of
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
 MOST_PSNR_LOSS = 0.5

@@ -16,7 +16,7 @@ import numpy as np
 from apps.studio.writer import ShootConfig, shoot
 from capture.opening import open_source
 from preprocess.body_file import load_body
-from preprocess.masks import open_masks
+from preprocess.masks.files import open_masks
 from preprocess.person_file import write_person
 
 ROWS, SIDE = 6, 64

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64, Int, Shaped
 from capture.errors import BadInput
 from preprocess.body import Body
 from preprocess.npz import read_npz
-from preprocess.pickles import read_pickled_arrays
+from preprocess.pickles.content import read_pickled_arrays
 from preprocess.skeleton import PARENTS
 
 ALWAYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")

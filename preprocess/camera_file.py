@@ -11,7 +11,7 @@ from capture.errors import BadInput
 from capture.source import Source
 from preprocess.cameras.door import read_named
 from preprocess.cameras.matching import bridged, by_frame
-from preprocess.masks import same_shape
+from preprocess.masks.files import same_shape
 from preprocess.npz import read_npz
 from preprocess.pose import Lens, Motion
 

@@ -10,7 +10,7 @@ from preprocess.doctor.claim import Claim
 from preprocess.doctor.cure import refocused
 from preprocess.doctor.diagnosis import FITTED_CHANGE, FITTED_GAIN, fit_factor, mean
 from preprocess.doctor.evidence import gather
-from preprocess.masks import Masks
+from preprocess.masks.files import Masks
 from preprocess.observe import check_masks
 from preprocess.pose import Motion
 from preprocess.silhouette import SkinPoints

@@ -9,11 +9,11 @@ from capture.pace import Pace
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.capture_folder import CapturePaths
-from preprocess.growing_masks import GrowingMasks
 from preprocess.growing_poses import GrowingPoses
+from preprocess.masks.growing import GrowingMasks
+from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, joiner, own_alpha, shrunk
-from preprocess.segmenter import Segmenter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,11 +12,11 @@ from capture.errors import BadInput
 from capture.frame import Frame
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
-from preprocess.masks import Masks, same_shape
+from preprocess.masks.files import Masks, same_shape
+from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
 from preprocess.pairing import row_by_order
 from preprocess.pose import BodyPose, Motion
-from preprocess.segmenter import Segmenter
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,8 @@ from apps.recording import Recording
 from apps.solving.job import SolveJob
 from capture.errors import BadInput
 from capture.frame import Frame
+from preprocess.masks.outline import Outline
 from preprocess.observe import check_masks, check_motion, own_alpha
-from preprocess.outline import Outline
 from preprocess.solve.keyframes import PersonIn
 from preprocess.solve.solved import Solved
 from preprocess.solve.solver import Settings, solve

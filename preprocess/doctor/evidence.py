@@ -12,7 +12,7 @@ from capture.frame import Frame
 from capture.images import list_images, read_image
 from capture.source import Source
 from preprocess.doctor.claim import Claim
-from preprocess.masks import Masks
+from preprocess.masks.files import Masks
 from preprocess.observe import own_alpha
 from preprocess.pose import Motion
 from preprocess.silhouette import PERSON_PX, SkinPoints, agreement, silhouette

@@ -17,8 +17,8 @@ import numpy as np
 
 from capture.errors import BadInput
 from capture.images import natural_key
-from preprocess.inert import product
-from preprocess.pickles import MAX_BYTES, bounded_bytes, guarded, plain_pickle
+from preprocess.pickles.content import MAX_BYTES, bounded_bytes, guarded, plain_pickle
+from preprocess.pickles.inert import product
 
 SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"})
 """Endings of files that may hold poses; in a folder only these are read."""

@@ -9,8 +9,8 @@ import torch
 
 from avatar import checkpoint
 from preprocess.body_file import load_body
+from preprocess.fit.stature import height_of
 from preprocess.person_file import read_person
-from preprocess.stature import height_of
 
 FEW = ("--frames", "0:8")
 

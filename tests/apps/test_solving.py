@@ -22,10 +22,10 @@ from apps.solving.worker import person_finder
 from apps.studio.writer import ShootConfig, shoot
 from capture.errors import BadInput
 from preprocess.camera_file import read_cameras, write_cameras
+from preprocess.fit.stature import height_of
 from preprocess.pose_file import read_motion
 from preprocess.solve.gates import similarity
 from preprocess.solve.solved import Solved
-from preprocess.stature import height_of
 
 FRAMES = 14
 

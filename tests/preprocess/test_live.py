@@ -11,8 +11,8 @@ import pytest
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.pace import Pace
-from preprocess.growing_masks import GrowingMasks
 from preprocess.growing_poses import GrowingPoses
+from preprocess.masks.growing import GrowingMasks
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
 

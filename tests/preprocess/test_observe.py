@@ -10,7 +10,7 @@ from capture.errors import BadInput
 from capture.opening import open_source
 from capture.quiet import silence_opencv
 from preprocess.camera_file import CameraTrack, default_cameras
-from preprocess.masks import open_masks
+from preprocess.masks.files import open_masks
 from preprocess.observation import Observation
 from preprocess.observe import Dropped, check_motion, observe, shrunk
 from preprocess.pose import Motion

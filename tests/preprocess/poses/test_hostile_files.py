@@ -25,8 +25,8 @@ import torch
 
 from benchmarks.mutations import mutated, random_opcodes
 from capture.errors import BadInput
-from preprocess import pickles
 from preprocess.body_file import load_body
+from preprocess.pickles import content as pickles
 from preprocess.poses import read_poses
 from preprocess.poses.content import read_content
 

@@ -52,7 +52,7 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
         BadInput: If no package brings one of that name, or it cannot be loaded.
     """
     if name == OURS:
-        from preprocess.grabcut import GrabCut
+        from preprocess.masks.grabcut import GrabCut
 
         return GrabCut(shaped)
     brought = {point.name: point for point in entry_points(group=GROUP)}

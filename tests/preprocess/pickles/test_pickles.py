@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from capture.errors import BadInput
-from preprocess import pickles
 from preprocess.body_file import load_body
-from preprocess.pickles import read_pickled_arrays
+from preprocess.pickles import content as pickles
+from preprocess.pickles.content import read_pickled_arrays
 
 
 class Python2Pickler(pickle._Pickler):

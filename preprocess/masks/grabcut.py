@@ -17,11 +17,11 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
-from preprocess.behind import Behind
 from preprocess.body import ShapedBody
-from preprocess.matte import softened
+from preprocess.masks.behind import Behind
+from preprocess.masks.matte import softened
+from preprocess.masks.shell import Around, Shell
 from preprocess.pose import BodyPose
-from preprocess.shell import Around, Shell
 
 WORK_PX = 220
 """Masks are found in pictures in which the person is about so large, or smaller."""

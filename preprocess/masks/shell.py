@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 
 from capture.camera import Camera
 from preprocess.body import ShapedBody
-from preprocess.outline import NEAR_M, Outline
+from preprocess.masks.outline import NEAR_M, Outline
 from preprocess.pose import BodyPose
 
 LAYERS_M = np.arange(-0.015, 0.0901, 0.0075)

@@ -12,7 +12,7 @@ from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
-from preprocess.mask_files import coded_masks, is_tracked, video_of_masks
+from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content
 

@@ -9,14 +9,14 @@ import pytest
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
-from preprocess import segmenter
-from preprocess.behind import BRIGHTEST, DARKEST, UNLIKE, Behind
-from preprocess.grabcut import GrabCut, _away, _Cut, _Shape
 from preprocess.kinematics import rotation_matrices
-from preprocess.outline import Outline
+from preprocess.masks import segmenter
+from preprocess.masks.behind import BRIGHTEST, DARKEST, UNLIKE, Behind
+from preprocess.masks.grabcut import GrabCut, _away, _Cut, _Shape
+from preprocess.masks.outline import Outline
+from preprocess.masks.segmenter import make_segmenter, segmenter_name
+from preprocess.masks.shell import Around, Shell
 from preprocess.pose import BodyPose
-from preprocess.segmenter import make_segmenter, segmenter_name
-from preprocess.shell import Around, Shell
 
 SIZE = (160, 200)
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.matte import EDGE_PX, softened
+from preprocess.masks.matte import EDGE_PX, softened
 
 
 def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray]:

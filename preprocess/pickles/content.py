@@ -8,8 +8,16 @@ import numpy as np
 from jaxtyping import Shaped
 
 from capture.errors import BadInput
-from preprocess.inert import Array, Encoded, Inert, Mapping, SparseColumns, array_of, dtype_of
-from preprocess.unpickle import FetchStorage, HoldsCode, unpickled
+from preprocess.pickles.inert import (
+    Array,
+    Encoded,
+    Inert,
+    Mapping,
+    SparseColumns,
+    array_of,
+    dtype_of,
+)
+from preprocess.pickles.unpickle import FetchStorage, HoldsCode, unpickled
 
 MAX_BYTES = 1 << 30
 """Larger files are refused (SMPL with 300 betas takes a quarter of it)."""

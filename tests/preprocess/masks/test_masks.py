@@ -13,8 +13,8 @@ from PIL import Image
 from capture.errors import BadInput
 from capture.opening import open_source
 from capture.quiet import silence_opencv
-from preprocess.mask_files import decoded
-from preprocess.masks import masks_in_poses, open_masks, same_shape
+from preprocess.masks.files import masks_in_poses, open_masks, same_shape
+from preprocess.masks.one_file import decoded
 
 SIZE = (30, 40)
 

@@ -1,7 +1,7 @@
 """SMPL's poses on another body while they come: fitted to the masks seen so far, ever again.
 
 The first picture says how far away the person is, turning says the rest. So what
-`preprocess.refit` does is done with the first frame, and whenever there are twice as many.
+`preprocess.fit.refit` does is done with the first frame, and whenever there are twice as many.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from capture.frame import Frame
 from preprocess.body import ShapedBody
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness
+from preprocess.fit.refit import FRAMES, Refit, moved_pelvis, refitted
 from preprocess.kinematics import rotation_matrices
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
 from preprocess.pose import BodyPose, Motion
-from preprocess.refit import FRAMES, Refit, moved_pelvis, refitted
 from preprocess.silhouette import PERSON_PX, SkinPoints
 
 

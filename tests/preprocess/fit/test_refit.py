@@ -10,8 +10,8 @@ from preprocess.body import ShapedBody
 from preprocess.body_file import load_body
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness
+from preprocess.fit.refit import Refit, refitted
 from preprocess.pose import Motion
-from preprocess.refit import Refit, refitted
 from preprocess.shape import on_smpl, shaped_for, smpl_joints
 from preprocess.silhouette import SkinPoints, silhouette
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import Shaped
 
-from preprocess.inert import (
+from preprocess.pickles.inert import (
     ALLOWED,
     STORAGES,
     Inert,

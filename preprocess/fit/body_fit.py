@@ -15,12 +15,12 @@ from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, gather
-from preprocess.masks import Masks
+from preprocess.fit.refit import FRAMES, Refit, refitted
+from preprocess.fit.stature import farther, height_of
+from preprocess.masks.files import Masks
 from preprocess.observe import check_cameras, check_masks
 from preprocess.pose import Motion
-from preprocess.refit import FRAMES, Refit, refitted
 from preprocess.silhouette import SkinPoints
-from preprocess.stature import farther, height_of
 
 BETTER = 0.02
 """By how much the body's own proportions must fit better than SMPL's to be taken instead."""

@@ -12,7 +12,7 @@ from capture.frame import Frame
 from capture.images import list_images
 from capture.pace import Pace
 from preprocess.growing_poses import LOOK_EVERY_S, PATIENCE_S
-from preprocess.masks import Masks, read_mask
+from preprocess.masks.files import Masks, read_mask
 
 
 @final

@@ -11,16 +11,16 @@ from capture.frame import Frame
 from capture.opening import open_source
 from preprocess.body import Body, ShapedBody
 from preprocess.body_file import load_body
-from preprocess.body_fit import BodyFit, fit_body, fit_to_person
 from preprocess.camera_file import CameraTrack
-from preprocess.growing_fit import GrowingFit
-from preprocess.masks import open_masks
+from preprocess.fit.body_fit import BodyFit, fit_body, fit_to_person
+from preprocess.fit.growing import GrowingFit
+from preprocess.fit.stature import as_tall, height_of
+from preprocess.masks.files import open_masks
 from preprocess.observation import Observation
 from preprocess.person_file import read_person, write_person
 from preprocess.pose import Motion
 from preprocess.shape import shaped_for
 from preprocess.silhouette import SkinPoints, silhouette
-from preprocess.stature import as_tall, height_of
 
 SIZE = (96, 128)
 FRAMES = 8

@@ -1,0 +1,1 @@
+"""The body that is really used: poses brought to it, in size, place and stance."""

@@ -1,0 +1,1 @@
+"""Pickles of strangers: what they hold, read without running any of it."""
