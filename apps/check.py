@@ -11,14 +11,14 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.console import Console
-from apps.examine import Examined, examine, share
-from apps.exit_codes import BAD_INPUT, DONE, exit_code
+from apps.checking.examine import Examined, examine, share
+from apps.checking.mended import check_place, write_mended
+from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames
-from apps.mended import check_place, write_mended
-from apps.recording import RecordingPaths
-from apps.sheet import write_sheet
-from apps.whole import write_text
+from apps.recording.recording import RecordingPaths
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
+from apps.terminal.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from preprocess.doctor.diagnosis import GOOD, USABLE

@@ -11,10 +11,10 @@ import numpy as np
 import tyro
 from tyro.conf import Positional, arg
 
-from apps.console import Console
-from apps.exit_codes import DONE, NO_PACKAGE, Stop, exit_code
-from apps.novel import novel_motion
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.playing.novel import novel_motion
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import DONE, NO_PACKAGE, Stop, exit_code
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose
@@ -94,7 +94,7 @@ def export(given: ExportArguments, console: Console) -> int:
 
 
 def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
-    from apps.mesh_file import write_mesh
+    from apps.playing.mesh_file import write_mesh
 
     write_mesh(package, given.out, console, poses=given.poses, name=given.out.stem)
 
@@ -109,7 +109,7 @@ def _package(folder: Path, out: Path, console: Console) -> None:
     with console.waiting("loading the checkpoint"):
         import torch
 
-        from apps.snapshot import snapshot
+        from apps.learning.snapshot import snapshot
         from avatar import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))

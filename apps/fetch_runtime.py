@@ -6,8 +6,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from apps.console import Console
-from apps.exit_codes import DONE, exit_code
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import DONE, exit_code
 from capture.errors import BadInput
 from export.web import runtime
 

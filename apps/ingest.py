@@ -9,26 +9,26 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from apps.console import Console
-from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
-from apps.first_look import first_look, hint
+from apps.checking.first_look import first_look, hint
 from apps.ingest_arguments import VIEW_PORT, IngestArguments
-from apps.interrupt import asked_to_stop
-from apps.port import with_port
-from apps.recording import Recording
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.recording.recording import Recording
 from apps.solving.attempt import Attempt, attempted
-from apps.whole import write_text
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
+from apps.terminal.interrupt import asked_to_stop
+from apps.terminal.port import with_port
+from apps.terminal.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 
 SAME_JOINTS_M = 1e-3
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from apps.deliver import Delivered
-    from apps.learn import Lesson
-    from apps.learnt import Learnt
-    from apps.snapshot import Snapshot
+    from apps.learning.deliver import Delivered
+    from apps.learning.learn import Lesson
+    from apps.learning.learnt import Learnt
+    from apps.learning.snapshot import Snapshot
     from apps.view.viewer import Viewer
     from avatar.trainer import Trainer
 
@@ -72,10 +72,10 @@ def _learnt_and_delivered(
 ) -> int:
     """All that comes once the input was found good."""
     with console.waiting("loading torch"):
-        from apps.deliver import RunNote, deliver
-        from apps.device import device_for
-        from apps.learn import Lesson
-        from apps.threads import use_threads
+        from apps.learning.deliver import RunNote, deliver
+        from apps.learning.learn import Lesson
+        from apps.terminal.device import device_for
+        from apps.terminal.threads import use_threads
         from avatar.kernels.choice import backend_for
 
         threads = use_threads(given.threads)
@@ -143,9 +143,9 @@ def _trainer(
     given: IngestArguments, recording: Recording, run: RunFolder, console: Console
 ) -> "tuple[Trainer, int, dict[str, Any]]":
     """The trainer, how many frames it has seen of this video, and what checkpoints keep."""
-    from apps.device import device_for
-    from apps.extension import Extension
-    from apps.learn import new_trainer
+    from apps.learning.extension import Extension
+    from apps.learning.learn import new_trainer
+    from apps.terminal.device import device_for
     from avatar import checkpoint
 
     device, video = device_for(given.device), _name_of(recording)
@@ -229,7 +229,7 @@ def _taught(
 
     Scores come after the first package, which need not wait for them.
     """
-    from apps.snapshot import finer, snapshot, views_of
+    from apps.learning.snapshot import finer, snapshot, views_of
 
     learnt, hasty = lesson.learn(recall=recall), recording.source.paced
     _check_learnt(learnt, recording)

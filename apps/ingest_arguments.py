@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.recording import Recording, RecordingPaths
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.recording.recording import Recording, RecordingPaths
 from apps.solving.job import SolveJob
 from capture.camera_device import camera_address
 from capture.errors import BadInput

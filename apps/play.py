@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import tyro
 
-from apps.console import Console
-from apps.exit_codes import BAD_INPUT, DONE, INTERRUPTED, exit_code
-from apps.play_arguments import TURN_S, WEB_PORT, PlayArguments
-from apps.port import with_port, with_value
+from apps.playing.arguments import TURN_S, WEB_PORT, PlayArguments
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, exit_code
+from apps.terminal.port import with_port, with_value
 from capture.errors import BadInput
 
 
@@ -38,10 +38,10 @@ def play(given: PlayArguments, console: Console) -> int:
 
 
 def _clip(given: PlayArguments, console: Console) -> int:
-    from apps.background import TRANSPARENT, background
-    from apps.clip import GIF_FPS, check_clip, encoder_of, write_clip
-    from apps.interrupt import asked_to_stop
-    from apps.shots import shots_of
+    from apps.playing.background import TRANSPARENT, background
+    from apps.playing.clip import GIF_FPS, check_clip, encoder_of, write_clip
+    from apps.playing.shots import shots_of
+    from apps.terminal.interrupt import asked_to_stop
     from export.player import Player
 
     out = given.clip
@@ -80,9 +80,9 @@ def _clip(given: PlayArguments, console: Console) -> int:
 
 
 def _bench(given: PlayArguments, console: Console) -> int:
-    from apps.bench import benchmark
-    from apps.shots import shots_of
-    from apps.whole import write_text
+    from apps.playing.bench import benchmark
+    from apps.playing.shots import shots_of
+    from apps.terminal.whole import write_text
     from export.player import Player
 
     started = time.perf_counter()
@@ -113,11 +113,11 @@ def _counted(workers: int) -> str:
 
 
 def _web(given: PlayArguments, port: int, console: Console) -> int:
-    from apps.novel import novel_motion
-    from apps.rate import poses_a_second
-    from apps.shots import motion_of
-    from apps.viewpoint import Viewpoint
-    from apps.web import check_folder, clip_of, serve, write_site
+    from apps.playing.novel import novel_motion
+    from apps.playing.rate import poses_a_second
+    from apps.playing.shots import motion_of
+    from apps.playing.viewpoint import Viewpoint
+    from apps.playing.web import check_folder, clip_of, serve, write_site
     from export.player import Player
     from export.web.runtime import runtime_files
     from export.web.site import site
@@ -152,8 +152,8 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
 
 
 def _verify(given: PlayArguments, console: Console) -> int:
-    from apps.verdict import verdict_of
-    from apps.whole import write_text
+    from apps.playing.verdict import verdict_of
+    from apps.terminal.whole import write_text
 
     verdict = verdict_of(given.avatar, provider=given.provider)
     if given.json is not None:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 import tyro
 
-from apps.recording import Recording
+from apps.recording.recording import Recording
 from avatar.hold import HeldOut
 from avatar.model import Avatar
 from avatar.prepare import PreparedFrame

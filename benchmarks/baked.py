@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apps.snapshot import snapshot
+from apps.learning.snapshot import snapshot
 from avatar.trainer import Trainer
 from benchmarks.likeness import Shot
 from benchmarks.marks import Mark

@@ -22,10 +22,10 @@ import tyro
 from jaxtyping import Float
 from tyro.conf import Positional
 
-from apps.exit_codes import exit_code
-from apps.follow import FollowingCamera
-from apps.novel import novel_motion
-from apps.web import clip_of, server_of
+from apps.playing.follow import FollowingCamera
+from apps.playing.novel import novel_motion
+from apps.playing.web import clip_of, server_of
+from apps.terminal.exit_codes import exit_code
 from benchmarks.hardware import Hardware
 from benchmarks.marks import Mark, table
 from benchmarks.stopwatch import use_threads

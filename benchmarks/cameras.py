@@ -19,12 +19,12 @@ import numpy as np
 from rich.console import Console as RichConsole
 from scipy.spatial.transform import Rotation
 
-from apps.console import Console
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined
 from apps.solving.solving import Solving
 from apps.studio.writer import ShootConfig, shoot
+from apps.terminal.console import Console
 from benchmarks.hardware import Hardware
 from capture.camera import Camera
 from capture.errors import BadInput

@@ -13,8 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from apps.examine import examine
-from apps.recording import RecordingPaths
+from apps.checking.examine import examine
+from apps.recording.recording import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from benchmarks import spoils
 from benchmarks.hardware import Hardware

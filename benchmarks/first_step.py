@@ -12,14 +12,14 @@ from pathlib import Path
 
 
 def main() -> None:
-    from apps.recording import Recording, RecordingPaths
+    from apps.recording.recording import Recording, RecordingPaths
 
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
     recording = Recording.open(RecordingPaths(video=capture))
 
     import torch
 
-    from apps.threads import use_threads
+    from apps.terminal.threads import use_threads
     from avatar.config import TrainConfig
     from avatar.events import Stepped
     from avatar.hold import HeldOut, prepared

@@ -86,8 +86,8 @@ def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Ge
 
 def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     """What each kind of file is read by, as the commands do."""
-    from apps.examine import examine
-    from apps.recording import Recording, RecordingPaths
+    from apps.checking.examine import examine
+    from apps.recording.recording import Recording, RecordingPaths
     from capture.opening import open_source
     from export.player import Player
     from preprocess.body_file import load_body

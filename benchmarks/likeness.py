@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from apps.recording import Recording
+from apps.recording.recording import Recording
 from avatar.hold import HeldOut, on_white, prepared, truth_on_white
 from avatar.metrics import psnr
 from avatar.model import Avatar

@@ -16,8 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from apps.console import Console
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.terminal.console import Console
 from avatar.warm import warm_up
 from benchmarks.hardware import ROOT
 from benchmarks.marks import Mark
@@ -87,7 +87,7 @@ def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
     import torch
 
-    from apps.learn import Lesson, new_trainer
+    from apps.learning.learn import Lesson, new_trainer
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
     recording, device = opened(capture), torch.device("cpu")

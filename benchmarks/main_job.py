@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.curve import CurvePoint, largest_fall
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
+from apps.reporting.curve import CurvePoint, largest_fall
 from apps.studio.writer import ShootConfig, shoot
 from avatar.hold import on_white, truth_on_white
 from avatar.metrics import psnr, ssim

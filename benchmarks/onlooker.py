@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from apps.recording import Recording
+from apps.recording.recording import Recording
 from avatar.cells import WarpCells
 from avatar.hold import HeldOut, is_held_out, prepared, spread
 from avatar.model import Avatar

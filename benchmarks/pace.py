@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.bench import Benchmark, benchmark
+from apps.playing.bench import Benchmark, benchmark
 from benchmarks.hardware import ROOT
 from benchmarks.likeness import Shot
 from benchmarks.marks import Mark

@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from apps.exit_codes import exit_code
+from apps.terminal.exit_codes import exit_code
 from avatar import checkpoint
 from avatar.trainer import Trainer
 from benchmarks.baked import baked, package_marks

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from apps.recording import Recording
+from apps.recording.recording import Recording
 from avatar.cells import WarpCells
 from avatar.config import TrainConfig
 from avatar.hold import HeldOut, prepared, score

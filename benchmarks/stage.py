@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar.config import TrainConfig
 from avatar.hold import HeldOut, prepared

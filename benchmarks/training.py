@@ -18,8 +18,8 @@ from typing import Literal
 import torch
 import tyro
 
-from apps.device import device_for
-from apps.exit_codes import exit_code
+from apps.terminal.device import device_for
+from apps.terminal.exit_codes import exit_code
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.hardware import Hardware

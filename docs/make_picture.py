@@ -8,9 +8,9 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.background import background
-from apps.follow import FollowingCamera
-from apps.whole import whole_file
+from apps.playing.background import background
+from apps.playing.follow import FollowingCamera
+from apps.terminal.whole import whole_file
 from capture.opening import open_source
 from export.player import Player
 from preprocess.camera_file import read_cameras

@@ -15,7 +15,7 @@ import apps  # noqa: F401 - sets OpenMP's variables, which torch reads when it i
 
 import torch
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished, Warned

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import final
 
-from apps.console import Console
-from apps.recording import Recording
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.recording.recording import Recording
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined, write_solved
 from apps.solving.solving import Solving
+from apps.terminal.console import Console
 from capture.errors import BadInput
 
 MOST_OFF = 0.02

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-from apps.recording import Recording
-from apps.run_folder import RunFolder
-from apps.whole import whole_file
+from apps.learning.run_folder import RunFolder
+from apps.recording.recording import Recording
+from apps.terminal.whole import whole_file
 from capture.camera import Camera
 from preprocess.camera_file import ASSUMED, write_cameras
 from preprocess.pose_file import write_motion

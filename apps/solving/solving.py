@@ -12,9 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import final
 
-from apps.console import Console
 from apps.solving.job import SolveJob
 from apps.solving.worker import KEPT, REFUSED, RESULT
+from apps.terminal.console import Console
 from capture.errors import BadInput
 from preprocess.solve.mapping import check_installed
 from preprocess.solve.solved import Solved

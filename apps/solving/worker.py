@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from apps.recording import Recording
+from apps.recording.recording import Recording
 from apps.solving.job import SolveJob
 from capture.errors import BadInput
 from capture.frame import Frame

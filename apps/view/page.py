@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from jaxtyping import UInt8
 
-from apps.curve import CurvePoint
+from apps.reporting.curve import CurvePoint
 from apps.view.poser import CHOICES, NEWEST
 from apps.view.scene import PAPER, Look
 

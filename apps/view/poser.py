@@ -8,8 +8,8 @@ from typing import final
 
 import numpy as np
 
-from apps.novel import novel_motion
-from apps.recording import Recording
+from apps.playing.novel import novel_motion
+from apps.recording.recording import Recording
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
 from preprocess.kinematics import rotation_matrices

@@ -7,17 +7,17 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from apps.body_map import BodyMap
-from apps.console import Console
-from apps.interrupt import ended_by_ctrl_c
-from apps.recording import Recording
-from apps.report import percent
-from apps.run_folder import RunFolder
-from apps.snapshot import snapshot, views_of
+from apps.learning.run_folder import RunFolder
+from apps.learning.snapshot import snapshot, views_of
+from apps.learning.watcher import Watched
+from apps.recording.recording import Recording
+from apps.reporting.body_map import BodyMap
+from apps.reporting.report import percent
+from apps.terminal.console import Console
+from apps.terminal.interrupt import ended_by_ctrl_c
 from apps.view.page import FRAME_PX, Page
 from apps.view.poser import DANCE, FILMED, NEWEST, Poser
 from apps.view.scene import Look, drawn
-from apps.view.watcher import Watched
 from avatar.advice import advice
 from avatar.cells import WarpCells
 from avatar.events import Evaluated, Finished, TrainEvent

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps import deliver, ingest, learn, play, snapshot
-from apps.recording import Recording, RecordingPaths
+from apps import ingest, play
+from apps.learning import deliver, learn, snapshot
+from apps.recording.recording import Recording, RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 
 MASK = (64, 64)
 

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from apps.body_map import BodyMap
+from apps.reporting.body_map import BodyMap
 from avatar.coverage import Coverage, Stage
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from apps import check, ingest
-from apps.examine import looks_well
-from apps.recording import Recording, RecordingPaths
+from apps.checking.examine import looks_well
+from apps.recording.recording import Recording, RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from benchmarks import spoils
 from preprocess.pose_file import read_motion

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps import encoders
-from apps.background import background
-from apps.clip import check_clip, encoder_of, write_clip
+from apps.playing import encoders
+from apps.playing.background import background
+from apps.playing.clip import check_clip, encoder_of, write_clip
 from capture.errors import BadInput
 
 needs_av = pytest.mark.skipif(

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.background import background
-from apps.console import MOST_WARNINGS, Console
-from apps.exit_codes import Stop, exit_code
-from apps.run_folder import RunFolder
-from apps.whole import whole_file, whole_folder, write_text
+from apps.learning.run_folder import RunFolder
+from apps.playing.background import background
+from apps.terminal.console import MOST_WARNINGS, Console
+from apps.terminal.exit_codes import Stop, exit_code
+from apps.terminal.whole import whole_file, whole_folder, write_text
 from capture.errors import BadInput
 from capture.images import read_image
 
@@ -149,7 +149,7 @@ def test_a_log_gets_plain_lines_and_few(monkeypatch):
     with console.bar("learning", 60.0) as bar:
         for step in range(100):
             bar.move(float(step), f"step {step}")
-        monkeypatch.setattr("apps.console.LOG_EVERY_S", 0.0)
+        monkeypatch.setattr("apps.terminal.console.LOG_EVERY_S", 0.0)
         bar.move(60.0, "the end")
     assert said.getvalue() == "learning: the end\n"
 

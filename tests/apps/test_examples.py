@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from apps import learn
+from apps.learning import learn
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from apps import learn
+from apps.learning import learn
 from avatar import checkpoint
 from export.player import Player
 
@@ -212,7 +212,7 @@ def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr("apps.snapshot.export_avatar", full)
+    monkeypatch.setattr("apps.learning.snapshot.export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "Nothing was written" in outcome.complaint()

@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from apps import ingest, learn
+from apps import ingest
+from apps.learning import learn
 from avatar import warm
 from avatar.train import train
 from avatar.warm import warm_up

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps.meter import MOST_NOTES, Meter
+from apps.reporting.meter import MOST_NOTES, Meter
 from capture.frame import Frame
 from capture.selection import Selection
 from preprocess.observe import Dropped

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from apps import check, play
-from apps.examine import looks_well
-from apps.recording import Recording, RecordingPaths
+from apps.checking.examine import looks_well
+from apps.recording.recording import Recording, RecordingPaths
 from preprocess.observation import Observation
 from preprocess.pose_file import read_motion, write_motion
 from preprocess.poses.place import moved

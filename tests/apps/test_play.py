@@ -11,9 +11,9 @@ import onnxruntime
 import pytest
 from PIL import Image
 
-from apps import encoders
-from apps.follow import FollowingCamera
-from apps.novel import novel_motion
+from apps.playing import encoders
+from apps.playing.follow import FollowingCamera
+from apps.playing.novel import novel_motion
 from export.package import read_package, write_package
 from export.player import Player
 from preprocess.kinematics import rotation_matrices

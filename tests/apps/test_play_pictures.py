@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps import play_arguments
-from apps.follow import FollowingCamera, standing_pose
-from apps.novel import novel_motion
-from apps.viewpoint import Viewpoint
+from apps.playing import arguments as play_arguments
+from apps.playing.follow import FollowingCamera, standing_pose
+from apps.playing.novel import novel_motion
+from apps.playing.viewpoint import Viewpoint
 from export.player import Player
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose_file import read_motion

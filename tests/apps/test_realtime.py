@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from apps import ingest, learn
+from apps import ingest
 from apps.ingest_arguments import IngestArguments
+from apps.learning import learn
 from avatar.train import train
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from benchmarks import spoils
 from capture.errors import BadInput
 from preprocess.kinematics import rotation_matrices

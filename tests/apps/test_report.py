@@ -8,10 +8,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from apps.curve import CurvePoint, largest_fall
-from apps.curve_svg import curve_svg
-from apps.pictures import data_uri, moving_data_uri
-from apps.report import (
+from apps.reporting.curve import CurvePoint, largest_fall
+from apps.reporting.curve_svg import curve_svg
+from apps.reporting.page import Pair, report_page
+from apps.reporting.pictures import data_uri, moving_data_uri
+from apps.reporting.report import (
     DroppedNote,
     FramesNote,
     HeldOutNote,
@@ -22,7 +23,6 @@ from apps.report import (
     TrainingNote,
     mean,
 )
-from apps.report_page import Pair, report_page
 from avatar.events import Score
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from apps.studio import motions, walk
 from apps.studio.actor import Actor
 from apps.studio.pattern import leaves, repeated

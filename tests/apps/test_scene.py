@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from apps.recording import Recording, RecordingPaths
+from apps.learning.watcher import shown
+from apps.recording.recording import Recording, RecordingPaths
 from apps.view.poser import CHOICES, DANCE, FILMED, NEWEST, STANDING, Poser
 from apps.view.scene import PAPER, Look, drawn
-from apps.view.watcher import shown
 from avatar.cells import WarpCells
 from avatar.config import TrainConfig
 from avatar.coverage import Coverage

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from apps.snapshot import Snapshot, finer
+from apps.learning.snapshot import Snapshot, finer
 from export.build import ExportReport
 
 WRITTEN = ExportReport(

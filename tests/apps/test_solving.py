@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.console import Console
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from apps.solving import solving as solving_module
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined
 from apps.solving.solving import Solving
 from apps.solving.worker import person_finder
 from apps.studio.writer import ShootConfig, shoot
+from apps.terminal.console import Console
 from capture.errors import BadInput
 from preprocess.camera_file import read_cameras, write_cameras
 from preprocess.fit.stature import height_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from apps.timeline import Timeline
+from apps.playing.timeline import Timeline
 from preprocess.pose import Motion
 
 

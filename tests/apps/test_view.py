@@ -17,7 +17,7 @@ import pytest
 
 from apps import ingest
 from apps.ingest_arguments import VIEW_PORT
-from apps.port import with_port
+from apps.terminal.port import with_port
 from export.player import Player
 from tests.apps.browser import Browser, chromium, until
 

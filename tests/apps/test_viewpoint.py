@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from apps.follow import AWAY, FollowingCamera, standing_pose
-from apps.novel import novel_motion
-from apps.viewpoint import Viewpoint
+from apps.playing.follow import AWAY, FollowingCamera, standing_pose
+from apps.playing.novel import novel_motion
+from apps.playing.viewpoint import Viewpoint
 from capture.errors import BadInput
 from export.player import Player
 from preprocess.kinematics import rotation_matrices

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from apps.follow import FollowingCamera
+from apps.playing.follow import FollowingCamera
 from capture.errors import BadInput
 from export.player import Likeness, Player, premultiplied
 from export.web import runtime

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from apps.person import live_person, person_of
-from apps.recording_notes import notes_of
+from apps.recording.notes import notes_of
+from apps.recording.person import live_person, person_of
 from capture.camera import Camera
 from capture.camera_device import camera_address
 from capture.errors import BadInput

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.console import Console
-from apps.follow import FollowingCamera, standing_pose
-from apps.novel import novel_motion
-from apps.play_arguments import SIZE_PX, PlayArguments
-from apps.timeline import Timeline
+from apps.playing.arguments import SIZE_PX, PlayArguments
+from apps.playing.follow import FollowingCamera, standing_pose
+from apps.playing.novel import novel_motion
+from apps.playing.timeline import Timeline
+from apps.terminal.console import Console
 from capture.camera import Camera
 from capture.errors import BadInput
 from export.player import Player

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.console import Console
-from apps.follow import FollowingCamera
-from apps.interrupt import ended_by_ctrl_c
-from apps.whole import whole_folder
+from apps.playing.follow import FollowingCamera
+from apps.terminal.console import Console
+from apps.terminal.interrupt import ended_by_ctrl_c
+from apps.terminal.whole import whole_folder
 from capture.errors import BadInput
 from export.player import Player
 from export.web.site import Clip, Look, pose_row

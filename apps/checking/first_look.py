@@ -1,8 +1,8 @@
 """What the doctor says before a run begins: nothing, a warning, or why it should not begin."""
 
-from apps.console import Console
-from apps.examine import Examined, examine, examined, looks_well
-from apps.recording import Recording, RecordingPaths
+from apps.checking.examine import Examined, examine, examined, looks_well
+from apps.recording.recording import Recording, RecordingPaths
+from apps.terminal.console import Console
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 

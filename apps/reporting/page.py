@@ -6,9 +6,9 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from apps.curve import largest_fall
-from apps.curve_svg import curve_svg
-from apps.report import Report, percent
+from apps.reporting.curve import largest_fall
+from apps.reporting.curve_svg import curve_svg
+from apps.reporting.report import Report, percent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ def report_page(
         novel: A moving picture of poses that the video does not show, as an address.
         warnings: What the user was told.
     """
-    style = (files("apps") / "report_page.css").read_text(encoding="utf-8")
+    style = (files("apps") / "reporting" / "page.css").read_text(encoding="utf-8")
     body = "\n".join(
         [
             f"<h1>{escape(name)}</h1>",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from apps.rate import poses_a_second
+from apps.playing.rate import poses_a_second
 from preprocess.pose import BodyPose, Motion
 from preprocess.rotations import between
 

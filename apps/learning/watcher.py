@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
-from apps.curve import CurvePoint
+from apps.reporting.curve import CurvePoint
 from avatar.coverage import Coverage
 from avatar.events import TrainEvent
 from avatar.hold import HeldOut, is_held_out

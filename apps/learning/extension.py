@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any, final
 
-from apps.console import Console
-from apps.report import ExtendedNote
-from apps.run_folder import RunFolder
+from apps.learning.run_folder import RunFolder
+from apps.reporting.report import ExtendedNote
+from apps.terminal.console import Console
 from avatar.events import Score
 from avatar.hold import HeldOut, score
 from avatar.kept_frames import CLIP, EARLIER, FINISHED, KeptFrames

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from apps.curve import CurvePoint
-from apps.meter import Meter
-from apps.report import ExtendedNote
+from apps.reporting.curve import CurvePoint
+from apps.reporting.meter import Meter
+from apps.reporting.report import ExtendedNote
 from avatar.coverage import Coverage
 from avatar.events import Score
 from avatar.hold import HeldOut

@@ -10,16 +10,16 @@ from typing import Any, final
 
 import torch
 
-from apps.console import Bar, Console
-from apps.curve import CurvePoint
-from apps.extension import Extension
-from apps.learnt import Learnt
-from apps.meter import Meter
-from apps.recording import Recording
-from apps.report import mean, percent
-from apps.run_folder import RunFolder
-from apps.view.watcher import Watcher, shown
-from apps.whole import whole_file
+from apps.learning.extension import Extension
+from apps.learning.learnt import Learnt
+from apps.learning.run_folder import RunFolder
+from apps.learning.watcher import Watcher, shown
+from apps.recording.recording import Recording
+from apps.reporting.curve import CurvePoint
+from apps.reporting.meter import Meter
+from apps.reporting.report import mean, percent
+from apps.terminal.console import Bar, Console
+from apps.terminal.whole import whole_file
 from avatar import checkpoint
 from avatar.advice import advice
 from avatar.config import TrainConfig

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from apps.viewpoint import Viewpoint
+from apps.playing.viewpoint import Viewpoint
 from capture.camera import Camera
 from export.player import Player
 from preprocess.kinematics import body_from_rest, rotation_matrices, world_from_body

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import TypeVar, final
 
-from apps.report import DroppedNote, Spread, StreamNote
+from apps.reporting.report import DroppedNote, Spread, StreamNote
 from avatar.hold import PassedOver
 from capture.frame import Frame
 from capture.reservoir import Reservoir

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apps.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording, RecordingPaths
 from capture.errors import BadInput
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.cure import shifted

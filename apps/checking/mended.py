@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from apps.examine import Examined
-from apps.whole import whole_folder
+from apps.checking.examine import Examined
+from apps.terminal.whole import whole_folder
 from capture.errors import BadInput
 from capture.images import list_images
 from preprocess.doctor.claim import Claim, step_of

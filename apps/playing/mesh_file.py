@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.console import Console
-from apps.novel import novel_motion
-from apps.rate import poses_a_second
-from apps.whole import whole_file
+from apps.playing.novel import novel_motion
+from apps.playing.rate import poses_a_second
+from apps.terminal.console import Console
+from apps.terminal.whole import whole_file
 from capture.errors import BadInput
 from export.gltf import Animation, glb
 from export.manifest import Manifest

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.viewpoint import CLOSE_UP, Viewpoint
+from apps.playing.viewpoint import CLOSE_UP, Viewpoint
 from capture.errors import BadInput
 
 WEB_PORT = 8010

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from apps.encoders import Encoder, video_encoder
-from apps.whole import whole_file, whole_folder
+from apps.playing.encoders import Encoder, video_encoder
+from apps.terminal.whole import whole_file, whole_folder
 from capture.errors import BadInput
 
 CLIPS = (".webm", ".mp4", ".gif", ".webp", ".png")

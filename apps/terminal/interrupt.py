@@ -5,7 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from apps.console import Console
+from apps.terminal.console import Console
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from apps.curve import CurvePoint
+from apps.reporting.curve import CurvePoint
 
 WIDTH, HEIGHT = 720, 320
 LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48

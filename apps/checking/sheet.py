@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from apps.examine import Examined
-from apps.whole import whole_file
+from apps.checking.examine import Examined
+from apps.terminal.whole import whole_file
 from capture.frame import Frame
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness

@@ -5,14 +5,16 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from apps.body_map import BodyMap
-from apps.console import Console
-from apps.follow import FollowingCamera
-from apps.learnt import Learnt
-from apps.novel import novel_motion
-from apps.pictures import data_uri, eight_bit, moving_data_uri
-from apps.recording import Recording
-from apps.report import (
+from apps.learning.learnt import Learnt
+from apps.learning.run_folder import RunFolder
+from apps.learning.snapshot import Snapshot
+from apps.playing.follow import FollowingCamera
+from apps.playing.novel import novel_motion
+from apps.recording.recording import Recording
+from apps.reporting.body_map import BodyMap
+from apps.reporting.page import Pair, report_page
+from apps.reporting.pictures import data_uri, eight_bit, moving_data_uri
+from apps.reporting.report import (
     CoverageNote,
     FramesNote,
     HeldOutNote,
@@ -21,10 +23,8 @@ from apps.report import (
     Report,
     TrainingNote,
 )
-from apps.report_page import Pair, report_page
-from apps.run_folder import RunFolder
-from apps.snapshot import Snapshot
-from apps.whole import write_text
+from apps.terminal.console import Console
+from apps.terminal.whole import write_text
 from avatar.hold import on_white, spread, truth_on_white
 from avatar.render import render
 from export.build import ExportReport

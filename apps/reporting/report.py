@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from apps.curve import CurvePoint
+from apps.reporting.curve import CurvePoint
 from avatar.advice import advice
 from avatar.coverage import Coverage
 from avatar.events import Score

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.curve import CurvePoint
-from apps.recording import Recording
+from apps.recording.recording import Recording
+from apps.reporting.curve import CurvePoint
 from avatar.hold import HeldOut, spread
 from avatar.trainer import Trainer
 from export.build import ExportReport, View, export_avatar

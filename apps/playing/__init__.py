@@ -1,0 +1,1 @@
+"""An avatar in motion: which poses, seen from where, drawn how fast, and what is made of it."""
