@@ -189,6 +189,17 @@ def _cameras(folder: Path, film: Path) -> None:
         place = folder / "polycam" / "keyframes" / "cameras" / f"{number}.json"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(json.dumps(numbers))
+    studio = _made(folder / "studio")
+    for file, parts in (("intri", {"K": 50.0 * np.eye(3)}), ("extri", {"Rot": np.eye(3),
+                        "T": np.zeros((3, 1))})):  # fmt: skip
+        storage = cv2.FileStorage(str(studio / f"{file}.yml"), cv2.FileStorage_WRITE)
+        for key, matrix in parts.items():
+            storage.write(f"{key}_1", matrix)
+        storage.release()
+    rig = {"K": [50.0 * np.eye(3)], "D": [np.zeros((5, 1))], "R": [np.eye(3)],
+           "T": [np.zeros((3, 1))]}  # fmt: skip
+    zju = {"cams": rig, "ims": [{"ims": ["Camera_B1/000000.jpg"]}]}
+    (folder / "annots.npy").write_bytes(npy(np.array(zju, dtype=object)))
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(

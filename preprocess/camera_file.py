@@ -11,6 +11,7 @@ from capture.errors import BadInput
 from capture.source import Source
 from preprocess.cameras.door import read_named
 from preprocess.cameras.matching import bridged, by_frame
+from preprocess.cameras.rigs import find_rig, read_rig
 from preprocess.masks.files import same_shape
 from preprocess.npz import read_npz
 from preprocess.pose import Lens, Motion
@@ -121,8 +122,14 @@ def write_cameras(path: Path, track: CameraTrack) -> None:
 
 
 def _foreign(path: Path, size_px: tuple[int, int], source: Source | None) -> CameraTrack:
-    """Cameras of other programs, one for every frame."""
-    found = read_named(path)
+    """Cameras of other programs, one for every frame, or one that stands still."""
+    rig = find_rig(path)
+    if rig is not None:
+        camera = read_rig(rig, None if source is None else source.path, size_px)
+        if not same_shape(camera.size_px, size_px):
+            raise _other_shape(path, camera.size_px, size_px)
+        return CameraTrack(cameras=(camera.resized(size_px),), source=rig.name)
+    found = read_named(path, size_px)
     stored = {each.camera.size_px for each in found}
     for size in stored:
         if not same_shape(size, size_px):

@@ -173,8 +173,12 @@ def cameras_from(
 def _picture_size(path: Path) -> tuple[int, int]:
     """Width and height that a camera file belongs to; twice its principal point if it is silent."""
     from preprocess.cameras.door import read_named
+    from preprocess.cameras.rigs import find_rig, read_rig
     from preprocess.npz import read_npz
 
+    rig = find_rig(path)
+    if rig is not None:
+        return read_rig(rig, None, None).size_px
     if path.suffix.lower() != ".npz":
         return read_named(path)[0].camera.size_px
 

@@ -10,7 +10,7 @@ import numpy as np
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.images import natural_key
-from preprocess.cameras.named import NamedCamera
+from preprocess.cameras.named import NamedCamera, picture_name
 
 PLACES = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""
@@ -61,7 +61,7 @@ def read_colmap(folder: Path) -> list[NamedCamera]:
     if not images:
         raise BadInput(f"The COLMAP model in {folder} has no registered picture.")
     return [
-        NamedCamera(name=Path(image.name).stem, camera=_camera(image, model, folder))
+        NamedCamera(name=picture_name(image.name), camera=_camera(image, model, folder))
         for image in images
     ]
 

@@ -18,13 +18,17 @@ from preprocess.cameras.phones import (
 READ = (
     "an .npz (intrinsic, extrinsic, height, width), a COLMAP model (the folder of cameras.bin and "
     "images.bin, or .txt), a transforms.json of nerfstudio or instant-ngp, Record3D's .r3d or its "
-    "metadata, or Polycam's folder"
+    "metadata, Polycam's folder, EasyMocap's intri.yml and extri.yml, or ZJU-MoCap's annots.npy"
 )
 """For messages."""
 
 
-def read_named(path: Path) -> list[NamedCamera]:
+def read_named(path: Path, size_px: tuple[int, int] | None = None) -> list[NamedCamera]:
     """The cameras of a file or a folder.
+
+    Args:
+        path: The file or folder.
+        size_px: Width and height of the pictures, for files that do not state them.
 
     Raises:
         BadInput: If nothing there holds cameras.
@@ -32,30 +36,30 @@ def read_named(path: Path) -> list[NamedCamera]:
     if not path.exists():
         raise BadInput(f"{path} does not exist; expected {READ}.")
     if path.is_dir():
-        return _in_folder(path)
+        return _in_folder(path, size_px)
     if path.suffix.lower() in (".bin", ".txt") and (model := find_model(path.parent)) is not None:
         return read_colmap(model)
     if path.suffix.lower() == ".r3d":
         return read_r3d(path)
     if path.suffix.lower() == ".json" or path.name == "metadata":
-        return _in_json(path)
+        return _in_json(path, size_px)
     raise BadInput(f"{path} holds no cameras that are known; expected {READ}.")
 
 
-def _in_folder(folder: Path) -> list[NamedCamera]:
+def _in_folder(folder: Path, size_px: tuple[int, int] | None) -> list[NamedCamera]:
     model = find_model(folder)
     if model is not None:
         return read_colmap(model)
-    for name in ("transforms.json", "metadata", "metadata.json"):
+    for name in ("transforms.json", "transforms_train.json", "metadata", "metadata.json"):
         if (folder / name).is_file():
-            return _in_json(folder / name)
+            return _in_json(folder / name, size_px)
     cameras = find_polycam(folder)
     if cameras is not None:
         return read_polycam(cameras)
     raise BadInput(f"{folder} holds no cameras that are known; expected {READ}.")
 
 
-def _in_json(path: Path) -> list[NamedCamera]:
+def _in_json(path: Path, size_px: tuple[int, int] | None) -> list[NamedCamera]:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise BadInput(f"{path} is larger than {MOST_BYTES >> 20} MiB; it holds no cameras.")
@@ -65,7 +69,7 @@ def _in_json(path: Path) -> list[NamedCamera]:
     except (OSError, ValueError, RecursionError) as cause:
         raise BadInput(f"{path} is no JSON that can be read ({cause}).") from cause
     if isinstance(content, dict) and "frames" in content:
-        return read_transforms(content, path)
+        return read_transforms(content, path, size_px)
     if isinstance(content, dict) and "poses" in content:
         return read_record3d(content, path)
     raise BadInput(f"{path} holds neither `frames` (nerfstudio) nor `poses` (Record3D).")

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,7 +31,8 @@ def by_frame(found: Sequence[NamedCamera], source: Source, path: Path) -> dict[i
     Raises:
         BadInput: If it cannot be said which frames they belong to.
     """
-    names = [each.name for each in found]
+    found = _of_one_folder(found, source, path)
+    names = [None if each.name is None else PurePosixPath(each.name).name for each in found]
     if source.path.is_dir():
         index = {file.stem: number for number, file in enumerate(list_images(source.path))}
         matched = {
@@ -49,6 +50,28 @@ def by_frame(found: Sequence[NamedCamera], source: Source, path: Path) -> dict[i
         "their names do not tell which belong together. Give as VIDEO the folder of pictures that "
         "the cameras were made from, or a camera for every frame."
     )
+
+
+def _of_one_folder(
+    found: Sequence[NamedCamera], source: Source, path: Path
+) -> Sequence[NamedCamera]:
+    """The cameras of the video's own pictures, where several folders hold pictures of one name.
+
+    Raises:
+        BadInput: If none of the folders is named like the video.
+    """
+    places = [PurePosixPath(each.name or str(row)) for row, each in enumerate(found)]
+    if len({place.name for place in places}) == len(found):
+        return found
+    own = {source.path.resolve().name, source.path.stem}
+    chosen = [e for place, e in zip(places, found, strict=True) if own & set(place.parent.parts)]
+    if not chosen or len({PurePosixPath(each.name or "").name for each in chosen}) < len(chosen):
+        folders = ", ".join(sorted({str(place.parent) for place in places})[:12])
+        raise BadInput(
+            f"{path} holds several cameras for pictures of one name, in the folders {folders}; "
+            f"{source.path} is none of them. Give as VIDEO one of these folders of pictures."
+        )
+    return chosen
 
 
 def bridged(cameras: dict[int, Camera], frames: int) -> tuple[tuple[Camera, ...], frozenset[int]]:

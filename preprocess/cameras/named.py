@@ -1,6 +1,7 @@
 """A camera and the picture it belongs to, before anybody knows which frame that is."""
 
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,19 @@ class NamedCamera:
     """One picture's camera.
 
     Attributes:
-        name: Of the picture's file, without folder and ending; None where there is only an order.
+        name: Of the picture's file, with its folders if it says so and without its ending; None
+            where there is only an order.
         camera: Of the picture's own size.
     """
 
     name: str | None
     camera: Camera
+
+
+def picture_name(stored: str) -> str:
+    """A picture's path in a stranger's file, of any system, without its ending."""
+    path = PurePosixPath(stored.replace("\\", "/"))
+    return str(path.with_suffix("")) if path.name else ""
 
 
 def camera_from_opengl(

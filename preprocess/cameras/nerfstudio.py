@@ -12,17 +12,31 @@ from preprocess.cameras.named import (
     NamedCamera,
     camera_from_opengl,
     checked_rigid,
+    picture_name,
     pinhole,
     rigid_inverse,
 )
 
-LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FULL", "perspective")
+LENSES = (
+    "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
+)  # fmt: skip
+
+OTHER_SIZE = 0.1
+"""By so much of its size a principal point may be off the middle of its own picture."""
 
 
-def read_transforms(content: dict[str, Any], path: Path) -> list[NamedCamera]:
+def read_transforms(
+    content: dict[str, Any], path: Path, size_px: tuple[int, int] | None = None
+) -> list[NamedCamera]:
     """The cameras of a transforms.json, sorted by their pictures' names.
 
     `applied_transform`, with which ns-process-data turns COLMAP's world, is taken back.
+
+    Args:
+        content: The JSON.
+        path: Of the file, for messages.
+        size_px: Width and height of the pictures, if the file does not state them (NeRF's own
+            files hold an angle of view only).
 
     Raises:
         BadInput: If it holds something else.
@@ -39,7 +53,7 @@ def read_transforms(content: dict[str, Any], path: Path) -> list[NamedCamera]:
             raise BadInput(f"{path}: one of the `frames` is no object; is the file damaged?")
         name = _name(frame, path)
         try:
-            camera = _camera({**content, **frame}, applied, path)
+            camera = _camera({**content, **frame}, applied, path, size_px)
         except (TypeError, ValueError, OverflowError) as cause:
             if isinstance(cause, BadInput):
                 raise
@@ -51,14 +65,20 @@ def read_transforms(content: dict[str, Any], path: Path) -> list[NamedCamera]:
 def _name(frame: dict[str, Any], path: Path) -> str:
     if not isinstance(frame.get("file_path"), str):
         raise BadInput(f"{path}: a frame has no `file_path`, so nobody knows whose camera it is.")
-    return Path(frame["file_path"]).stem
+    return picture_name(frame["file_path"])
 
 
-def _camera(numbers: dict[str, Any], applied: np.ndarray, path: Path) -> Camera:
+def _camera(
+    numbers: dict[str, Any], applied: np.ndarray, path: Path, size_px: tuple[int, int] | None
+) -> Camera:
     """One frame's camera; what the frame does not say, the file does."""
-    lens = numbers.get("camera_model", "OPENCV")
+    lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")
     if lens not in LENSES:
-        raise BadInput(f"{path}: camera model {lens}; expected one of {', '.join(LENSES)}.")
+        raise BadInput(
+            f"{path}: camera model {lens}; expected one of {', '.join(LENSES)}. Undistort the "
+            "pictures first (cv2.fisheye.undistortImage, or colmap image_undistorter)."
+        )
+    numbers = _with_size(numbers, size_px)
     world = checked_rigid(numbers.get("transform_matrix"), f"{path}, transform_matrix")
     if "fl_x" not in numbers and "camera_angle_x" in numbers:
         numbers = {**numbers, **_from_angles(numbers, path)}
@@ -73,6 +93,18 @@ def _camera(numbers: dict[str, Any], applied: np.ndarray, path: Path) -> Camera:
         tuple(bends),
         str(path),
     )
+
+
+def _with_size(numbers: dict[str, Any], size_px: tuple[int, int] | None) -> dict[str, Any]:
+    """With w and h, the frames' own unless the principal point is the middle of another size."""
+    if {"w", "h"} <= numbers.keys() or size_px is None:
+        return numbers
+    width, height = size_px
+    if {"cx", "cy"} <= numbers.keys():
+        cx, cy = float(numbers["cx"]), float(numbers["cy"])
+        if abs(cx / width - 0.5) > OTHER_SIZE or abs(cy / height - 0.5) > OTHER_SIZE:
+            width, height = round(2.0 * cx), round(2.0 * cy)
+    return {**numbers, "w": width, "h": height}
 
 
 def _from_angles(numbers: dict[str, Any], path: Path) -> dict[str, float]:

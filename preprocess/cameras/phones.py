@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
@@ -49,15 +50,31 @@ def read_record3d(content: dict[str, Any], path: Path) -> list[NamedCamera]:
         raise BadInput(f"{path}: K, w and h describe no camera.")
     if not 1 <= height <= MOST_PX:
         raise BadInput(f"{path}: h is {height}; expected a height in pixels.")
+    own = _own_intrinsics(content, intrinsics, len(poses))
     found = []
-    for pose in poses:
+    for row, pose in enumerate(poses):
         world_from_camera = np.eye(4)
         world_from_camera[:3, :3] = Rotation.from_quat(pose[:4]).as_matrix()
         world_from_camera[:3, 3] = pose[4:]
         camera_from_world = camera_from_opengl(world_from_camera)
-        camera = Camera.from_intrinsic(intrinsics, (width, height), camera_from_world)
+        camera = Camera.from_intrinsic(own[row], (width, height), camera_from_world)
         found.append(NamedCamera(name=None, camera=camera))
     return found
+
+
+def _own_intrinsics(
+    content: dict[str, Any], common: Float[np.ndarray, "3 3"], count: int
+) -> Float[np.ndarray, "frames 3 3"]:
+    """K of each frame, whose focus breathes: `perFrameIntrinsicCoeffs` (N, 4) = fx fy cx cy."""
+    every = np.tile(common, (count, 1, 1))
+    try:
+        told = np.array(content.get("perFrameIntrinsicCoeffs"), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return every
+    if told.shape != (count, 4) or not np.isfinite(told).all() or (told[:, :2] <= 0.0).any():
+        return every
+    every[:, [0, 1, 0, 1], [0, 1, 2, 2]] = told
+    return every
 
 
 def read_r3d(path: Path) -> list[NamedCamera]:

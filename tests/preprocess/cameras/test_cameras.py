@@ -95,7 +95,7 @@ def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp
         for part in ("rigs", "frames"):
             (folder / f"{part}.{'bin' if kind == 'binary' else 'txt'}").unlink()
     found = read_named(tmp_path)
-    assert [each.name for each in found] == [f"frame_{n:05d}" for n in range(1, COUNT + 1)]
+    assert [each.name for each in found] == [f"frames/frame_{n:05d}" for n in range(1, COUNT + 1)]
     for number, each in enumerate(found, 1):
         local = model.image(number).cam_from_world() * points
         pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
@@ -142,7 +142,8 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     for path in (tmp_path, tmp_path / "transforms.json"):
         found = read_named(path)
-        assert [each.name for each in found] == [f"frame_{n:05d}" for n in range(1, COUNT + 1)]
+        names = [f"images/frame_{n:05d}" for n in range(1, COUNT + 1)]
+        assert [each.name for each in found] == names
         for each, camera in zip(found, cameras, strict=True):
             wanted = seen(opengl_pose(camera), camera, points)
             np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
