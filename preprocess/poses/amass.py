@@ -16,6 +16,8 @@ from preprocess.poses.track import People, track
 
 AIST_RATE = 60.0
 """Of all AIST++ motions, by their documentation."""
+OF_SMPLX = 165
+"""Numbers a row that only SMPL-X has: 55 joints."""
 
 
 def tracks(content: Any, driving: bool = False) -> People | None:
@@ -31,6 +33,8 @@ def tracks(content: Any, driving: bool = False) -> People | None:
     else:
         return None
     model = str(content.get("surface_model_type", "smpl"))
+    numbers = sum(np.asarray(part).size for part in parts) / max(1, len(content["trans"]))
+    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == OF_SMPLX
     motion = track(
         parts,
         content["trans"],
@@ -38,7 +42,7 @@ def tracks(content: Any, driving: bool = False) -> People | None:
         if "betas" in content
         else None,
         times_s=_times(len(np.asarray(content["trans"])), _rate(content)),
-        model="smplx" if "smplx" in model.replace("-", "").lower() else "smpl",
+        model="smplx" if is_smplx else "smpl",
         space="world",
     )
     return {"0": motion}

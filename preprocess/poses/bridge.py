@@ -16,12 +16,15 @@ def bridged(motion: Motion, longest: int = LONGEST_GAP) -> Motion:
     """The motion with short gaps filled in: slerp for rotations, straight lines for places.
 
     A gap is a run of frames without a valid row between two frames with one; longer gaps stay.
-    Motions without frame numbers are taken as one row a frame.
+    Motions without frame numbers are taken as one row a frame. Those with cameras of their own are
+    bridged only where each frame has its row, and so its camera.
 
     Args:
         motion: One row a frame at most.
         longest: Of how many frames a gap may be.
     """
+    if motion.camera_from_world is not None and motion.frames is not None:
+        return motion  # nobody knows where the cameras of the missing frames stood
     numbers = motion.frames if motion.frames is not None else np.arange(len(motion))
     good = np.flatnonzero(motion.valid)
     before = good[:-1][(np.diff(numbers[good]) > 1) & (np.diff(numbers[good]) <= longest + 1)]
@@ -52,7 +55,6 @@ def bridged(motion: Motion, longest: int = LONGEST_GAP) -> Motion:
         valid=merged(motion.valid, np.ones(len(new), dtype=bool)),
         frames=merged(numbers, new) if motion.frames is not None else None,
         times_s=times_s,
-        camera_from_world=None,
         bridged=merged(np.zeros(len(numbers), dtype=bool), np.ones(len(new), dtype=bool)),
     )
 

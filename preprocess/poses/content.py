@@ -26,6 +26,15 @@ SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json",
 OTHERS = frozenset({".txt", ".csv", ".md", ".bvh", ".fbx", ".glb", ".obj", ".mp4", ".mov", ".png"})
 """Endings of files that people name by mistake."""
 
+NO_PICKLES = {
+    b"\x89HDF": "an HDF5 file; of PeopleSnapshot's: python -c \"import h5py, numpy; f = "
+    "h5py.File('reconstructed_poses.hdf5'); numpy.savez('poses.npz', **{k: f[k][()] for k in f})\"",
+    b"MATLAB": "a .mat of MATLAB; write global_orient, body_pose and transl to an .npz",
+    b"glTF": "a mesh; poses were expected",
+    b"Kaydara": "an .fbx; poses of SMPL were expected",
+}
+"""What files begin with that can be no poses, and what they are."""
+
 PIECE = 1 << 20
 """Bytes that are unpacked at a time."""
 
@@ -77,6 +86,9 @@ def _decoded(data: bytes, path: Path) -> Any:
         return plain_pickle(_unpacked(lambda: _blocks(BZ2Decompressor(), data)))
     if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
         return plain_pickle(_unpacked(lambda: _blocks(lzma.LZMADecompressor(), data)))
+    for magic, words in NO_PICKLES.items():
+        if data.startswith(magic):
+            raise ValueError(words)
     if data[:64].lstrip()[:1] in (b"{", b"["):
         return _json(data, path)
     return plain_pickle(data)

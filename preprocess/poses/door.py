@@ -11,11 +11,13 @@ from preprocess.pose_file import read_motion
 from preprocess.poses import (
     amass,
     easymocap,
+    frames,
     gvhmr,
     native,
     phalp,
     prompthmr,
     romp,
+    slahmr,
     tram,
     vibe,
     wham,
@@ -23,6 +25,7 @@ from preprocess.poses import (
 from preprocess.poses.bridge import LONGEST_GAP, bridged
 from preprocess.poses.content import read_content
 from preprocess.poses.track import People
+from preprocess.poses.unknown import described
 
 ADAPTERS: dict[str, Callable[[Any, bool], People | None]] = {
     "PHALP (4D-Humans)": phalp.tracks,
@@ -33,6 +36,7 @@ ADAPTERS: dict[str, Callable[[Any, bool], People | None]] = {
     "TRAM": tram.tracks,
     "ROMP or BEV": romp.tracks,
     "EasyMocap": easymocap.tracks,
+    "SLAHMR or 3DPW": slahmr.tracks,
     "AMASS or AIST++": amass.tracks,
 }
 """Trackers by name, in the order in which they are asked whether a file is theirs."""
@@ -87,6 +91,8 @@ def _recognised(
     for tool, tracks in ADAPTERS.items():
         try:
             people = tracks(content, driving)
+        except BadInput:
+            raise
         except REFUSED as cause:
             raise BadInput(
                 f"{path} looks like a file of {tool}, but what it holds cannot be used: "
@@ -95,13 +101,23 @@ def _recognised(
         if people:
             return tool, people
     people = native.tracks(content, path, default_model)
+    if people is not None:
+        return None, people
+    try:
+        people = frames.tracks(content, path, default_model)
+    except BadInput:
+        raise
+    except REFUSED as cause:
+        raise BadInput(
+            f"{path} holds a pose a frame that do not fit together ({cause})."
+        ) from cause
     if people is None:
         raise BadInput(
-            f"{path} holds no poses that are known: {_described(content)}. Expected global_orient, "
+            f"{path} holds no poses that are known: {described(content)} Expected global_orient, "
             f"body_pose and transl (or poses and trans), or a file of {', '.join(ADAPTERS)}; see "
             "docs/formats.md."
         )
-    return None, people
+    return "its tracker", people
 
 
 def _chosen(people: People, person: str | None, path: Path) -> Motion:
@@ -125,10 +141,3 @@ def _chosen(people: People, person: str | None, path: Path) -> Motion:
 def _named(people: People) -> str:
     listed = [f"{name} ({int(held.valid.sum())} poses)" for name, held in people.items()]
     return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "")
-
-
-def _described(content: Any) -> str:
-    if isinstance(content, dict):
-        keys = [str(key)[:40] for key in content]
-        return f"its keys are {', '.join(keys[:12]) or 'none'}{' …' if len(keys) > 12 else ''}"
-    return f"it is a {type(content).__name__}"

@@ -2,16 +2,53 @@
 
 Layout: global_orient, body_pose, transl; or thetas, transl; or poses, trans; with optional keys of
 ours (frame, time, valid, K, camera, model): see `preprocess.pose_file`. mmhuman3d's HumanData holds
-the same under `smpl`.
+the same under `smpl`, and so does EMDB. Other names of the same things are known, too (`ALIASES`).
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Shaped
 
-from preprocess.pose_file import LAYOUTS, motion_of
+from capture.errors import BadInput
+from preprocess.pose import Lens
+from preprocess.pose_file import CAMERA_KEYS, LAYOUTS, motion_of
 from preprocess.poses.track import People
+
+ALIASES = {
+    "global_orient": ("root_orient", "root_pose", "poses_root"),
+    "body_pose": ("pose_body", "poses_body"),
+    "thetas": ("pose", "smpl_poses"),
+    "transl": ("trans", "global_t", "smpl_trans"),
+    "betas": ("shape", "smpl_betas"),
+    "valid": ("good_frames_mask",),
+    "K": ("cam_intrinsics", "intrinsics"),
+    "camera": ("cam_extrinsics", "extrinsics"),
+}
+"""What other programs call the same numbers: ExAvatar, ARAH, EMDB, CLIFF, HumanNeRF and more."""
+
+OF_SMPLX = frozenset(
+    {"left_hand_pose", "lhand_pose", "jaw_pose", "leye_pose", "expression", "expr"}
+)
+"""Keys of which one is enough to know the body."""
+JOINTS_OF = {52: "smpl", 55: "smplx"}
+"""Bodies by how many joints a pose has, hands and face included."""
+
+BESIDE = ("frame", "time", "valid", "K", "camera")
+"""What may lie beside `smpl`."""
+KNOWN = (
+    *{key: None for keys in LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame", "time",
+    "valid", "K", "model", "space", "scale",
+)  # fmt: skip
+"""What is taken of a file; whatever else is in it is left there."""
+CLIFF = Lens(share=1.0, of="diagonal")
+"""The camera in which CLIFF's `global_t` is."""
+
+UNIT = 0.01
+"""A stated scale that is nearer to 1 says nothing."""
 
 
 def tracks(content: Any, path: Path, default_model: str) -> People | None:
@@ -23,9 +60,68 @@ def tracks(content: Any, path: Path, default_model: str) -> People | None:
     if not isinstance(content, dict):
         return None
     held = content.get("smpl", content)
-    if not isinstance(held, dict) or not any(set(keys) <= held.keys() for keys in LAYOUTS):
+    if not isinstance(held, dict):
         return None
-    arrays = {key: np.asarray(value) for key, value in held.items() if value is not None}
+    named = renamed(held)
     if held is not content:
-        arrays.setdefault("model", np.array("smpl"))
-    return {"0": motion_of(arrays, path, default_model=default_model)}
+        beside = {key: value for key, value in content.items() if not isinstance(value, dict)}
+        if isinstance(content.get("camera"), dict):
+            beside |= content["camera"]
+        around = renamed(beside)
+        named |= {key: around[key] for key in BESIDE if key in around and key not in named}
+        named.setdefault("model", "smpl")
+    if not any(set(keys) <= named.keys() for keys in LAYOUTS):
+        return None
+    motion = motion_of(arrays_of(named, path), path, default_model=default_model)
+    if "global_t" in held:
+        motion = replace(motion, lens=CLIFF, space="camera")
+    return {"0": motion}
+
+
+def renamed(held: Mapping[Any, Any]) -> dict[str, Any]:
+    """The same by the house's keys, where another name stands for what is missing.
+
+    The body is named where other keys tell: hands and face are SMPL-X's; whoever states a gender,
+    or uses other names, has fitted SMPL.
+    """
+    found = {str(key): value for key, value in held.items() if value is not None}
+    foreign, ours = False, any(set(keys) <= found.keys() for keys in LAYOUTS)
+    for key, others in ALIASES.items():
+        known = next((other for other in others if other in found), None)
+        if key not in found and known is not None and not isinstance(found[known], dict):
+            found[key] = found[known]
+            foreign = not ours
+    if "model" not in found:
+        kind = str(found.get("surface_model_type", "")).replace("-", "").lower()
+        if OF_SMPLX & found.keys() or "smplx" in kind:
+            found["model"] = "smplx"
+        elif "gender" in found or foreign:
+            found["model"] = "smpl"  # nobody else's programs know the embedded body
+    return found
+
+
+def arrays_of(named: Mapping[str, Any], path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """The arrays that `motion_of` takes.
+
+    Raises:
+        BadInput: If they are no arrays, or the world that they speak of is not metric.
+    """
+    try:
+        arrays = {key: np.asarray(named[key]) for key in KNOWN if key in named}
+    except ValueError as cause:
+        raise BadInput(f"{path}: one of its arrays has rows of several lengths ({cause}).") from (
+            cause
+        )
+    whole = arrays.get("thetas", arrays.get("poses"))
+    if "model" not in arrays and whole is not None and whole.ndim >= 2 and whole[0].size:
+        joints = whole[0].size // (9 if whole.shape[-2:] == (3, 3) else 3)
+        if joints in JOINTS_OF:
+            arrays["model"] = np.array(JOINTS_OF[joints])
+    scale = arrays.get("scale")
+    if scale is not None and scale.dtype.kind in "iuf" and (abs(scale - 1.0) > UNIT).any():
+        raise BadInput(
+            f"{path} has a `scale` of {np.median(scale):.3g}: its world has a unit of its own "
+            "(NeuMan, HUGS), and metres were expected. Divide `transl`, and the shifts of the "
+            "cameras, by `scale`, and leave the key out."
+        )
+    return arrays

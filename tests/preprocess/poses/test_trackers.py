@@ -498,7 +498,7 @@ def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"pose": np.zeros((3, 72))}, "no poses that are known: its keys are pose"),
+        ({"theta": np.zeros((3, 72))}, "no poses that are known: its keys are theta"),
         ([1, 2, 3], "it is a list"),
         (
             {0: {"pose": np.zeros((3, 60)), "trans": np.zeros((3, 3)), "frame_ids": [0, 1, 2]}},
