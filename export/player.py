@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-import onnxruntime
 from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.errors import BadInput
+from export.close_up import CloseUps, coarse, enlarged
+from export.drawable import check, sized
 from export.initialisers import initialisers
 from export.manifest import Manifest
 from export.package import AvatarPackage, read_package
+from export.session import provider_named, session_of, shortened
 from preprocess.kinematics import body_from_rest, world_from_body
 from preprocess.pose import BodyPose
 
@@ -23,8 +25,6 @@ CLOSE = 2
 """Two pictures are alike where no channel (premultiplied) differs by more, in 1/255 …"""
 ALIKE = 0.999
 """… on at least this share of the pixels."""
-MOST_SAMPLES = 256
-LARGEST_PX = 8192
 
 
 @final
@@ -49,13 +49,14 @@ class Player:
         """A player of a package that has been read (or is about to be written)."""
         self.manifest: Manifest = package.manifest
         self._rules = package.manifest.tiers[tier].rules
+        self._close_ups = CloseUps(package.tables[tier], self._rules)
         # onnxruntime only borrows the tables: they must live as long as the session
         self._tables = {
             name: array.tobytes()
             for name, array in initialisers(package.tables[tier], self._rules).items()
         }
         self.provider = provider_named(provider)
-        self._session = _session(package.graphs[tier], self._tables, threads, self.provider)
+        self._session = session_of(package.graphs[tier], self._tables, threads, self.provider)
         canonical = self._body_from_rest(self.manifest.canonical_rotations)
         self._rest_from_canonical = np.linalg.inv(canonical)
 
@@ -90,7 +91,7 @@ class Player:
         self,
         pose: BodyPose,
         camera: Camera,
-        size: int | tuple[int, int] | None = None,
+        size: int | np.integer | tuple[int, int] | None = None,
         samples: int | None = None,
     ) -> UInt8[np.ndarray, "height width 4"]:
         """The avatar's picture with straight alpha.
@@ -103,26 +104,26 @@ class Player:
             samples: Along 5 cm of a ray; the tier's own choice if None.
 
         Raises:
-            BadInput: If the camera's lens bends, or there are no samples or no pixels.
+            BadInput: If the camera's lens bends, there are no samples or no pixels, or pose or
+                camera are of another shape or not finite.
         """
         samples = self._rules.samples if samples is None else samples
-        if size is not None:
-            camera = camera.fitted(size) if isinstance(size, int) else camera.resized(size)
-        if camera.distortion:
-            raise BadInput(
-                "The camera has lens distortion, but the player draws pinhole pictures. "
-                "Leave the distortion out of the camera."
-            )
-        if not 1 <= samples <= MOST_SAMPLES:
-            raise BadInput(f"{samples} samples were asked for; 1 to {MOST_SAMPLES} can be drawn.")
+        camera = sized(camera, size)
+        check(pose, camera, samples)
+        bones = self.bones(pose, camera)
+        times = self._close_ups.coarser(bones, camera)
+        if times == 1.0:
+            return self._drawn(bones, camera, samples)
+        return enlarged(self._drawn(bones, coarse(camera, times), samples), camera.size_px, times)
+
+    def _drawn(
+        self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
+    ) -> UInt8[np.ndarray, "height width 4"]:
+        """What the graph draws."""
         width, height = camera.size_px
-        if not (0 < width <= LARGEST_PX and 0 < height <= LARGEST_PX):
-            raise BadInput(
-                f"Pictures of {width}x{height} px cannot be drawn; 1 to {LARGEST_PX} a side can."
-            )
         lens = [*camera.focal_px, *camera.center_px]
         inputs = {
-            "bones": self.bones(pose, camera).reshape(24, 12),
+            "bones": bones.reshape(24, 12),
             "camera": np.array(lens, dtype=np.float32),
             "height": np.array(height, dtype=np.int64),
             "width": np.array(width, dtype=np.int64),
@@ -131,7 +132,7 @@ class Player:
         try:
             packed = np.asarray(self._session.run(["rgba"], inputs)[0])
         except Exception as error:  # onnxruntime has no common class for what a graph can do
-            raise BadInput(f"The package's graph cannot draw this: {_shortened(error)}") from error
+            raise BadInput(f"The package's graph cannot draw this: {shortened(error)}") from error
         if packed.size != height * width or packed.dtype != np.int32:
             raise BadInput(
                 f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
@@ -189,59 +190,6 @@ class Player:
         return body_from_rest(self.manifest.rest_joints, self.manifest.parents, rotations)
 
 
-def provider_named(name: str) -> str:
-    """onnxruntime's own name of a provider: "cpu" is "CPUExecutionProvider".
-
-    Raises:
-        BadInput: If this onnxruntime has none of that name.
-    """
-    known = onnxruntime.get_available_providers()
-    for provider in known:
-        if name.lower() in (provider.lower(), provider.lower().removesuffix("executionprovider")):
-            return provider
-    short = ", ".join(provider.removesuffix("ExecutionProvider").lower() for provider in known)
-    raise BadInput(
-        f"onnxruntime {onnxruntime.__version__} has no provider {name!r} here; it has: {short}. "
-        "Others come with other builds of it, such as onnxruntime-gpu or onnxruntime-openvino."
-    )
-
-
-def _shortened(error: Exception, most: int = 400) -> str:
-    """What onnxruntime says, without the pages that some providers add."""
-    said = " ".join(str(error).split())
-    return said if len(said) <= most else f"{said[: most // 2]} … {said[-most // 2 :]}"
-
-
-def _session(
-    graph: bytes, tables: dict[str, bytes], threads: int, provider: str
-) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what fails is said below
-    options.enable_mem_reuse = False  # planning it takes longer than anything else at load
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    names, buffers = list(tables), list(tables.values())
-    options.add_external_initializers_from_files_in_memory(
-        names, buffers, [len(buffer) for buffer in buffers]
-    )
-    wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # what it lacks, the CPU does
-    try:
-        session = onnxruntime.InferenceSession(graph, options, providers=wanted)
-    except Exception as error:
-        raise BadInput(
-            f"The package's graph does not run on onnxruntime {onnxruntime.__version__} "
-            f"({provider}): {_shortened(error)}"
-        ) from error
-    if session.get_providers()[0] != provider:
-        raise BadInput(
-            f"onnxruntime {onnxruntime.__version__} knows {provider} but could not start it here; "
-            "it would draw on the CPU instead. Are the drivers and libraries installed?"
-        )
-    return session
-
-
 @dataclass(frozen=True, kw_only=True)
 class Likeness:
     """How far two pictures are apart.
@@ -290,7 +238,7 @@ def verify(path: Path | str, *, provider: str = "cpu") -> list[Likeness]:
     Raises:
         BadInput: If the file is no sound package, or there is no such provider.
     """
-    package = read_package(Path(path))
+    package = read_package(Path(path), tier=None)  # every entry is looked at
     player = Player(package, provider=provider)
     return [
         Likeness.of(premultiplied(player.render(frame.pose, frame.camera)), premultiplied(stored))

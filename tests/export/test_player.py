@@ -1,5 +1,6 @@
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -118,6 +119,44 @@ def test_what_cannot_be_drawn_is_said(player, bent, camera):
         player.render(bent, replace(camera(9, 9), distortion=(0.1,)))
     with pytest.raises(BadInput, match="samples"):
         player.render(bent, camera(9, 9), samples=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "size", "said"),
+    [
+        ({"focal_px": (np.nan, 100.0)}, None, "focal"),
+        ({"focal_px": (0.0, 0.0)}, None, "above 0"),
+        ({"center_px": (4.0, np.inf)}, None, "centre"),
+        ({"camera_from_world": np.full((4, 4), np.nan)}, None, "camera_from_world holds NaN"),
+        ({}, 0, "size 0"),
+        ({}, (5, -3), "size"),
+    ],
+)
+def test_numbers_that_are_none_are_refused_before_they_are_drawn(
+    player, bent, camera, change, size, said
+):
+    with pytest.raises(BadInput, match=said):
+        player.render(bent, replace(camera(9, 9), **change), size=size)
+
+
+def test_a_pose_without_numbers_is_refused(player, bent, camera):
+    lost = replace(bent, joint_rotations=np.full((23, 3), np.nan))
+    with pytest.raises(BadInput, match="joint_rotations holds NaN"):
+        player.render(lost, camera(9, 9))
+
+
+def test_sizes_may_be_numpys_integers(player, bent, camera):
+    assert player.render(bent, camera(90, 60), size=np.int64(30)).shape == (20, 30, 4)
+
+
+def test_a_proof_looks_at_every_entry(exported, tmp_path):
+    """A graph of the other tier that was lost is noticed, though golden frames do not show it."""
+    path = tmp_path / "x.iavatar"
+    with zipfile.ZipFile(exported.path) as whole, zipfile.ZipFile(path, "w") as part:
+        for name in set(whole.namelist()) - {"lite/player.onnx"}:
+            part.writestr(name, whole.read(name))
+    with pytest.raises(BadInput, match=r"lite/player\.onnx is missing"):
+        verify(path)
 
 
 def test_bricks_give_linear_ramps_back(tables):

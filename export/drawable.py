@@ -1,0 +1,72 @@
+"""What the player can draw, checked before it is asked of the graph."""
+
+from typing import Any
+
+import numpy as np
+
+from capture.camera import Camera
+from capture.errors import BadInput
+from preprocess.pose import BodyPose
+
+MOST_SAMPLES = 256
+LARGEST_PX = 8192
+FARTHEST = 1e8
+"""Pixels, metres, radians: whatever is larger, or NaN, is a mistake."""
+
+
+def sized(camera: Camera, size: int | np.integer | tuple[int, int] | None) -> Camera:
+    """The same camera for a picture of another size.
+
+    Args:
+        camera: With a size of its own.
+        size: Longer side, or width and height, pixels; None for the camera's own.
+
+    Raises:
+        BadInput: If there would be no pixels.
+    """
+    if size is None:
+        return camera
+    sides: Any = np.asarray(size)
+    if sides.shape not in ((), (2,)) or sides.dtype.kind not in "iu" or sides.min() < 1:
+        raise BadInput(
+            f"A picture of size {size} was asked for; expected the longer side, or width and "
+            "height, in whole pixels from 1 on."
+        )
+    return camera.fitted(int(sides)) if sides.ndim == 0 else camera.resized((*sides.tolist(),))
+
+
+def check(pose: BodyPose, camera: Camera, samples: int) -> None:
+    """Whether all of it can be drawn.
+
+    Raises:
+        BadInput: If it cannot.
+    """
+    if not 1 <= samples <= MOST_SAMPLES:
+        raise BadInput(f"{samples} samples were asked for; 1 to {MOST_SAMPLES} can be drawn.")
+    _check_array("root_rotation", pose.root_rotation, (3,))
+    _check_array("root_translation", pose.root_translation, (3,))
+    _check_array("joint_rotations", pose.joint_rotations, (23, 3))
+    _check_array("camera_from_world", camera.camera_from_world, (4, 4))
+    if camera.distortion:
+        raise BadInput(
+            "The camera has lens distortion, but the player draws pinhole pictures. "
+            "Leave the distortion out of the camera."
+        )
+    width, height = camera.size_px
+    if not (0 < width <= LARGEST_PX and 0 < height <= LARGEST_PX):
+        raise BadInput(
+            f"Pictures of {width}x{height} px cannot be drawn; 1 to {LARGEST_PX} a side can."
+        )
+    lens = np.array([*camera.focal_px, *camera.center_px])
+    if not (np.abs(lens) < FARTHEST).all() or min(camera.focal_px) <= 0.0:
+        raise BadInput(
+            f"The camera's focal lengths are {camera.focal_px} and its centre {camera.center_px}; "
+            "finite numbers of pixels were expected, focal lengths above 0."
+        )
+
+
+def _check_array(name: str, array: Any, shape: tuple[int, ...]) -> None:
+    if np.shape(array) != shape:
+        raise BadInput(f"{name} has the shape {np.shape(array)}; {shape} was expected.")
+    if not (np.abs(array) < FARTHEST).all():
+        raise BadInput(f"{name} holds NaN, infinity or a number out of all bounds.")
