@@ -125,7 +125,10 @@ class Manifest:
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             if isinstance(error, BadInput):
                 raise
-            raise BadInput(f"The package's manifest is damaged: {error!r}.") from error
+            what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            raise BadInput(
+                f"The package's manifest is damaged: {what}. Copy or export it again."
+            ) from error
 
 
 def _finite(value: Any) -> Any:
@@ -144,9 +147,11 @@ def _parsed(text: bytes) -> dict[str, Any]:
         raise BadInput("The package's manifest is no JSON; the file is damaged.") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else None
+        newer = isinstance(found, int) and found > FORMAT
         raise BadInput(
             f"The package has format {found!r}; this version reads format {FORMAT}. "
-            "Export the avatar again, or use the version that wrote it."
+            + ("Update instant-avatar-stream, " if newer else "Export the avatar again, ")
+            + "or use the version that wrote it."
         )
     return content
 

@@ -169,6 +169,8 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
         BadInput: If the file is missing, truncated, altered, or no package, or has no such tier.
     """
     try:
+        if path.exists() and not path.is_file():  # a folder; a pipe would never end
+            raise BadInput(_no_file(path))
         with path.open("rb") as file:
             if (size := path.stat().st_size) > LARGEST_FILE:
                 raise BadInput(f"{path} has {size >> 20} MB; no package has. Refused.")
@@ -182,6 +184,14 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
         raise BadInput(
             f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
         ) from error
+
+
+def _no_file(path: Path) -> str:
+    found = sorted(path.glob("*.iavatar")) if path.is_dir() else []
+    if found:
+        return f"{path} is a folder; the package in it is {found[0]}. Give that."
+    what = "a folder" if path.is_dir() else "no file"
+    return f"{path} is {what}; the .iavatar file that ia-ingest or ia-export wrote was expected."
 
 
 @final
@@ -248,7 +258,10 @@ class _Archive:
 
 
 def _read(archive: _Archive, tier: str | None) -> AvatarPackage:
-    manifest = Manifest.from_json(archive.read(MANIFEST, most=LARGEST_TEXT))
+    try:
+        manifest = Manifest.from_json(archive.read(MANIFEST, most=LARGEST_TEXT))
+    except BadInput as error:
+        raise BadInput(f"{archive.path}: {error}") from error
     if tier is not None and tier not in manifest.tiers:
         known = ", ".join(sorted(manifest.tiers))
         raise BadInput(f"{archive.path} has no tier {tier!r}; it has: {known}.")
