@@ -58,6 +58,8 @@ class ExportArguments:
     """File to write; it appears whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """With --to glb: the motion that goes in, as ia-play reads it; without it, a turn."""
+    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """Whose poses, where the file holds several people's; without it whoever has most."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,10 +98,17 @@ def export(given: ExportArguments, console: Console) -> int:
 def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
     from apps.playing.mesh_file import write_mesh
 
-    write_mesh(package, given.out, console, poses=given.poses, name=given.out.stem)
+    write_mesh(
+        package, given.out, console, poses=given.poses, name=given.out.stem, person=given.person
+    )
 
 
 def _package(folder: Path, out: Path, console: Console) -> None:
+    if folder.is_file():
+        raise BadInput(
+            f"{folder} is a file; a package is made from the folder that ia-ingest wrote. From a "
+            "package come --to glb and --to ply."
+        )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():
         raise BadInput(

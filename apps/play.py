@@ -113,27 +113,23 @@ def _counted(workers: int) -> str:
 
 
 def _web(given: PlayArguments, port: int, console: Console) -> int:
+    from apps.playing.driving import driving_motion
     from apps.playing.novel import novel_motion
     from apps.playing.rate import poses_a_second
-    from apps.playing.shots import motion_of
-    from apps.playing.viewpoint import Viewpoint
     from apps.playing.web import check_folder, clip_of, serve, write_site
     from export.player import Player
     from export.web.runtime import runtime_files
     from export.web.site import site
 
-    if given.camera is not None or given.bench or given.viewpoint != Viewpoint():
-        raise BadInput(
-            "--web has a camera of its own: leave out --camera, --orbit, --turntable and their "
-            "like, and --bench."
-        )
     if not 0 < port < 1 << 16:
         raise BadInput(f"--web {port} is no port; 1 to 65535 were expected.")
     runtime_files()
     if given.out is not None:
         check_folder(given.out)
     player = Player.load(given.avatar)
-    motion = novel_motion() if given.poses is None else motion_of(given, player, console)
+    joints, motion = player.manifest.rest_joints, novel_motion()
+    if given.poses is not None:
+        motion = driving_motion(given.poses, joints, console, person=given.person)
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
     clip = clip_of(player, motion, rows, given.fps or given.speed * poses_a_second(motion))
     name = (

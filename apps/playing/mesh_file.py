@@ -5,20 +5,26 @@ from pathlib import Path
 
 import numpy as np
 
+from apps.playing.driving import driving_motion
 from apps.playing.novel import novel_motion
 from apps.playing.rate import poses_a_second
 from apps.terminal.console import Console
 from apps.terminal.whole import whole_file
-from capture.errors import BadInput
 from export.gltf import Animation, glb
 from export.manifest import Manifest
 from export.mesh import SkinnedMesh, mesh_of
 from export.package import read_package
-from preprocess.pose_file import read_motion
+from preprocess.pose import Motion
 
 
 def write_mesh(
-    package: Path, out: Path, console: Console, *, poses: Path | None, name: str
+    package: Path,
+    out: Path,
+    console: Console,
+    *,
+    poses: Path | None,
+    name: str,
+    person: str | None = None,
 ) -> None:
     """Writes the mesh by the suffix of its name, whole or not at all.
 
@@ -28,13 +34,17 @@ def write_mesh(
         console: Where it says how far it is.
         poses: What the .glb does; without it, a turn.
         name: Of the avatar.
+        person: Whose poses, where the file holds several people's.
 
     Raises:
         BadInput: If the package is not sound, or no pose is valid.
         OSError: If the disk is full.
     """
     held = read_package(package)
-    write = _ply if out.suffix == ".ply" else _glb(held.manifest, poses, name, console)
+    motion = novel_motion()
+    if poses is not None:
+        motion = driving_motion(poses, held.manifest.rest_joints, console, person=person)
+    write = _ply if out.suffix == ".ply" else _glb(held.manifest, motion, name)
     with console.waiting("taking the surface"):
         mesh = mesh_of(held.tables["hq"])
         content = write(mesh)
@@ -43,17 +53,9 @@ def write_mesh(
     console.say(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
 
 
-def _glb(
-    manifest: Manifest, poses: Path | None, name: str, console: Console
-) -> Callable[[SkinnedMesh], bytes]:
-    motion = novel_motion() if poses is None else read_motion(poses)
+def _glb(manifest: Manifest, motion: Motion, name: str) -> Callable[[SkinnedMesh], bytes]:
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
-    if not rows:
-        raise BadInput(f"None of the {len(motion)} poses in {poses} is valid.")
-    if len(rows) < len(motion):
-        console.warn(f"{len(motion) - len(rows)} of {len(motion)} poses are not valid; left out.")
-    fps = poses_a_second(motion)
-    animation = Animation.of(motion, rows, fps, manifest.rest_joints[0])
+    animation = Animation.of(motion, rows, poses_a_second(motion), manifest.rest_joints[0])
     return lambda mesh: glb(mesh, manifest, animation, name=name)
 
 

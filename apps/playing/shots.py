@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from apps.playing.arguments import SIZE_PX, PlayArguments
+from apps.playing.driving import driving_motion
 from apps.playing.follow import FollowingCamera, standing_pose
 from apps.playing.novel import novel_motion
 from apps.playing.timeline import Timeline
@@ -61,7 +62,9 @@ def shots_of(
     elif given.poses is None:
         motion = novel_motion()
     else:
-        motion = motion_of(given, player, console)
+        motion = driving_motion(
+            given.poses, player.manifest.rest_joints, console, person=given.person
+        )
     one = given.still is not None or len(motion) == 1
     if one or given.clip.suffix.lower() == ".png":
         row = given.still or 0
@@ -79,28 +82,6 @@ def shots_of(
     rows = tuple(line.row(picture) for picture in range(len(line)))
     return Shots(poses=poses, cameras=_cameras(given, player, motion, rows, poses, line.fps),
                  fps=line.fps)  # fmt: skip
-
-
-def motion_of(given: PlayArguments, player: Player, console: Console) -> Motion:
-    """The poses of the file, about the avatar's own pelvis.
-
-    Raises:
-        BadInput: If there are none.
-    """
-    from preprocess.poses import read_poses
-    from preprocess.poses.place import about_pelvis
-
-    assert given.poses is not None
-    motion = read_poses(given.poses, person=given.person, driving=True)
-    motion = about_pelvis(motion, player.manifest.rest_joints)
-    if motion.note is not None:
-        console.say(f"note: {motion.note}")
-    lost = int((~motion.valid).sum())
-    if lost == len(motion):
-        raise BadInput(f"None of the {len(motion)} poses in {given.poses} is valid.")
-    if lost:
-        console.warn(f"{lost} of {len(motion)} poses are not valid; left out.")
-    return motion
 
 
 def _held(pose: BodyPose) -> Motion:

@@ -6,6 +6,7 @@ import trimesh
 
 from apps import export
 from export.player import Player, verify
+from preprocess.pose_file import read_motion
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def test_the_whole_person_is_in_the_views(rig):
     [
         (lambda run, out: (out.parent, out), "checkpoint"),
         (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
-        (lambda run, out: (run / "avatar.iavatar", out), "checkpoint"),
+        (lambda run, out: (run / "avatar.iavatar", out), "--to glb"),
         (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "no folder"),
     ],
 )
@@ -65,6 +66,28 @@ def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
     low, high = mesh.bounds
     assert 1.4 < high[1] - low[1] < 2.1  # a person's height
     assert [file.name for file in tmp_path.iterdir()] == ["a.glb"]
+
+
+def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_path):
+    """AMASS's keys, which ia-play reads, say the same as our own."""
+    ours = read_motion(film / "truth" / "novel" / "poses.npz")
+    turned = np.concatenate([ours.root_rotations[:, None], ours.joint_rotations], axis=1)
+    np.savez(
+        tmp_path / "amass.npz",
+        poses=np.pad(turned.reshape(len(ours), 72)[:, :66], [(0, 0), (0, 90)]),
+        trans=ours.root_translations,
+        betas=np.zeros(16),
+        gender="neutral",
+        mocap_framerate=30.0,
+    )
+    out = tmp_path / "a.glb"
+    words = run / "avatar.iavatar", "--to", "glb", "--poses", tmp_path / "amass.npz", "--out", out
+    code, said = call_export(*words)
+    assert code == 0, said.err
+    assert len(trimesh.load(out).geometry) == 1
+    code, said = call_export(*words, "--person", "7")
+    assert code == 2
+    assert "7" in said.err
 
 
 def test_a_package_becomes_a_still_mesh_in_colour(run, call_export, tmp_path):

@@ -1,0 +1,41 @@
+"""Poses that an avatar is driven with, whoever wrote them."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from apps.terminal.console import Console
+from capture.errors import BadInput
+from preprocess.pose import Motion
+from preprocess.poses import read_poses
+from preprocess.poses.place import about_pelvis
+
+
+def driving_motion(
+    path: Path,
+    rest_joints: Float[np.ndarray, "24 3"],
+    console: Console,
+    *,
+    person: str | None = None,
+) -> Motion:
+    """The poses of a file, about the avatar's own pelvis.
+
+    Args:
+        path: Whatever `preprocess.poses` reads.
+        rest_joints: The avatar's, metres.
+        console: Hears what the user should know about the poses.
+        person: Whose poses; None: of whom there are most.
+
+    Raises:
+        BadInput: If there are none.
+    """
+    motion = about_pelvis(read_poses(path, person=person, driving=True), rest_joints)
+    if motion.note is not None:
+        console.say(f"note: {motion.note}")
+    lost = int((~motion.valid).sum())
+    if lost == len(motion):
+        raise BadInput(f"None of the {len(motion)} poses in {path} is valid.")
+    if lost:
+        console.warn(f"{lost} of {len(motion)} poses are not valid; left out.")
+    return motion
