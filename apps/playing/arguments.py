@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -106,6 +106,7 @@ class PlayArguments:
         Raises:
             BadInput: If they do not, or a number cannot be.
         """
+        self._check_mode()
         if self.json is not None and not (self.bench or self.verify):
             raise BadInput("--json writes the figures of --bench or --verify; give one of them.")
         if self.fps is not None and not 0.1 <= self.fps <= 240.0:
@@ -122,6 +123,16 @@ class PlayArguments:
                 "--distance, --zoom, --close-up and --turntable, or leave out --camera."
             )
         self.size_px  # noqa: B018 - raises
+        self.viewpoint  # noqa: B018 - raises
+
+    def _check_mode(self) -> None:
+        """Refuses what would not be listened to."""
+        given = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
+        for mode, (does, heard) in MODES.items():
+            unheard = given - heard - {"avatar", mode}
+            if mode in given and unheard:
+                flag = min(unheard).replace("_", "-")
+                raise BadInput(f"--{mode} {does}: leave out --{flag}, or --{mode}.")
 
     @property
     def size_px(self) -> tuple[int, int] | int | None:
@@ -166,3 +177,15 @@ class PlayArguments:
         stem = self.avatar.stem if self.poses is None else self.poses.stem
         one = self.still is not None and self.turntable is None
         return self.avatar.parent / (f"{stem}-{self.still}.png" if one else f"{stem}.webm")
+
+
+ALL = frozenset(field.name for field in fields(PlayArguments))
+MODES = {
+    "verify": ("draws the golden frames as they were drawn", frozenset({"provider", "json"})),
+    "web": (
+        "shows a page that has a camera, a size and a choice of tiers of its own",
+        frozenset({"poses", "person", "out", "fps", "speed"}),
+    ),
+    "bench": ("writes no pictures", ALL - {"out", "background"}),
+}
+"""What is done instead of a clip, and which arguments it listens to."""

@@ -12,7 +12,9 @@ DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM, INTERRUPTED = 0, 1, 2, 3, 130
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """The disk, the quota, or the largest size that a file may have."""
-FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR})
+FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+NO_PLACE = frozenset({errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST})
+"""Names that nothing can be read from or written to."""
 BUSY = ("out of memory", "busy or unavailable", "not enough memory")
 """What torch says of a device that cannot be used now."""
 
@@ -71,7 +73,7 @@ def _of_the_machine(error: OSError | RuntimeError | MemoryError) -> tuple[int, s
             return NO_ROOM, f"the disk is full ({why})."
         if error.errno == errno.EBUSY:
             return NO_ROOM, f"a device is busy ({why})."
-        if error.errno in FORBIDDEN:
+        if error.errno in FORBIDDEN | NO_PLACE:
             return BAD_INPUT, f"cannot read or write there ({why}). Name another place."
         return None
     said = str(error).strip() or "out of memory"

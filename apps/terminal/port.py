@@ -24,8 +24,9 @@ def _is_number(word: str) -> bool:
 def _filled(words: Sequence[str], flag: str, value: str, fits: Callable[[str], bool]) -> list[str]:
     """argparse would take the next word for the value, whatever that is."""
     filled: list[str] = []
-    for word, after in zip(words, [*words[1:], ""], strict=True):
+    for place, word in enumerate(words):
         filled.append(word)
+        after = words[place + 1] if place + 1 < len(words) else ""
         if word == flag and not fits(after):
             filled.append(value)
     return filled

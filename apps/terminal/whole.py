@@ -1,6 +1,7 @@
 """Files that appear whole or not at all."""
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,15 +14,20 @@ from capture.errors import BadInput
 def whole_file(path: Path) -> Iterator[Path]:
     """Gives a name to write to; the file takes its own name once the block is done.
 
+    A link is followed: what it points to is replaced.
+
     The passing name keeps the suffix, by which encoders know what to write. An older file stays
     until then, and stays if the block fails.
 
     Raises:
-        BadInput: If `path` is a folder.
+        BadInput: If `path` is a folder, or a device or a pipe.
         OSError: If it cannot be written.
     """
     if path.is_dir():
         raise BadInput(f"{path} is a folder; the name of a file was expected.")
+    if _is_stream(path):
+        raise BadInput(f"{path} is a device or a pipe; the name of a file was expected.")
+    path = Path(os.path.realpath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
@@ -35,7 +41,11 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Gives a folder to fill; it takes its own name, and an older one's place, at the end."""
+    """Gives a folder to fill; it takes its own name, and an older one's place, at the end.
+
+    A link is followed, as by `whole_file`.
+    """
+    path = Path(os.path.realpath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     old = path.with_name(f".{path.name}.{os.getpid()}.old")
@@ -51,6 +61,18 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A text file, whole or not at all."""
+    """A text file, whole or not at all; a device such as /dev/stdout just gets the text."""
+    if _is_stream(path):
+        path.write_text(text, encoding="utf-8")
+        return
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+STDOUT = re.compile(r"/dev/(stdout|stderr|fd/\d+)|/proc/.*")
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether a name is that of a device or a pipe; stdout is one wherever it was sent to."""
+    named = STDOUT.fullmatch(str(path.absolute())) is not None
+    return named or (path.exists() and not (path.is_file() or path.is_dir()))

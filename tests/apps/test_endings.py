@@ -2,6 +2,8 @@
 
 import errno
 import io
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +34,8 @@ def raising(error):
         (OSError(errno.EBUSY, "Device or resource busy"), 3, "busy"),
         (RuntimeError("CUDA error: out of memory\nat line 3"), 3, "out of memory"),
         (PermissionError(errno.EACCES, "Permission denied", "/out"), 2, "/out"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "xxx"), 2, "too long: xxx"),
+        (OSError(errno.ELOOP, "Too many levels of symbolic links", "a"), 2, "Name another place"),
         (MemoryError(), 3, "memory"),
         (KeyboardInterrupt(), 130, "Ctrl-C"),
         (Stop("too [blurred]", 1), 1, "too [blurred]"),
@@ -98,6 +102,34 @@ def test_a_folder_that_fails_leaves_the_older_one(tmp_path):
         fails()
     assert (path / "0000.png").read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["frames"]
+
+
+def test_a_link_stays_and_what_it_points_to_is_replaced(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "old.png").write_text("old")
+    (tmp_path / "frames").symlink_to(tmp_path / "far")
+    with whole_folder(tmp_path / "frames") as part:
+        (part / "new.png").write_text("new")
+    assert (tmp_path / "frames").is_symlink()
+    assert [file.name for file in (tmp_path / "far").iterdir()] == ["new.png"]
+    (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
+    write_text(tmp_path / "a.json", "{}")
+    assert (tmp_path / "a.json").is_symlink()
+    assert (tmp_path / "b.json").read_text() == "{}"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.json", "b.json", "far", "frames"]
+
+
+def test_figures_can_go_to_stdout_and_no_device_is_ever_replaced(capfd, tmp_path):
+    stdout = Path("/dev/stdout")
+    if not stdout.exists():
+        pytest.skip("there is no /dev/stdout here")
+    write_text(stdout, "figures\n")
+    assert capfd.readouterr().out == "figures\n"
+    os.mkfifo(tmp_path / "pipe.png")
+    for device in (Path(os.devnull), stdout, tmp_path / "pipe.png"):
+        with pytest.raises(BadInput, match="device or a pipe"), whole_file(device):
+            pass
+    assert [file.name for file in tmp_path.iterdir()] == ["pipe.png"]
 
 
 def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):

@@ -1,6 +1,7 @@
 """The player's command: what it writes, what it refuses, and that it needs no torch."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,7 @@ import onnxruntime
 import pytest
 from PIL import Image
 
-from apps.playing import encoders
+from apps import encoders, ingest, play
 from apps.playing.follow import FollowingCamera
 from apps.playing.novel import novel_motion
 from export.package import read_package, write_package
@@ -254,6 +255,10 @@ def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
         (["--distance", "0.1"], "--distance"),
         (["--close-up", "nose"], "left_hand"),
         (["--turntable", "0"], "--turntable"),
+        (["--turntable", "nan"], "--turntable"),
+        (["--background", "x" * 300], "too long"),
+        (["--bench", "--out", "a.webm"], "leave out --out"),
+        (["--bench", "--verify"], "leave out --"),
         (["--camera", "none.npz", "--orbit", "-20"], "leave out --orbit"),
         (["--out", "clip.mp4", "--background", "transparent"], "no transparency"),
         (["--fps", "0"], "--fps"),
@@ -267,6 +272,29 @@ def test_wrong_wishes(call_play, package, novel, tmp_path, monkeypatch, argument
     assert outcome.code == 2
     assert word in outcome.complaint("ia-play")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_proof_would_not_listen_to_is_refused(call_play, package, tmp_path):
+    for words in (["--tier", "lite"], ["--size", "64"], ["--out", tmp_path / "a.webm"]):
+        outcome = call_play(package, "--verify", *words)
+        assert outcome.code == 2
+        assert f"leave out {words[0]}" in outcome.complaint("ia-play")
+
+
+def test_a_folder_or_a_pipe_in_the_packages_place_is_named(call_play, package, tmp_path):
+    said = call_play(package.parent, "--verify").complaint("ia-play")
+    assert f"the package in it is {package}" in said
+    assert "is a folder" in call_play(tmp_path, "--verify").complaint("ia-play")
+    os.mkfifo(tmp_path / "pipe.iavatar")  # it would be waited on for ever
+    assert "is no file" in call_play(tmp_path / "pipe.iavatar", "--verify").complaint("ia-play")
+
+
+@pytest.mark.parametrize("command", [play, ingest])
+def test_without_any_argument_what_is_missing_is_said(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        command.main([])
+    assert end.value.code == 2
+    assert "--help" in capsys.readouterr().err
 
 
 def test_things_that_are_not_there(call_play, package, novel, tmp_path):

@@ -294,6 +294,8 @@ def test_without_the_runtime_it_says_how_to_get_it(call_play, package, tmp_path,
     [
         (["--web", "0"], "no port"),
         (["--web", "--bench"], "--bench"),
+        (["--web", "--tier", "lite"], "--tier"),
+        (["--web", "--size", "200"], "--size"),
         (["--web", "--camera", "cameras.npz"], "--camera"),
     ],
 )
