@@ -12,7 +12,8 @@ import onnxruntime
 import pytest
 from PIL import Image
 
-from apps import encoders, ingest, play
+from apps import ingest, play
+from apps.playing import encoders
 from apps.playing.follow import FollowingCamera
 from apps.playing.novel import novel_motion
 from export.package import read_package, write_package
