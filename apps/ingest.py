@@ -155,7 +155,7 @@ def _trainer(
     if not (given.resume and run.has_checkpoint()):
         trainer = new_trainer(
             recording, seconds=seconds, seed=given.seed, refine_poses=given.refine_poses,
-            device=device,
+            hold_every=given.hold_out, device=device,
         )  # fmt: skip
         return trainer, 0, {"video": video}
     trainer, notes = checkpoint.load(run.checkpoint, device)

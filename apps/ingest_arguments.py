@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from apps.learning.run_folder import RunFolder
 from apps.recording.recording import Recording, RecordingPaths
 from apps.solving.job import SolveJob
+from avatar.config import HOLD_EVERY
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.growing import IDLE_S
@@ -96,6 +97,8 @@ class IngestArguments:
     be learnt in --seconds: 540 in a minute, twice as many in four."""
     frames: str = "::"
     """Which frames, START:STOP:STEP, counted from 0."""
+    hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HOLD_EVERY
+    """Every so manieth frame is kept for scores and never learnt from; 0 learns from all."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
     force: Flag = False
@@ -135,6 +138,8 @@ class IngestArguments:
             raise BadInput(
                 f"--height-cm is {self.height_cm}; {LEAST_CM:.0f} to {MOST_CM:.0f} was expected."
             )
+        if self.hold_out < 0 or self.hold_out == 1:
+            raise BadInput(f"--hold-out is {self.hold_out}; 0, or 2 and more, was expected.")
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.mask_invert and self.no_mask_invert:

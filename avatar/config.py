@@ -22,6 +22,8 @@ Roots = Literal["cells", "broyden"]
 """How samples are warped: by our warp cells, or each by Broyden's method (Fast-SNARF)."""
 EmptyTerm = Literal["occupancy", "global"]
 """Where density is penalised: in empty cells (InstantAvatar, §3.4), or in the whole box."""
+HOLD_EVERY = 10
+"""Every so manieth frame is held out, unless somebody says otherwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +77,7 @@ class TrainConfig:
     """Whether the frames' poses are corrected while they are learnt from."""
     key_frames: int = 200
     """Frames that stay for replay."""
-    hold_every: int = 10
+    hold_every: int = HOLD_EVERY
     """Every so manieth frame is held out; 0 for none."""
     seed: int = 0
     """Of everything random."""
@@ -115,7 +117,7 @@ class TrainConfig:
         footprint_m: float,
         frames: int | None = None,
         seed: int = 0,
-        hold_every: int = 10,
+        hold_every: int = HOLD_EVERY,
     ) -> "TrainConfig":
         """The recipe for a waiting time and a picture size.
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -22,7 +23,12 @@ RAYS_A_CORRECTION = 512
 
 
 def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
-    """Scores of held-out frames after their poses have been fitted to them.
+    """Scores of held-out frames after their poses have been fitted to them (see `fitted`)."""
+    return tuple(score(trainer.avatar, frame) for frame in fitted(trainer, held))
+
+
+def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[HeldOut]:
+    """Held-out frames in poses that have been fitted to them, each with its warp.
 
     The avatar stays as it is: nothing of these frames is learnt but where the body was.
 
@@ -31,7 +37,7 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
         held: Frames that were never trained on.
     """
     if not held:
-        return ()
+        return
     avatar, field = trainer.avatar, trainer.avatar.field
     device = field.table.device
     replay = Replay(len(held), device)
@@ -54,11 +60,7 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
         field.table_grad.zero_()
         for _ in range(2):
             let_follow(avatar.rig, trainer.backend, replay, poses, rate=cosine(step / steps))
-    scores = []
     for slot, frame in enumerate(held):
         pose = poses.pose(slot)
         cells = WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
-        scores.append(
-            score(avatar, HeldOut(observation=replace(frame.observation, pose=pose), cells=cells))
-        )
-    return tuple(scores)
+        yield HeldOut(observation=replace(frame.observation, pose=pose), cells=cells)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from apps.recording.recording import Recording
+from avatar.config import HOLD_EVERY
 from avatar.hold import HeldOut, on_white, prepared, truth_on_white
 from avatar.metrics import psnr
 from avatar.model import Avatar
@@ -22,7 +23,6 @@ from preprocess.observation import Observation
 from preprocess.pose import BodyPose
 from preprocess.poses import read_poses
 
-HOLD_EVERY = 10
 DANCES = 16
 ASKED = {"hq": (("≥ 40", "≥ 43"), ("< 0.4", "< 0.1")), "lite": (("", ""), ("< 1.2", "< 0.5"))}
 """By tier: "at least" and "moonshot" of the PSNR to the renderer and of the loss."""

@@ -22,7 +22,7 @@ from apps.terminal.console import Bar, Console
 from apps.terminal.whole import whole_file
 from avatar import checkpoint
 from avatar.advice import advice
-from avatar.config import TrainConfig
+from avatar.config import HOLD_EVERY, TrainConfig
 from avatar.coverage import Coverage
 from avatar.events import Arrived, Evaluated, Score, Stepped, TrainEvent, Warned
 from avatar.fit import fitted_scores
@@ -41,13 +41,20 @@ LATE_S = 0.5
 
 
 def new_trainer(
-    recording: Recording, *, seconds: float, seed: int, refine_poses: bool, device: torch.device
+    recording: Recording,
+    *,
+    seconds: float,
+    seed: int,
+    refine_poses: bool,
+    hold_every: int = HOLD_EVERY,
+    device: torch.device,
 ) -> Trainer:
     """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
     config = TrainConfig.within(
         seconds,
         footprint_m=recording.footprint_m(),
         frames=recording.source.frame_count,
+        hold_every=hold_every,
         seed=seed,
     )
     config = replace(config, refine_poses=refine_poses)

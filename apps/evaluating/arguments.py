@@ -1,0 +1,104 @@
+"""What ia-evaluate can be told; the text under each field is its --help."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from apps.ingest_arguments import parsed_frames
+from apps.recording.recording import RecordingPaths
+from capture.errors import BadInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments:
+    """Says how good avatars are, as a table (Markdown): renderer and player beside real frames.
+
+    Try it:
+
+        ia-evaluate run                              a run's own held-out frames
+        ia-evaluate run other/run --json table.json  several; their mean, too
+        ia-evaluate run --on another/capture         the same person in another video
+        ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
+        ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
+
+    The last one learns each subject of PeopleSnapshot that it finds (folders in InstantAvatar's
+    layout: male-3-casual, …) from the paper's training frames for --seconds, scores the paper's
+    test frames, and puts the paper's figures beside (docs/evaluation.md). Subjects that were
+    learnt before are not learnt again.
+
+    All pictures are compared on white and whole, in the capture's poses ("given") and in poses
+    fitted to each frame with the avatar frozen ("fitted", as the paper does).
+
+    Exit codes: 0 done; 2 bad input; 3 disk full; 130 Ctrl-C, after a table of what was scored.
+    """
+
+    what: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RUN|AVATAR|DATASET", help_behavior_hint="")
+    ]
+    """Folders that ia-ingest wrote, .iavatar packages, or a folder of PeopleSnapshot's subjects."""
+    on: Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint="")] = None
+    """Score on this video or capture folder, all of its frames, instead of the run's own held-out
+    ones."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Of --on, as ia-ingest takes them; without it what lies in the folder."""
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Of --on; as above."""
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Of --on; as above."""
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """The body that the avatars were learnt with, if it was a file of your own."""
+    frames: str = "::"
+    """Which frames of --on, START:STOP:STEP, counted from 0."""
+    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
+    """Longer side of the pictures; without it as the run was learnt, else as they are."""
+    fitted: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Also in poses fitted to the frames."""
+    player: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Also as the package's player draws them, in each tier."""
+    seconds: float = 60.0
+    """Of a dataset: how long each subject is learnt."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Of a dataset: folder for the runs; without it runs/NAME, after the dataset."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to learn and to render."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write all figures to this file, of every frame."""
+    markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write the table to this file as well."""
+
+    def check(self) -> None:
+        """Refuses what cannot be meant.
+
+        Raises:
+            BadInput: Naming the option.
+        """
+        if not self.what:
+            raise BadInput("Name a run, a package or a dataset: ia-evaluate run (see --help).")
+        if self.size is not None and self.size < 16:
+            raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
+        if not 0.0 < self.seconds < float("inf"):
+            raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+        parsed_frames(self.frames)
+        told = [
+            f"--{name}" for name in ("poses", "masks", "cameras") if getattr(self, name) is not None
+        ]
+        if self.frames != "::":
+            told.append("--frames")
+        if told and self.on is None:
+            raise BadInput(f"{', '.join(told)} belong to a capture: name it with --on.")
+        for path in self.what:
+            if not path.exists():
+                raise BadInput(f"{path} does not exist; a run's folder or a package was expected.")
+
+    def wanted(self, video: Path) -> RecordingPaths:
+        """What is to be opened of --on."""
+        return RecordingPaths(
+            video=video,
+            poses=self.poses,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parsed_frames(self.frames),
+        )

@@ -1,0 +1,148 @@
+"""The frames that an avatar is compared with: its own held-out ones, or another capture's."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from apps.ingest_arguments import IngestArguments, learnable_px
+from apps.learning.run_folder import RunFolder
+from apps.recording.recording import Recording, RecordingPaths
+from capture.errors import BadInput
+from preprocess.observation import Observation
+
+PATHS = ("video", "poses", "masks", "body", "out", "json")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frames:
+    """Frames of a recording.
+
+    Attributes:
+        recording: Where they come from.
+        numbers: Which of them count; None for all.
+    """
+
+    recording: Recording
+    numbers: frozenset[int] | None = None
+
+    @property
+    def count(self) -> int | None:
+        """How many there are, if that is known."""
+        return self.recording.source.frame_count if self.numbers is None else len(self.numbers)
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Those in which the person was found, in order; what is no longer needed is not read."""
+        recording, wanted = self.recording, self.numbers
+        observe, last = recording.observer(), max(wanted, default=-1) if wanted else None
+        for frame in recording.source.frames():
+            counts = wanted is None or frame.index in wanted
+            if counts or recording.segment is not None:  # masks are estimated frame after frame
+                seen = observe(frame)
+                if counts and isinstance(seen, Observation):
+                    yield seen
+            if frame.index == last:
+                return
+
+
+def frames_on(wanted: RecordingPaths, person: Path | None, size_px: int | None) -> Frames:
+    """All frames of a capture.
+
+    Args:
+        wanted: What the user named.
+        person: The body of the avatar, as a file, to which the poses are brought.
+        size_px: Longer side; None for their own.
+
+    Raises:
+        BadInput: If a part is missing or does not fit.
+    """
+    return Frames(recording=Recording.open(wanted, size_px=size_px, avatars=person))
+
+
+def held_out_frames(run: RunFolder, size_px: int | None) -> Frames:
+    """The frames that a run has kept for scores, read again from where it read them.
+
+    Raises:
+        BadInput: If its report, or what it read, is not there any more.
+    """
+    report = read_report(run)
+    given = _given_then(report, run)
+    if given.live or str(given.video).startswith("camera:"):
+        raise BadInput(
+            f"{run.path} was learnt from a live source, which nobody kept. Name another capture of "
+            "the same person with --on."
+        )
+    wanted = given.wanted()
+    if given.cameras == "solve" and run.cameras.is_file():
+        wanted = replace(wanted, cameras=str(run.cameras), poses=run.poses)
+    person = run.person if run.person.is_file() else None
+    recording = Recording.open(wanted, avatars=person)
+    own_px = given.size or learnable_px(given.training_seconds(recording))
+    numbers = report["held_out"]["frames"]
+    if not numbers:
+        raise BadInput(
+            f"{run.path} has held out no frame, so there is nothing to score it on. Name another "
+            "capture of the same person with --on."
+        )
+    return Frames(
+        recording=replace(recording, size_px=size_px or own_px), numbers=frozenset(numbers)
+    )
+
+
+def learnt_px(run: RunFolder) -> int | None:
+    """Longer side of the pictures that a run has learnt from; None if nobody knows."""
+    size = read_report(run)["held_out"].get("size") if run.report.is_file() else None
+    return max(size) if size else None
+
+
+def read_report(run: RunFolder) -> dict[str, Any]:
+    """A run's report.json.
+
+    Raises:
+        BadInput: If there is none, or it is damaged.
+    """
+    try:
+        report = json.loads(run.report.read_text(encoding="utf-8"))
+        if isinstance(report["command"], dict) and isinstance(report["held_out"]["frames"], list):
+            return report
+        raise KeyError("command")
+    except FileNotFoundError as error:
+        raise BadInput(
+            f"{run.path} holds no {run.report.name}, which says what it was learnt from: finish "
+            "the run (ia-ingest … --resume), or name a capture with --on."
+        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(
+            f"{run.report} is no report that ia-ingest wrote ({type(error).__name__}: {error}); "
+            "name a capture with --on."
+        ) from error
+
+
+def _given_then(report: dict[str, Any], run: RunFolder) -> IngestArguments:
+    """The arguments of the run; paths that were relative are looked for near it, too."""
+    known = {item.name for item in fields(IngestArguments)}
+    words = {key: value for key, value in report["command"].items() if key in known}
+    try:
+        words |= {key: Path(words[key]) for key in PATHS if words.get(key) is not None}
+        given = IngestArguments(**words)
+    except TypeError as error:
+        raise BadInput(
+            f"{run.report} does not say what was learnt from; name a capture with --on."
+        ) from error
+    base = _base(given, run)
+    near = {key: base / words[key] for key in PATHS if words.get(key) is not None}
+    if given.cameras is not None and (base / given.cameras).exists():
+        near["cameras"] = str(base / given.cameras)
+    return replace(given, **near, realtime=False)
+
+
+def _base(given: IngestArguments, run: RunFolder) -> Path:
+    """Where the command was run: here, or where its --out was this folder."""
+    if given.video.exists() or given.out is None or given.out.is_absolute():
+        return Path()
+    above = Path(os.path.abspath(run.path))
+    for _ in given.out.parts:
+        above = above.parent
+    return above if (above / given.video).exists() else Path()
