@@ -21,6 +21,7 @@ from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
 from avatar.prepare import BodyRays
 from avatar.skip import pruned, window
+from avatar.strays import Strays
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
@@ -45,7 +46,7 @@ def render(
     """Premultiplied RGBA in [0, 1] of the avatar in one pose, seen by one camera.
 
     It is within `UNSEEN`, and what single precision rounds off, of the sum over all lattice samples
-    in `avatar.rendering_grid()`.
+    in `avatar.rendering_grid()` that are on their rays (`avatar.strays`).
 
     Args:
         avatar: Who.
@@ -63,7 +64,8 @@ def render(
         grid = avatar.rendering_grid()
         cells = pruned(cells, grid)
         rows, columns = window(cells, camera, world_from_body)
-        colors_of = partial(traced, avatar.field, grid=grid, step_m=avatar.step_m)
+        strays = Strays.of(avatar.rig, pose.joint_rotations, cells, device)
+        colors_of = partial(traced, avatar.field, grid=grid, strays=strays, step_m=avatar.step_m)
     else:
         rows, columns = slice(0, height), slice(0, width)
         colors_of = partial(_seen, avatar.field, samples_along, step_m=avatar.step_m)
@@ -89,7 +91,13 @@ def _in_parts(
 
 
 def traced(
-    field: Field, rays: Rays, cells: CellTables, *, grid: Grid, step_m: float
+    field: Field,
+    rays: Rays,
+    cells: CellTables,
+    *,
+    grid: Grid,
+    strays: Strays,
+    step_m: float,
 ) -> Float32[Tensor, "rays 4"]:
     """Premultiplied colour and alpha along rays.
 
@@ -98,6 +106,7 @@ def traced(
         rays: Of one body frame or of many.
         cells: Their warps.
         grid: Where the field counts.
+        strays: Finds samples that are not on their rays: these hold nothing.
         step_m: Distance between samples, metres.
     """
     colors = torch.zeros(len(rays.slots), 4, device=rays.origins.device)
@@ -107,7 +116,9 @@ def traced(
         how = Marching(step_m, math.inf, most)
         samples, jitter = field.backend.march_on(rays, cells, grid, how)
         nearer = colors[alive]
-        part = field.backend.composite(field.raw_at(samples.points), samples, step_m)
+        raw = field.raw_at(samples.points)
+        raw[strays.among(samples, rays), 3] = EMPTY_LOG_DENSITY
+        part = field.backend.composite(raw, samples, step_m)
         nearer = nearer + (1.0 - nearer[:, 3:]) * part
         colors[alive] = nearer
         on = ((samples.count == most) & (nearer[:, 3] < 1.0 - UNSEEN)).nonzero()[:, 0]

@@ -30,13 +30,8 @@ def build_cells(
     rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
 ) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
     """The corner, index and roots of one frame's `avatar.cells.WarpCells`."""
-    lanes = np.zeros((24, LANES), dtype=np.float32)
-    lanes[:, :12] = bones
-    transforms = np.zeros((*rig.weights.shape[:3], LANES), dtype=np.float32)
-    blend_nodes(*rig.near_nodes(band_m + REACH_M), lanes, transforms.reshape(-1, LANES))
+    volume = posed_volume(rig, bones, band_m + REACH_M)
     extent = rig.box_high - rig.box_low
-    last = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
-    volume = transforms, rig.box_low, last / extent
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
     room = np.empty(LANES + 15, dtype=np.float32)
     pose_seeds(*volume, rig.seeds, posed, inverses, room)
@@ -60,6 +55,21 @@ def build_cells(
             chains, following, _, warps, bent = found
             return low, index, gather(chains, following, warps, bent, index.reshape(-1))
         capacity = count
+
+
+def posed_volume(
+    rig: Rig, bones: Float32[np.ndarray, "24 12"], reach_m: float
+) -> tuple[Float32[np.ndarray, "x y z lanes"], Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]]:
+    """Blended transforms on the nodes of the weight volume, where these lie, and nodes per metre.
+
+    Nodes farther from the skin than `reach_m` are left at zero.
+    """
+    lanes = np.zeros((24, LANES), dtype=np.float32)
+    lanes[:, :12] = bones
+    transforms = np.zeros((*rig.weights.shape[:3], LANES), dtype=np.float32)
+    blend_nodes(*rig.near_nodes(reach_m), lanes, transforms.reshape(-1, LANES))
+    last = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
+    return transforms, rig.box_low, last / (rig.box_high - rig.box_low)
 
 
 @compile_kernel(**LEAN)

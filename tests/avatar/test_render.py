@@ -13,6 +13,7 @@ from avatar.config import TrainConfig
 from avatar.kernels.backend import Marching, Rays
 from avatar.prepare import BodyRays
 from avatar.render import UNSEEN, cell_tables, render
+from avatar.strays import Strays
 from avatar.trainer import Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
@@ -59,7 +60,10 @@ def decibels(a, b):
 
 
 def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
-    """Constant density σ and colour c: alpha = 1 - exp(-σ · step · samples), colour = c · alpha."""
+    """Constant density σ and colour c: alpha = 1 - exp(-σ · step · samples), colour = c · alpha.
+
+    Of samples that skinning carries to the ray: the others hold nothing.
+    """
     config = TrainConfig(levels=2, table_size=1 << 10, step_m=0.03)
     avatar = Trainer(rig, config, torch.device("cpu")).avatar
     weights, bias = avatar.field.layers[2:]
@@ -79,7 +83,10 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
     )
     how = Marching(config.step_m, np.inf, 512)
     tables = cell_tables(cells, torch.device("cpu"))
-    count = avatar.field.backend.march(batch, tables, avatar.rendering_grid(), how).count.numpy()
+    samples = avatar.field.backend.march(batch, tables, avatar.rendering_grid(), how)
+    strays = Strays.of(rig, pose.joint_rotations, cells, torch.device("cpu"))
+    rays_of_strays = torch.searchsorted(samples.first, strays.among(samples, batch), right=True) - 1
+    count = samples.count.numpy() - np.bincount(rays_of_strays, minlength=len(pixels))
     alpha = 1.0 - np.exp(-np.exp(1.5) * config.step_m * count.reshape(camera.size_px[::-1]))
     color = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 2.0])))
     assert alpha.max() > 0.5

@@ -14,8 +14,9 @@ from avatar.kernels.backend import Marching, Rays
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
 from avatar.prepare import BodyRays
-from avatar.render import cell_tables, render
+from avatar.render import EMPTY_LOG_DENSITY, cell_tables, render
 from avatar.skip import pruned, window
+from avatar.strays import Strays
 from capture.camera import Camera
 
 CPU = torch.device("cpu")
@@ -32,14 +33,21 @@ def rays_of(camera: Camera, world_from_body: np.ndarray) -> Rays:
     )
 
 
-def brute_force(avatar: Avatar, pose, camera, cells: WarpCells) -> np.ndarray:
-    """Every sample of every ray through the avatar's cells, summed in double precision."""
+def lattice_samples(avatar: Avatar, pose, camera, cells: WarpCells):
+    """Every sample of each ray through the cells, and which skinning carries elsewhere."""
     rays = rays_of(camera, avatar.rig.world_from_body(pose))
     how = Marching(avatar.step_m, math.inf, 1024)
     grid = avatar.rendering_grid()
     samples = avatar.field.backend.march(rays, cell_tables(cells, CPU), grid, how)
     assert int(samples.count.max()) < how.most
+    return samples, Strays.of(avatar.rig, pose.joint_rotations, cells, CPU).among(samples, rays)
+
+
+def brute_force(avatar: Avatar, pose, camera, cells: WarpCells) -> np.ndarray:
+    """All of them but those, summed in double precision."""
+    samples, strays = lattice_samples(avatar, pose, camera, cells)
     raw = avatar.field.forward(samples.points).raw.double()
+    raw[strays, 3] = EMPTY_LOG_DENSITY
     colors = reference.composite(raw, samples.first, samples.count, avatar.step_m)
     return colors.reshape(*camera.size_px[::-1], 4).numpy()
 
@@ -116,12 +124,13 @@ def test_clear_foggy_and_opaque_people_are_summed_as_exactly(altered, shot, log_
     expected = brute_force(person, pose, camera, cells)
     picture = render(person, pose, camera, cells=cells)
     assert np.abs(picture - expected).max() <= 1e-5
-    grid, step_m = person.rendering_grid(), person.step_m
-    through = math.exp(-math.exp(min(log_density, MAX_LOG_DENSITY)) * step_m)
-    rays = rays_of(camera, person.rig.world_from_body(pose))
-    how = Marching(step_m, math.inf, 1024)
-    count = person.field.backend.march(rays, cell_tables(cells, CPU), grid, how).count
-    alpha = 1.0 - through ** count.double().numpy().reshape(picture.shape[:2])
+    samples, strays = lattice_samples(person, pose, camera, cells)
+    there = torch.ones(len(samples.points))
+    there[strays] = 0.0
+    ray = torch.repeat_interleave(torch.arange(len(samples.count)), samples.count)
+    count = torch.bincount(ray, there, minlength=len(samples.count))
+    through = math.exp(-math.exp(min(log_density, MAX_LOG_DENSITY)) * person.step_m)
+    alpha = 1.0 - through ** count.numpy().reshape(picture.shape[:2])
     np.testing.assert_allclose(picture[..., 3], alpha, atol=1e-5)
 
 

@@ -1,0 +1,81 @@
+"""Samples that a warp cell invents: found where limbs fold, against skinning in plain torch."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.cells import WarpCells
+from avatar.kernels.backend import Marching, Rays
+from avatar.kernels.choice import backend_for
+from avatar.kernels.skin import skinned
+from avatar.occupancy import Occupancy
+from avatar.render import cell_tables
+from avatar.skip import pruned
+from avatar.strays import FAR_M, Strays
+
+CPU = torch.device("cpu")
+
+
+def folded() -> np.ndarray:
+    """Elbows bent by 140°, the arms along the body, a knee drawn up."""
+    rotations = np.zeros((23, 3))
+    rotations[15], rotations[16] = (0.0, 0.0, -1.2), (0.0, 0.0, 1.2)
+    rotations[17], rotations[18] = (0.0, -2.4, 0.0), (0.0, 2.4, 0.0)
+    rotations[0], rotations[3] = (-1.6, 0.0, 0.1), (2.2, 0.0, 0.0)
+    return rotations
+
+
+@pytest.fixture(scope="module")
+def seen(rig):
+    """Samples along 4,000 parallel rays through a folded body, and how far off each is carried."""
+    rotations, generator = folded(), torch.Generator().manual_seed(0)
+    grid = Occupancy(rig, CPU).grid
+    cells = pruned(WarpCells.of(rig, rotations), grid)
+    low = torch.from_numpy(cells.low)
+    size = torch.tensor(cells.index.shape) * cells.cell_m
+    origins = low + size * torch.rand(4000, 3, generator=generator)
+    origins[:, 2] = low[2] - 0.1
+    count = len(origins)
+    rays = Rays(
+        origins,
+        torch.tensor([0.0, 0.0, 1.0]).expand(count, 3).contiguous(),
+        torch.zeros(count, dtype=torch.int32),
+        torch.full((count,), 0.5),
+    )
+    samples, _ = backend_for(CPU).march_on(
+        rays, cell_tables(cells, CPU), grid, Marching(0.01, math.inf, 400)
+    )
+    bones = rig.body_from_canonical(rotations)[:, :3].reshape(24, 12)
+    nodes = (np.array(rig.weights.shape[:3]) - 1) / (rig.box_high - rig.box_low)
+    parts = rig.weights, rig.box_low, nodes.astype(np.float32), bones.astype(np.float32)
+    carried = skinned(samples.points, *(torch.from_numpy(part) for part in parts))
+    ray = torch.repeat_interleave(torch.arange(count), samples.count)
+    off = (carried - origins[ray])[:, :2].norm(dim=1)
+    strays = Strays.of(rig, rotations, cells, CPU)
+    return strays, samples, rays, off
+
+
+def test_strays_are_samples_that_skinning_carries_elsewhere(seen):
+    strays, samples, rays, off = seen
+    found = strays.among(samples, rays)
+    assert len(found) > 20
+    assert (off[found] > 0.99 * FAR_M).all()
+
+
+def test_nearly_every_sample_that_is_carried_far_is_found(seen):
+    """A warp may be right in all corners of its cell and wrong between them, but hardly ever."""
+    strays, samples, rays, off = seen
+    far = off > 2.0 * FAR_M
+    found = torch.zeros_like(far)
+    found[strays.among(samples, rays)] = True
+    assert (found & far).sum() > 0.98 * far.sum()
+
+
+def test_few_cells_are_doubtful_and_none_in_the_canonical_pose(rig, seen):
+    strays = seen[0]
+    assert 0 < strays.doubtful.sum() < 0.2 * len(strays.doubtful)
+    canonical = rig.canonical_rotations
+    cells = WarpCells.of(rig, canonical)
+    assert not Strays.of(rig, canonical, cells, CPU).doubtful.any()
