@@ -1,6 +1,9 @@
 """The commands. They know every stage; no stage knows a command."""
 
 import os
+import sys
+from pathlib import Path
+from types import TracebackType
 
 # Before anything imports torch: OpenMP threads that spin while they wait made two threads 4-15×
 # slower on a busy machine.
@@ -8,3 +11,17 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 # numpy's own BLAS spins, too: a second thread doubled the cost of a frame's warp, for nothing.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def _stopped(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    """Ctrl-C while a command still loads what it needs is no fault, and shows none."""
+    if issubclass(kind, KeyboardInterrupt):
+        print("stopped by Ctrl-C.", file=sys.stderr)  # noqa: T201 - no console is there yet
+    else:
+        sys.__excepthook__(kind, error, traceback)
+
+
+if Path(sys.argv[0]).name.startswith(("ia-", "-m")):  # a command, not somebody who imports one
+    sys.excepthook = _stopped

@@ -16,12 +16,13 @@ from apps.recording.recording import Recording
 from apps.solving.attempt import Attempt, attempted
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
-from apps.terminal.interrupt import asked_to_stop
+from apps.terminal.interrupt import asked_to_stop, nothing_to_save
 from apps.terminal.port import with_port
 from apps.terminal.whole import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 
+PROGRAM = "ia-ingest"
 SAME_JOINTS_M = 1e-3
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
@@ -36,8 +37,8 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     words = with_port(sys.argv[1:] if arguments is None else arguments, "--view", VIEW_PORT)
-    given = tyro.cli(IngestArguments, prog="ia-ingest", args=words)
-    return exit_code("ia-ingest", lambda: ingest(given, Console()))
+    given = tyro.cli(IngestArguments, prog=PROGRAM, args=words)
+    return exit_code(PROGRAM, lambda: ingest(given, Console()))
 
 
 def ingest(given: IngestArguments, console: Console) -> int:
@@ -71,21 +72,23 @@ def _learnt_and_delivered(
     started: float,
 ) -> int:
     """All that comes once the input was found good."""
-    with console.waiting("loading torch"):
-        from apps.learning.deliver import RunNote, deliver
-        from apps.learning.learn import Lesson
-        from apps.terminal.device import device_for
-        from apps.terminal.threads import use_threads
-        from avatar.kernels.choice import backend_for
+    with nothing_to_save(console, PROGRAM):
+        with console.waiting("loading torch"):
+            from apps.learning.deliver import RunNote, deliver
+            from apps.learning.learn import Lesson
+            from apps.terminal.device import device_for
+            from apps.terminal.threads import use_threads
+            from avatar.kernels.choice import backend_for
 
-        threads = use_threads(given.threads)
-    with console.waiting("compiling kernels (slow on the first run only)"):
-        backend_for(device_for(given.device))  # a bad --device is said here, too
+            threads = use_threads(given.threads)
+        with console.waiting("compiling kernels (slow on the first run only)"):
+            backend_for(device_for(given.device))  # a bad --device is said here, too
     if attempt is not None:
         recording = attempt.before(recording, console)
-    trainer, recall, notes = _trainer(given, recording, run, console)
-    _warm_up(trainer, console)
-    viewer = _viewer(given, recording, run, console)
+    with nothing_to_save(console, PROGRAM):
+        trainer, recall, notes = _trainer(given, recording, run, console)
+        _warm_up(trainer, console)
+        viewer = _viewer(given, recording, run, console)
     run.begin(resume=given.resume)
     try:
         with asked_to_stop(console) as stop:

@@ -1,5 +1,6 @@
 """What a command says while it works: a live line on a terminal, plain lines in a log."""
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,11 @@ class Console:
     def say(self, message: str) -> None:
         """A line."""
         self._rich.print(escape(message), highlight=False)
+
+    def say_last(self, message: str) -> None:
+        """A line, from wherever the command is; the terminal gets its cursor back."""
+        self._rich.show_cursor(True)
+        os.write(2, f"\n{message}\n".encode() if self.live else f"{message}\n".encode())
 
     def made(self, what: str, path: object) -> None:
         """A line that names a file that is there now."""

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.markup import escape
 
+from apps.terminal.interrupt import INTERRUPTED as INTERRUPTED
+from apps.terminal.interrupt import noted
 from capture.errors import BadInput
 
-DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """The disk, the quota, or the largest size that a file may have."""
@@ -37,6 +39,17 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
         program: The command's name, in front of the message.
         work: Returns its own exit code.
     """
+    with noted() as interrupted:
+        try:
+            return _exit_code(program, work)
+        except Exception:
+            if not interrupted.is_set():
+                raise
+    complain(program, "stopped by Ctrl-C.")
+    return INTERRUPTED
+
+
+def _exit_code(program: str, work: Callable[[], int]) -> int:
     try:
         return work()
     except Stop as end:

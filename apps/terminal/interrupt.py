@@ -1,11 +1,15 @@
 """Ctrl-C that lets the work be saved: the first asks to stop, the second stops."""
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from apps.terminal.console import Console
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ended."""
 
 
 @contextmanager
@@ -33,6 +37,55 @@ def asked_to_stop(
     before = signal.signal(signal.SIGINT, first)
     try:
         yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def nothing_to_save(console: Console, program: str) -> Iterator[None]:
+    """Ctrl-C ends the process where it stands.
+
+    For the time in which libraries are loaded, kernels compiled and trees searched by threads of
+    their own: there an exception in the main thread ends in others, or in a crash.
+
+    Args:
+        console: Gives the terminal back.
+        program: The command's name, in front of the message.
+    """
+
+    def leave(signal_number: int, frame: object) -> None:
+        console.say_last(f"{program}: stopped by Ctrl-C.")
+        os._exit(INTERRUPTED)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def noted() -> Iterator[threading.Event]:
+    """An event that is set by Ctrl-C, which raises KeyboardInterrupt as always.
+
+    What is being imported may turn that into an error of its own; the event still knows. Off the
+    main thread it is never set.
+    """
+    came = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+
+    def note(signal_number: int, frame: object) -> None:
+        came.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield came
     finally:
         signal.signal(signal.SIGINT, before)
 

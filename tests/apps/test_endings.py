@@ -3,6 +3,9 @@
 import errno
 import io
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +63,47 @@ def test_what_is_added_on_the_way_is_said(capsys):
 def test_our_own_faults_keep_their_traceback(error):
     with pytest.raises(type(error)):
         exit_code("ia-test", raising(error))
+
+
+def test_what_an_import_makes_of_ctrl_c_is_still_ctrl_c(capsys):
+    def half_imported():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+
+    before = signal.getsignal(signal.SIGINT)
+    assert exit_code("ia-test", half_imported) == 130
+    assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
+    """They would have a tree taken away from under them, and the process would crash."""
+    code = (
+        "import os, signal, threading, time\n"
+        "from apps.terminal.console import Console\n"
+        "from apps.terminal.interrupt import nothing_to_save\n"
+        "with nothing_to_save(Console(), 'ia-test'):\n"
+        "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(60)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50
+    )
+    assert done.returncode == 130
+    assert done.stderr == "ia-test: stopped by Ctrl-C.\n"
+
+
+@pytest.mark.parametrize(("name", "shown"), [("ia-play", False), ("mine.py", True)])
+def test_a_command_that_is_stopped_while_it_loads_shows_no_traceback(name, shown):
+    code = f"import sys; sys.argv = ['/bin/{name}']; import apps; raise KeyboardInterrupt"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50
+    )
+    assert ("Traceback" in done.stderr) is shown
+    assert done.returncode != 0
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
