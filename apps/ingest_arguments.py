@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from apps.learning.run_folder import RunFolder
 from apps.recording.recording import Recording, RecordingPaths
 from apps.solving.job import SolveJob
+from apps.terminal.whole import check_place
 from avatar.config import HOLD_EVERY
 from capture.camera_device import camera_address
 from capture.errors import BadInput
@@ -142,6 +143,8 @@ class IngestArguments:
             raise BadInput(f"--hold-out is {self.hold_out}; 0, or 2 and more, was expected.")
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
+        if self.json is not None:
+            check_place(self.json, "--json")
         if self.mask_invert and self.no_mask_invert:
             raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
 

@@ -1,17 +1,19 @@
 """ia-sample: films a synthetic person into a capture folder, with the truth beside it."""
 
-import errno
+import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
+from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apps.studio.writer import ShootConfig, shoot
-from capture.errors import BadInput
+from apps.terminal.console import Console
+from apps.terminal.exit_codes import DONE, exit_code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,34 +43,32 @@ class SampleConfig:
     """Replace a capture that is already there."""
 
 
-def main() -> None:
-    """The command."""
-    config = tyro.cli(SampleConfig, prog="ia-sample")
-    console = Console(stderr=True)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    config = tyro.cli(SampleConfig, prog="ia-sample", args=arguments)
+    return exit_code("ia-sample", lambda: _sample(config, Console()))
+
+
+def _sample(config: SampleConfig, console: Console) -> int:
     try:
-        _shoot_with_bar(config, console)
-    except BadInput as error:
-        console.print(f"[red]ia-sample:[/] {error}", highlight=False)
-        sys.exit(2)
-    except OSError as error:
-        console.print(f"[red]ia-sample:[/] {error}. Nothing was left behind.", highlight=False)
-        sys.exit(3 if error.errno in (errno.ENOSPC, errno.EDQUOT) else 2)
-    except KeyboardInterrupt:
-        console.print("[yellow]Stopped; nothing was left behind.[/]")
-        sys.exit(130)
-    out = config.out
-    console.print(f"Filmed {config.shoot.frames} frames into [bold]{out}[/]. Next:")
-    console.print(f"  ia-ingest {out}/video.mp4 --poses {out}/poses.npz", highlight=False)
+        _shoot_with_bar(config)
+    except (OSError, KeyboardInterrupt) as error:
+        error.add_note("Nothing was left behind.")
+        raise
+    video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
+    console.say(f"Filmed {config.shoot.frames} frames into {config.out}. Next:")
+    console.say(f"  ia-ingest {video} --poses {poses}")
+    return DONE
 
 
-def _shoot_with_bar(config: SampleConfig, console: Console) -> None:
+def _shoot_with_bar(config: SampleConfig) -> None:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bar:
         task = bar.add_task("Dressing the actor", total=None)
 
         def advance(done: int, total: int) -> None:
@@ -78,4 +78,4 @@ def _shoot_with_bar(config: SampleConfig, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from apps.terminal.whole import check_place
 from capture.errors import BadInput
 
 
@@ -71,6 +72,7 @@ class RunFolder:
             raise BadInput("--resume goes on with a run, --overwrite removes it: give one of them.")
         if self.path.exists() and not self.path.is_dir():
             raise BadInput(f"{self.path} is a file; --out names the folder that holds the run.")
+        check_place(self.path, "--out")
         if self.holds_a_run() and not (resume or overwrite):
             raise BadInput(
                 f"{self.path} already holds a run. Go on with it (--resume), replace it "

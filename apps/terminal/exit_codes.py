@@ -15,7 +15,9 @@ DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """The disk, the quota, or the largest size that a file may have."""
 FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-NO_PLACE = frozenset({errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST})
+NO_PLACE = frozenset(
+    {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
+)
 """Names that nothing can be read from or written to."""
 BUSY = ("out of memory", "busy or unavailable", "not enough memory")
 """What torch says of a device that cannot be used now."""

@@ -10,6 +10,25 @@ from pathlib import Path
 from capture.errors import BadInput
 
 
+def check_place(path: Path, flag: str) -> None:
+    """Whether something can be written there, asked before any work is done for it.
+
+    Args:
+        path: A file or a folder; it and folders above it need not be there yet.
+        flag: Which argument named it.
+
+    Raises:
+        BadInput: If that cannot be.
+    """
+    place = Path(os.path.abspath(path))
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if place.is_file() and place.absolute() != Path(os.path.abspath(path)):
+        raise BadInput(f"{flag} is {path}, but {place} is a file and holds nothing.")
+    if not os.access(place, os.W_OK):
+        raise BadInput(f"{flag} is {path}, but {place} cannot be written to. Name another place.")
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Gives a name to write to; the file takes its own name once the block is done.

@@ -16,7 +16,7 @@ from apps.learning.run_folder import RunFolder
 from apps.playing.background import background
 from apps.terminal.console import MOST_WARNINGS, Console
 from apps.terminal.exit_codes import Stop, exit_code
-from apps.terminal.whole import whole_file, whole_folder, write_text
+from apps.terminal.whole import check_place, whole_file, whole_folder, write_text
 from capture.errors import BadInput
 from capture.images import read_image
 
@@ -174,6 +174,22 @@ def test_figures_can_go_to_stdout_and_no_device_is_ever_replaced(capfd, tmp_path
         with pytest.raises(BadInput, match="device or a pipe"), whole_file(device):
             pass
     assert [file.name for file in tmp_path.iterdir()] == ["pipe.png"]
+
+
+def test_a_place_that_cannot_be_written_to_is_named_before_any_work(tmp_path):
+    check_place(tmp_path / "new" / "run", "--out")
+    (tmp_path / "report.json").write_text("{}")
+    check_place(tmp_path / "report.json", "--json")
+    with pytest.raises(BadInput, match=r"--out is .*report\.json is a file"):
+        check_place(tmp_path / "report.json" / "run", "--out")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_for_reading_alone_is_named_before_any_work(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(BadInput, match="cannot be written to"):
+        check_place(tmp_path / "new" / "run", "--out")
+    tmp_path.chmod(0o700)
 
 
 def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):

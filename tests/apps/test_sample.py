@@ -1,46 +1,47 @@
 import errno
-import sys
+import shlex
 
 import pytest
 
 from apps import sample
 
 
-def run(monkeypatch, *arguments):
+def run(*arguments):
     """Exit code of `ia-sample` with these arguments."""
-    monkeypatch.setattr(sys, "argv", ["ia-sample", *map(str, arguments)])
     try:
-        sample.main()
+        return sample.main([str(argument) for argument in arguments])
     except SystemExit as stop:
         return stop.code
-    return 0
 
 
-def test_it_films_and_says_what_comes_next(monkeypatch, tmp_path, capsys):
-    out = tmp_path / "c"
-    assert run(monkeypatch, out, "--frames", 2, "--size", 32, "--background", "plain") == 0
+def test_it_films_and_says_what_comes_next(tmp_path, capsys):
+    out = tmp_path / "my [c]" / ("long" * 30)
+    assert run(out, "--frames", 2, "--size", 32, "--background", "plain") == 0
     assert (out / "video.mp4").exists()
-    assert "ia-ingest" in capsys.readouterr().err
+    command = capsys.readouterr().err.splitlines()[-1]
+    assert shlex.split(command) == [
+        "ia-ingest", str(out / "video.mp4"), "--poses", str(out / "poses.npz")
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("option", "value"),
     [("--frames", "0"), ("--size", "3"), ("--fps", "nan"), ("--mask-noise-px", "-1")],
 )
-def test_numbers_out_of_range_are_named(monkeypatch, tmp_path, capsys, option, value):
-    assert run(monkeypatch, tmp_path / "c", option, value) == 2
+def test_numbers_out_of_range_are_named(tmp_path, capsys, option, value):
+    assert run(tmp_path / "c", option, value) == 2
     assert option in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_refused_with_advice(monkeypatch, tmp_path, capsys):
+def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
     (tmp_path / "poses.npz").write_bytes(b"")
-    assert run(monkeypatch, tmp_path, "--frames", 1, "--size", 32) == 2
+    assert run(tmp_path, "--frames", 1, "--size", 32) == 2
     assert "--overwrite" in " ".join(capsys.readouterr().err.split())
 
 
-def test_unknown_subjects_are_bad_input(monkeypatch, tmp_path):
-    assert run(monkeypatch, tmp_path / "c", "--subject", 3) == 2
+def test_unknown_subjects_are_bad_input(tmp_path):
+    assert run(tmp_path / "c", "--subject", 3) == 2
 
 
 @pytest.mark.parametrize(
@@ -56,4 +57,4 @@ def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
         raise error
 
     monkeypatch.setattr(sample, "shoot", fail)
-    assert run(monkeypatch, tmp_path / "c") == code
+    assert run(tmp_path / "c") == code
