@@ -13,10 +13,16 @@ from capture.frame import Frame
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.masks.files import Masks, same_shape
+from preprocess.masks.naming import rows_by_name
 from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
 from preprocess.pairing import row_by_order
 from preprocess.pose import BodyPose, Motion
+
+NEAR_S = 0.05
+"""A pose from farther away is no frame's own, however few poses there are."""
+FEWEST = 0.1
+"""Share of the frames, or of the poses, that must belong together by their times."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +167,9 @@ def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None
             )
         return lambda frame: rows.get(frame.index)
     if motion.times_s is not None:
-        return _row_by_time(motion.times_s)
+        row_of = _row_by_time(motion.times_s, _step_s(source))
+        _check_times(motion.times_s, source, row_of)
+        return lambda frame: row_of(frame.time_s)
     by_order = row_by_order(len(motion), source, "poses")
     return lambda frame: by_order(frame.index)
 
@@ -170,7 +178,8 @@ def check_masks(masks: Masks | None, source: Source) -> Callable[[int], int]:
     """Whether the masks fit the frames; returns the mask's row by the frame's number.
 
     Raises:
-        BadInput: If there are none, or not one per frame, or of another shape.
+        BadInput: If there are none, or of another shape, or not one per frame and their names do
+            not tell whose they are. What is returned raises it for frames without a mask.
     """
     if masks is None:
         if source.has_alpha:
@@ -185,7 +194,22 @@ def check_masks(masks: Masks | None, source: Source) -> Callable[[int], int]:
             f"{source.size_px[0]}x{source.size_px[1]}; expected the same shape. Was the video "
             "cropped or rotated?"
         )
+    if masks.names is not None and masks.count not in (source.frames_in_file, source.frame_count):
+        named = rows_by_name(masks.names, source)
+        if named is not None:
+            return _row_named(named, masks)
     return row_by_order(masks.count, source, f"masks in {masks.path}")
+
+
+def _row_named(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
+    """Rows of masks that belong to frames by their names, some of which have none."""
+
+    def row(index: int) -> int:
+        if index not in named:
+            raise BadInput(f"{masks.path} holds none for frame {index}")
+        return named[index]
+
+    return row
 
 
 def check_cameras(cameras: CameraTrack, source: Source) -> Callable[[int], int]:
@@ -207,19 +231,49 @@ def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
-def _row_by_time(times_s: Float[np.ndarray, "poses"]) -> Callable[[Frame], int | None]:
-    """The row nearest in time, if it is nearer than half the usual step."""
+def _step_s(source: Source) -> float | None:
+    """From one wanted frame to the next, as the container claims."""
+    if not source.duration_s or not source.frame_count:
+        return None
+    return source.duration_s / source.frame_count
+
+
+def _check_times(
+    times_s: Float[np.ndarray, "poses"], source: Source, row_of: Callable[[float], int | None]
+) -> None:
+    """Raises if hardly any frame has a pose at its time."""
+    step, count = _step_s(source), source.frame_count
+    if step is None or count is None:
+        return
+    start = source.selection.start * step / source.selection.step
+    found = {row_of(start + step * number) for number in range(count)} - {None}
+    most = min(count, len(times_s))
+    if len(found) < max(min(2, most), FEWEST * most):
+        known = times_s[np.isfinite(times_s)]
+        said = f"{known.min():.6g} to {known.max():.6g} s" if len(known) else "unknown times"
+        raise BadInput(
+            f"The poses are those of {said}, the frames of {source.path} those of {start:.3g} to "
+            f"{start + step * count:.3g} s; `time` was expected in seconds since the video's first "
+            "frame. Is it in milliseconds, or by another clock?"
+        )
+
+
+def _row_by_time(
+    times_s: Float[np.ndarray, "poses"], frame_step_s: float | None
+) -> Callable[[float], int | None]:
+    """The row nearest to a time, if it is nearer than half the usual step, and near at all."""
     finite = np.flatnonzero(np.isfinite(times_s))
     rows = finite[np.argsort(times_s[finite], kind="stable")]
     times = times_s[rows]
     steps = np.diff(times)
     reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
+    reach = min(reach, max(NEAR_S, 0.5 * (frame_step_s or 0.0)))
 
-    def row(frame: Frame) -> int | None:
-        place = int(np.searchsorted(times, frame.time_s))
+    def row(time_s: float) -> int | None:
+        place = int(np.searchsorted(times, time_s))
         around = range(max(0, place - 1), min(len(times), place + 1))
-        nearest = min(around, key=lambda i: abs(times[i] - frame.time_s), default=None)
-        if nearest is None or abs(times[nearest] - frame.time_s) > reach + 1e-6:
+        nearest = min(around, key=lambda i: abs(times[i] - time_s), default=None)
+        if nearest is None or abs(times[nearest] - time_s) > reach + 1e-6:
             return None
         return int(rows[nearest])
 

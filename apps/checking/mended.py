@@ -125,10 +125,14 @@ def _write_masks(examined: Examined, healed: Claim, folder: Path) -> None:
         return
     (folder / "masks").mkdir()
     for row in range(masks.count):
-        alpha = masks.alpha(row, masks.size_px)
+        try:
+            alpha = masks.alpha(row, masks.size_px)
+        except BadInput:  # one of many; its frame will be without
+            continue
         alpha = np.float32(1.0) - alpha if healed.inverted else alpha
         _, code = cv2.imencode(".png", (alpha * 255.0 + 0.5).astype(np.uint8))
-        (folder / "masks" / f"{row:06d}.png").write_bytes(code.tobytes())
+        name = f"{row:06d}" if masks.names is None else masks.names[row]
+        (folder / "masks" / f"{name}.png").write_bytes(code.tobytes())
 
 
 def _write_cameras(claim: Claim, path: Path) -> None:

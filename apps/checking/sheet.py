@@ -70,7 +70,8 @@ def _row(
     cells = [_cell(frame, witness, claim, evidence) for frame, witness in shown]
     label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER, np.uint8)
     scores = [evidence.score(claim, witness) for _, witness in shown]
-    _write(label, f"{title}: agreement {np.nanmean(scores):.2f}", 6)
+    known = [score for score in scores if np.isfinite(score)]
+    _write(label, f"{title}: agreement {np.mean(known) if known else 0.0:.2f}", 6)
     return np.concatenate([label, np.concatenate(cells, axis=1)])
 
 

@@ -10,6 +10,9 @@ from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.pose import Motion
 
+SPARSEST = 6.0
+"""Frames from one pose to the next beyond which those between have none."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Claim:
@@ -50,7 +53,7 @@ class Claim:
 
     def row_of(self, frame: int) -> int | None:
         """The valid row that is nearest to a frame, if it is near enough to be its own."""
-        reach = 0.5 * max(1.0, step_of(self.places)) + 1e-6
+        reach = 0.5 * min(max(1.0, step_of(self.places)), SPARSEST) + 1e-6
         away = np.where(self.motion.valid, np.abs(self.places - frame), np.inf)
         row = int(np.argmin(away))
         return row if away[row] <= reach else None

@@ -34,10 +34,11 @@ class Cure:
 
 def shifted(frames: int) -> Cure:
     """Poses that come too late (positive) or too early by some frames."""
-    late = "late" if frames > 0 else "early"
+    late, other = ("late", "early") if frames > 0 else ("early", "late")
     return Cure(
         cause="frame_offset",
-        words=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late}",
+        words=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late} "
+        f"(or the masks too {other})",
         undo=lambda c: replace(c, places=c.places - frames),
     )
 
@@ -56,6 +57,27 @@ def refocused(factor: float) -> Cure:
         words=f"the focal length is too {wrong}; {factor:.3f} times fits",
         undo=undo,
         factor=factor,
+    )
+
+
+def recentred(right_px: float, down_px: float) -> Cure:
+    """Principal points that are so many pixels too far left and up (negative: right and down)."""
+
+    def undo(claim: Claim) -> Claim:
+        intrinsics = claim.intrinsics.copy()
+        intrinsics[:, :2, 2] += np.array([right_px, down_px])
+        return replace(claim, intrinsics=intrinsics)
+
+    sides = (
+        f"{abs(right_px):.0f} px too far {'left' if right_px > 0.0 else 'right'}",
+        f"{abs(down_px):.0f} px too far {'up' if down_px > 0.0 else 'down'}",
+    )
+    told = [s for s, px in zip(sides, (right_px, down_px), strict=True) if abs(px) >= 1.0]
+    return Cure(
+        cause="focal",
+        words=f"the principal point is {' and '.join(told) or 'elsewhere'}; was the video cropped "
+        "after its poses or its camera were made?",
+        undo=undo,
     )
 
 

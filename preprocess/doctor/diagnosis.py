@@ -10,7 +10,8 @@ from preprocess.doctor.claim import Claim
 from preprocess.doctor.cure import CAUSES, Cure, refocused, rescaled, shifted
 from preprocess.doctor.evidence import Evidence
 from preprocess.doctor.mistakes import cures
-from preprocess.doctor.view import standing
+from preprocess.doctor.soundness import jumps
+from preprocess.doctor.view import centring, standing
 
 GOOD, USABLE = 0.7, 0.5
 """Agreement from which a capture is well, and below which nothing can be learnt from it."""
@@ -24,6 +25,8 @@ FITTED_GAIN, FITTED_CHANGE = 0.04, 0.06
 FITTED = ("focal", "body_scale")
 CERTAIN = 3.0
 """By how many standard errors, over the frames, a gain must be above nothing."""
+LOST = 0.3
+"""Share of the frames with poses that a cure may leave without one before they count as missed."""
 MOST_CURES = 3
 QUICK = 6
 """Frames of the first look; guesses among the best `KEPT` there are looked at in all frames."""
@@ -79,9 +82,17 @@ def diagnose(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
     """
     first = evidence.scores(claim)
     named, healed, tried = _mended(claim, evidence, frames)
-    if mean(evidence.scores(healed)) < DOUBTFUL and (found := standing(claim, evidence)):
+    for sought in (centring,) if jumps(claim)[0] else (centring, standing):
+        so_far = mean(evidence.scores(healed))
+        if so_far >= DOUBTFUL or evidence.boxes:
+            break
+        found = sought(claim, evidence)
+        if found is None:
+            continue
         others, better, _ = _mended(found.undo(claim), evidence, frames)
-        if mean(evidence.scores(better)) > max(USABLE, mean(evidence.scores(healed)) + SURER):
+        least, scores = GOOD if sought is centring else USABLE, evidence.scores(better)
+        gained = mean(scores) > max(least, so_far + SURER)
+        if gained and np.nanpercentile(scores, 10) > USABLE:  # or it is a bargain between two
             named, healed = [found, *others], better
             tried = _best_of_each_cause([*tried, *_looked_at([found], claim, evidence)])
     return Diagnosis(
@@ -172,6 +183,8 @@ def _nearer_shifts(shifts: list[Tried], claim: Claim) -> list[Cure]:
 
 def _fitted(claim: Claim, evidence: Evidence) -> list[Cure]:
     """The focal length and the size that fit best, one at a time."""
+    if evidence.boxes:
+        return []
     pelvis = evidence.skin.shaped.joints[0]
     return [fit_factor(_maker(cause, pelvis), claim, evidence) for cause in FITTED]
 
@@ -214,6 +227,9 @@ def _best_of_each_cause(guesses: list[Tried]) -> tuple[Tried, ...]:
 def _is_worth_it(guess: Tried, claim: Claim, scores: Float[np.ndarray, "witnesses"]) -> bool:
     """Whether a guess wins enough, in frame after frame."""
     gains = guess.scores - np.nan_to_num(scores)
+    had, lost = np.isfinite(scores), np.isfinite(scores) & ~np.isfinite(guess.scores)
+    if lost.sum() > LOST * had.sum():  # it explains the rest, and gives these away
+        gains = np.where(lost, -np.nan_to_num(scores), gains)
     gains = gains[np.isfinite(gains)]
     if 2 * len(gains) < len(scores):
         return False

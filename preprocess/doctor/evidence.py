@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from capture.errors import BadInput
 from capture.frame import Frame
@@ -21,6 +21,8 @@ FRAMES = 16
 """How many frames are looked at."""
 FIRST_LOOK_PX = 256.0
 """Longer side of the masks in which the person's height is measured."""
+BOX = 0.95
+"""Share of its bounding box that no person's outline fills."""
 MOST_KEPT = 256
 """Posed skins that are kept: 25 MB."""
 
@@ -47,10 +49,12 @@ class Evidence:
     Attributes:
         witnesses: In the frames' order; all masks are of one size.
         skin: The person whose silhouette is held against them.
+        refused: Why masks that were looked at cannot be used.
     """
 
     witnesses: tuple[Witness, ...]
     skin: SkinPoints
+    refused: tuple[str, ...] = ()
     _posed: dict[tuple[Motion, int], Float32[np.ndarray, "points 3"]] = field(default_factory=dict)
 
     @property
@@ -58,6 +62,11 @@ class Evidence:
         """Width and height of the small masks."""
         height, width = self.witnesses[0].alpha.shape
         return int(width), int(height)
+
+    @property
+    def boxes(self) -> bool:
+        """Whether the masks are boxes around the person, which say nothing of its size."""
+        return float(np.median([_filled(w.alpha > 0.5) for w in self.witnesses])) > BOX
 
     def some(self, count: int) -> "Evidence":
         """Every so many-th of the frames."""
@@ -84,6 +93,14 @@ class Evidence:
                 self._posed.clear()
             self._posed[motion, row] = self.skin.posed(motion[row])
         return self._posed[motion, row]
+
+
+def _filled(alpha: Bool[np.ndarray, "height width"]) -> float:
+    """Share of its bounding box that a mask covers."""
+    rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
+    if not len(rows):
+        return 0.0
+    return float(alpha[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean())
 
 
 def spread(total: int, count: int) -> list[int]:
@@ -123,9 +140,9 @@ def gather(
     full = source.size_px
     size_px = _fitted(full, FIRST_LOOK_PX)
     if masks is None:
-        found = _from_pictures(source, frames, size_px)
+        found, refused = _from_pictures(source, frames, size_px), []
     else:
-        found = _from_masks(masks, frames, mask_row, size_px)
+        found, refused = _from_masks(masks, frames, mask_row, size_px)
     found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
     if not found:
         raise BadInput(f"None of the masks of {len(frames)} frames of {source.path} shows anybody.")
@@ -138,19 +155,21 @@ def gather(
             for index, alpha in found
         ),
         skin=skin,
+        refused=tuple(refused),
     )
 
 
 def _from_masks(
     masks: Masks, frames: Sequence[int], row: Callable[[int], int], size_px: tuple[int, int]
-) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
-    found = []
+) -> tuple[list[tuple[int, Float32[np.ndarray, "_ _"]]], list[str]]:
+    """Those of the masks that can be used, and why others cannot."""
+    found, refused = [], []
     for index in frames:
         try:
             found.append((index, masks.alpha(row(index), size_px)))
-        except BadInput:  # one of many; that it is missing is said elsewhere
-            continue
-    return found
+        except BadInput as cause:
+            refused.append(str(cause))
+    return found, refused
 
 
 def _from_pictures(

@@ -34,6 +34,7 @@ def unsound(
         height_px: Of the pictures.
     """
     yield from _gaps(claim, frames)
+    yield from _times(claim, frames)
     yield from _ranges(claim)
     yield from _jumps(claim)
     seen = views(claim)
@@ -43,6 +44,7 @@ def unsound(
             "does not see cannot be learnt. Turn round once."
         )
     if evidence is not None:
+        yield from _unusable(evidence)
         yield from _framing(evidence, height_px)
 
 
@@ -66,6 +68,24 @@ def _gaps(claim: Claim, frames: list[int]) -> Iterator[str]:
         yield f"{len(bare)} of {len(frames)} frames have no pose{_named(bare)}."
 
 
+def _times(claim: Claim, frames: list[int]) -> Iterator[str]:
+    """Whether the poses' times are the video's."""
+    times = claim.motion.times_s
+    known = np.isfinite(claim.places)
+    if times is None or claim.motion.frames is not None or not known.any():
+        return
+    inside = (claim.places[known] >= frames[0] - 0.5) & (claim.places[known] <= frames[-1] + 0.5)
+    last = int(np.argmax(np.where(known, np.abs(times), 0.0)))
+    if inside.mean() >= 0.5 or claim.places[last] == 0.0:
+        return
+    seconds = times[last] / claim.places[last]
+    yield (
+        f"The poses' times run from {times[known].min():.6g} to {times[known].max():.6g} s, the "
+        f"frames' from {seconds * frames[0]:.3g} to {seconds * frames[-1]:.3g} s; `time` is in "
+        "seconds since the video's first frame. Milliseconds, or another clock?"
+    )
+
+
 def _ranges(claim: Claim) -> Iterator[str]:
     motion = claim.motion
     places = motion.root_translations[motion.valid]
@@ -84,28 +104,51 @@ def _ranges(claim: Claim) -> Iterator[str]:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
 
 
-def _jumps(claim: Claim) -> Iterator[str]:
-    """Steps that are far larger than the others."""
+def jumps(claim: Claim) -> tuple[list[int], float]:
+    """Frames before which there is a step far larger than the others; share of poses that rest."""
     motion = claim.motion
     if motion.valid.sum() < 3:
-        return
+        return [], 0.0
     rows = np.flatnonzero(motion.valid)
     rows = rows[np.argsort(claim.places[rows], kind="stable")]
     near = np.diff(claim.places[rows]) <= 1.5 * step_of(claim.places)
     moved = np.linalg.norm(np.diff(motion.root_translations[rows], axis=0), axis=1)
     roots = Rotation.from_rotvec(motion.root_rotations[rows])
     turned = (roots[:-1].inv() * roots[1:]).magnitude()
-    jumps = near & (_outliers(moved, JUMP_M) | _outliers(turned, JUMP_RAD))
-    if jumps.any():
-        after = [int(claim.places[row]) for row in rows[1:][jumps]]
-        yield f"The poses jump {len(after)} times{_named(after)}. Did the tracker change persons?"
+    jumped = near & (_outliers(moved, JUMP_M) | _outliers(turned, JUMP_RAD))
     still = near & (moved == 0.0) & (turned == 0.0)
-    if near.any() and still.sum() > 0.2 * near.sum():
-        yield f"{still.sum() / near.sum():.0%} of the poses are the same as the one before."
+    after = [int(claim.places[row]) for row in rows[1:][jumped]]
+    return after, float(still.sum() / max(1, near.sum()))
+
+
+def _jumps(claim: Claim) -> Iterator[str]:
+    """What those steps are called."""
+    after, still = jumps(claim)
+    if after:
+        times = "once" if len(after) == 1 else f"{len(after)} times"
+        yield f"The poses jump {times}{_named(after)}. Did the tracker change persons?"
+    if still > 0.2:
+        yield f"{still:.0%} of the poses are the same as the one before."
 
 
 def _outliers(steps: Float[np.ndarray, "steps"], least: float) -> Bool[np.ndarray, "steps"]:
     return (steps > least) & (steps > JUMPS * np.median(steps))
+
+
+def _unusable(evidence: Evidence) -> Iterator[str]:
+    """Masks that cannot be used, or are no outlines."""
+    looked = len(evidence.refused) + len(evidence.witnesses)
+    if evidence.refused:
+        first = evidence.refused[0].rstrip(".")
+        yield (
+            f"{len(evidence.refused)} of {looked} masks that were looked at cannot be used, and "
+            f"their frames are left out ({first})."
+        )
+    if evidence.boxes:
+        yield (
+            "The masks are boxes, not outlines: all that is in them will be learnt as the person. "
+            "Leave them out (--masks segmenter:grabcut), or give a segmenter's."
+        )
 
 
 def _framing(evidence: Evidence, height_px: int) -> Iterator[str]:

@@ -8,11 +8,13 @@ from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from preprocess.doctor.claim import Claim
-from preprocess.doctor.cure import Cure
+from preprocess.doctor.cure import Cure, recentred
 from preprocess.doctor.evidence import Evidence
 from preprocess.silhouette import agreement, silhouette
 
 FRAMES = 6
+MOST_CROPPED = 0.45
+"""Share of a picture's sides by which its principal point may be off."""
 YAWS = 24
 UPS = {"y": np.diag([1.0, -1.0, -1.0]), "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
 """Level OpenCV cameras in worlds with y or z up."""
@@ -28,6 +30,12 @@ class _Scene:
 
     claim: Claim
     evidence: Evidence
+
+    @cached_property
+    def camera_rows(self) -> list[int]:
+        """The camera of each of the bodies."""
+        witnesses = self.evidence.witnesses
+        return [w.camera_row for w in witnesses if self.claim.row_of(w.index) is not None]
 
     @cached_property
     def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "_ _"]]]:
@@ -63,6 +71,28 @@ class _Scene:
             extrinsic[:2, 3] += off * far / np.array(camera.focal_px)
             extrinsic[2, 3] = far - depth
         return extrinsic
+
+
+def centring(claim: Claim, evidence: Evidence) -> Cure | None:
+    """The principal point with which bodies are where the masks are.
+
+    None if no mask has a pose, or they are so far apart that no cropping explains it.
+    """
+    scene = _Scene(claim=claim, evidence=evidence.some(FRAMES))
+    if not scene.bodies:
+        return None
+    small = np.array(evidence.size_px) / np.array(claim.size_px)
+    wanted = np.stack([_box(alpha) for _, alpha in scene.bodies])
+    drawn = np.stack(
+        [
+            _bounds(claim.camera(row, evidence.size_px).project(points[::8]))
+            for (points, _), row in zip(scene.bodies, scene.camera_rows, strict=True)
+        ]
+    )
+    away = np.median(wanted - drawn, axis=0)
+    right, down = 0.5 * (away[:2] + away[2:]) / small
+    near = bool((np.abs([right, down]) < MOST_CROPPED * np.array(claim.size_px)).all())
+    return recentred(float(right), float(down)) if near else None
 
 
 def standing(claim: Claim, evidence: Evidence) -> Cure | None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float32, Shaped
 from PIL import Image, ImageOps
 
 from capture.errors import BadInput
@@ -13,6 +13,7 @@ from capture.images import IMAGE_SUFFIXES, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
 from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
+from preprocess.masks.polarity import is_turned, show_background
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content
 
@@ -37,6 +38,7 @@ class Masks:
         count: How many there are.
         size_px: Width and height of the first.
         inverted: Whether the files hold the background, and are turned here.
+        names: Of a folder's files, without their endings; None where there is only an order.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class Masks:
         read: Reader,
         *,
         invert: bool | None,
+        names: tuple[str, ...] | None = None,
     ) -> None:
         """Looks at a few of the masks that `read` gives as they are stored.
 
@@ -54,18 +57,21 @@ class Masks:
         """
         self.path = path
         self.count = count
+        self.names = names
         self._read = read
+        self._doubts = invert is None
         rows = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
-        self.inverted = _show_background(samples, path) if invert is None else invert
+        self.inverted = show_background(samples, path) if invert is None else invert
 
     def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         """The mask in one row, scaled to a picture's size.
 
         Raises:
-            BadInput: If it cannot be read or is not of the picture's shape.
+            BadInput: If it cannot be read, is not of the picture's shape, or is the other way round
+                than most (nobody having said which way they are).
         """
         stored = self._read(row)
         height, width = stored.shape
@@ -80,7 +86,13 @@ class Masks:
             stored = cv2.resize(
                 stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             )
-        return np.float32(1.0) - stored if self.inverted else stored
+        alpha = np.float32(1.0) - stored if self.inverted else stored
+        if self._doubts and is_turned(alpha):
+            raise BadInput(
+                f"mask {row} in {self.path} covers most of the picture and of its rim, unlike the "
+                "others; is it the wrong way round?"
+            )
+        return alpha
 
 
 def open_masks(path: Path, *, invert: bool | None = None, person: str | None = None) -> Masks:
@@ -97,7 +109,9 @@ def open_masks(path: Path, *, invert: bool | None = None, person: str | None = N
     """
     if not path.exists():
         raise BadInput(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
-    count, read = _folder_of_masks(path) if path.is_dir() else _file_of_masks(path, person)
+    if path.is_dir():
+        return _folder_of_masks(path, invert)
+    count, read = _file_of_masks(path, person)
     return Masks(path, count, read, invert=invert)
 
 
@@ -111,13 +125,14 @@ def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
     )
 
 
-def _folder_of_masks(path: Path) -> tuple[int, Reader]:
+def _folder_of_masks(path: Path, invert: bool | None) -> Masks:
     suffixes = IMAGE_SUFFIXES | {".npy"}
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes]
     files = sorted((file for file in files if not file.name.startswith(".")), key=natural_key)
     if not files:
         raise BadInput(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
-    return len(files), lambda row: read_mask(files[row])
+    names = tuple(file.stem for file in files)
+    return Masks(path, len(files), lambda row: read_mask(files[row]), invert=invert, names=names)
 
 
 def masks_in_poses(path: Path, source: Source, *, person: str | None = None) -> Masks | None:
@@ -262,28 +277,3 @@ def _readable(read: Reader, rows: list[int]) -> list[Float32[np.ndarray, "height
     if not masks:
         raise refused[0]
     return masks
-
-
-def _show_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
-    """Whether masks are 1 where the person is not: on most of the picture and of its rim."""
-    shares = np.array([_shares(mask) for mask in samples])
-    told = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
-    if not len(told):
-        raise BadInput(
-            f"The masks in {path} show nothing: all {len(samples)} that were looked at are empty "
-            "or full. Expected the person at 255 and the rest at 0."
-        )
-    area, rim = told.mean(axis=0)
-    if (area > 0.5) != (rim > 0.5):
-        raise BadInput(
-            f"It cannot be seen which side of the masks in {path} is the person: they cover "
-            f"{area:.0%} of the pictures and {rim:.0%} of the rims. Say so with --mask-invert (the "
-            "person is 0) or --no-mask-invert (the person is 255)."
-        )
-    return bool(area > 0.5)
-
-
-def _shares(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
-    """How much of the picture, and of its rim, is covered."""
-    rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
-    return np.array([alpha.mean(), rim.mean()], dtype=np.float64)

@@ -184,12 +184,45 @@ def test_the_alpha_channel_of_the_pictures_serves_as_mask(tmp_path):
 
 def test_masks_must_be_one_per_frame_and_of_the_frames_shape(parts, images):
     source, _, cameras = parts()
-    (images / "masks" / "7.png").unlink()
+    stack = [open_masks(images / "masks").alpha(row, source.size_px) for row in range(7)]
+    np.savez(images / "short.npz", np.stack(stack))
     with pytest.raises(BadInput, match=rf"7 masks in .* {COUNT} frames"):
-        observe(source, moving(COUNT), open_masks(images / "masks"), cameras)
+        observe(source, moving(COUNT), open_masks(images / "short.npz"), cameras)
     np.savez(images / "turned.npz", np.rot90(cv2.imread(str(images / "masks/0.png"))[..., 0])[None])
     with pytest.raises(BadInput, match="64x48 px, the frames 48x64"):
         observe(source, moving(COUNT), open_masks(images / "turned.npz"), cameras)
+
+
+def test_frames_whose_mask_is_missing_are_left_out_where_names_tell(parts, images):
+    for number in (2, 7):
+        (images / "masks" / f"{number}.png").unlink()
+    source, masks, cameras = parts()
+    results = list(observe(source, moving(COUNT), masks, cameras))
+    reasons = {r.index: r.reason for r in results if isinstance(r, Dropped)}
+    assert set(reasons) == {2, 7}
+    assert "holds none for frame 2" in reasons[2]
+    seen = {r.frame.index: r.alpha.max() for r in results if isinstance(r, Observation)}
+    assert seen == {n: pytest.approx((200 + n) / 255) for n in (0, 1, 3, 4, 5, 6)}
+
+
+def test_masks_that_are_turned_among_others_are_left_out_and_obeyed_where_told(parts, images):
+    path = images / "masks" / "4.png"
+    cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    source, masks, cameras = parts()
+    results = list(observe(source, moving(COUNT), masks, cameras))
+    assert [r.index for r in results if isinstance(r, Dropped)] == [4]
+    assert "wrong way round" in results[4].reason
+    told = open_masks(images / "masks", invert=False)
+    assert not any(isinstance(r, Dropped) for r in observe(source, moving(COUNT), told, cameras))
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1000.0, 0.0), (1.0, 1.7e9), (1e-3, 0.0)])
+def test_times_by_another_clock_are_refused_and_never_taken_for_the_nearest(parts, scale, shift):
+    source, masks, cameras = parts(frames=slice(0, None))
+    times = np.arange(20) / 30 * scale + shift
+    motion = moving(20, times_s=times)
+    with pytest.raises(BadInput, match=r"frames of .* those of 0 to 0.267 s; .*milliseconds"):
+        observe(source, motion, masks, cameras)
 
 
 def test_moving_cameras_follow_their_frames(parts):
