@@ -8,6 +8,7 @@ import numpy as np
 from capture.errors import BadInput
 from capture.source import Source
 from preprocess.camera_file import CameraTrack, read_cameras
+from preprocess.cameras.colmap import find_model
 
 
 def upright_cameras(path: Path, source: Source) -> CameraTrack:
@@ -15,6 +16,9 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
 
     Cameras that were made for the pictures as they are stored are turned with them. Which they were
     made for, their width and height tell; where an .npz states none, their principal point does.
+    Photographs that hang upside down have one size either way: there COLMAP's cameras are known to
+    be those of the stored ones, as COLMAP leaves tags alone, and others are left as they are (so
+    are those of videos, as what takes videos apart turns their pictures).
 
     Args:
         path: See `read_cameras`.
@@ -24,7 +28,10 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
         BadInput: As `read_cameras`.
     """
     if source.quarter_turns % 2 == 0:
-        return read_cameras(path, source.size_px, None if source.live else source)
+        track = read_cameras(path, source.size_px, None if source.live else source)
+        of_colmap = find_model(path) if path.is_dir() else path.suffix in (".bin", ".txt")
+        hang = source.quarter_turns == 2 and source.path.is_dir()
+        return _turned(track, path, source) if hang and of_colmap else track
     width, height = source.size_px
     shown = _tried(path, (width, height), source)
     stored = _tried(path, (height, width), source)
@@ -34,6 +41,11 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
         if isinstance(shown, BadInput):
             raise shown
         return shown
+    return _turned(stored, path, source)
+
+
+def _turned(stored: CameraTrack, path: Path, source: Source) -> CameraTrack:
+    """Cameras of stored pictures, turned with them."""
     said = f"The cameras in {path.name} were turned with the pictures, by their rotation flag."
     return replace(
         stored,

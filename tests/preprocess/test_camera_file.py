@@ -183,6 +183,24 @@ def test_a_moving_camera_of_stored_pictures_turns_with_each(turned, tmp_path):
         np.testing.assert_allclose(upright.project(there), shown_at(100.0, 20.0, turned))
 
 
+@pytest.mark.parametrize("program", ["colmap", "other"])
+def test_of_photographs_upside_down_colmaps_cameras_are_those_of_the_stored(tmp_path, program):
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", STORED_PX).save(tmp_path / "images" / "0.jpg", exif=exif)
+    source = open_source(tmp_path / "images")
+    assert (source.size_px, source.quarter_turns) == (STORED_PX, 2)
+    np.savez(tmp_path / "c.npz", intrinsic=LYING, width=128, height=72)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 128 72 90 91 63 35\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 0.jpg\n\n")
+    path = tmp_path if program == "colmap" else tmp_path / "c.npz"
+    camera = upright_cameras(path, source)[0]
+    x, y = read_cameras(tmp_path / "c.npz", STORED_PX)[0].project(POINT)
+    wanted = [128 - x, 72 - y] if program == "colmap" else [x, y]
+    np.testing.assert_allclose(camera.project(POINT), wanted)
+
+
 def test_cameras_of_another_shape_are_refused_as_the_user_sees_the_pictures(turned, tmp_path):
     np.savez(tmp_path / "c.npz", intrinsic=LYING, width=100, height=100)
     with pytest.raises(BadInput, match="the video has 72x128"):
