@@ -72,6 +72,7 @@ class Motion:
         valid: Which rows may be used (finite, and not marked as lost by the tracker).
         betas: Shape coefficients; they mean something only to the body family named in `model`.
         model: Body family whose tracker made the poses: "smpl" or "body24".
+        model_said: Whether the file names that family; if not, it is a guess.
         frames: Index of the video frame that each row belongs to, if the file says so.
         times_s: Time of each row in seconds, if the file says so.
         intrinsic: The tracker's own camera matrix K, if the file holds one.
@@ -92,6 +93,7 @@ class Motion:
     valid: Bool[np.ndarray, "poses"]
     betas: Float[np.ndarray, "betas"]
     model: str
+    model_said: bool = True
     frames: Int[np.ndarray, "poses"] | None = None
     times_s: Float[np.ndarray, "poses"] | None = None
     intrinsic: Float[np.ndarray, "3 3"] | None = None

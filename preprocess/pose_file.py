@@ -87,6 +87,7 @@ def motion_of(arrays: Arrays, path: Path, *, default_model: str = "body24") -> M
         valid=_valid(arrays, np.column_stack([poses, translations]), times, path),
         betas=_betas(arrays, path),
         model=str(arrays["model"]) if "model" in arrays else default_model,
+        model_said="model" in arrays,
         frames=_frame_numbers(arrays, count, path),
         times_s=times,
         intrinsic=_intrinsic(arrays, path),

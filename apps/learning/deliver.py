@@ -1,7 +1,5 @@
 """What a run leaves on disk beside its package: report.json and report.html."""
 
-import resource
-import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -27,6 +25,7 @@ from apps.terminal.console import Console
 from apps.terminal.whole import write_text
 from avatar.hold import on_white, spread, truth_on_white
 from avatar.render import render
+from capture.memory import peak_memory_mb
 from export.build import ExportReport
 from export.player import Player
 
@@ -212,10 +211,5 @@ def _training_note(learnt: Learnt, note: RunNote) -> TrainingNote:
         rays=trainer.rays,
         rays_per_second=trainer.rays / max(trainer.wall_seconds, 1e-6),
         samples_per_ray=trainer.samples / max(trainer.rays, 1),
-        peak_memory_mb=_peak_memory_mb(),
+        peak_memory_mb=peak_memory_mb(),
     )
-
-
-def _peak_memory_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)

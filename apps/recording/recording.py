@@ -23,6 +23,7 @@ from preprocess.body_file import load_body
 from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.doctor.claim import Claim
+from preprocess.fit.family import with_family
 from preprocess.fit.growing import GrowingFit
 from preprocess.fit.refit import Refit
 from preprocess.focal import focal_from_masks
@@ -144,8 +145,10 @@ class Recording:
             cameras = upright_cameras(paths.cameras, source)
         else:
             cameras = default_cameras(motion, source.size_px)
+        given = paths.cameras is not None
+        motion = with_family(motion, body, cameras, source, masks, cameras_given=given)
         shaped = shaped_for(body, motion)
-        motion = placed(motion, shaped, cameras, cameras_given=paths.cameras is not None)
+        motion = placed(motion, shaped, cameras, cameras_given=given)
         if paths.cameras is None and motion.intrinsic is None and motion.lens is None:
             cameras = focal_from_masks(cameras, motion, shaped, source, masks)
         fit = person_of(

@@ -81,7 +81,7 @@ def fit_body(
         return BodyFit(shaped=shaped, motion=motion)
     if masks is None and not source.has_alpha:
         return BodyFit(shaped=shaped, motion=motion, words=UNFITTED)
-    evidence = _evidence(shaped, cameras, source, masks)
+    evidence = evidence_of(shaped, cameras, source, masks)
     if evidence is None:
         return BodyFit(shaped=shaped, motion=motion)
     claim = Claim.of(motion, cameras, source)
@@ -114,7 +114,7 @@ def fit_to_person(
     if same and not foreign:
         return BodyFit(shaped=person, motion=motion)
     masked = masks is not None or source.has_alpha
-    evidence = _evidence(person, cameras, source, masks) if masked else None
+    evidence = evidence_of(person, cameras, source, masks) if masked else None
     claim = Claim.of(motion, cameras, source)
     if not same and not (foreign and evidence is not None):
         motion = farther(claim, shaped, person)
@@ -160,7 +160,7 @@ def _compared(shaped: ShapedBody, person: ShapedBody) -> str:
     )
 
 
-def _evidence(
+def evidence_of(
     shaped: ShapedBody, cameras: CameraTrack, source: Source, masks: Masks | None
 ) -> Evidence | None:
     """A few masks; None where parts do not fit or show nobody, which is said elsewhere."""

@@ -12,12 +12,15 @@ def rows_by_name(names: Sequence[str], source: Source) -> dict[int, int] | None:
 
     In a folder of pictures a mask belongs to the picture of its name, or of its number. In a video
     numbers count the frames, from 0 if one is 0, from 1 if one is that of the last frame. Numbers
-    without a gap are the count of a few chosen frames, and say nothing.
+    without a gap are the count of a few chosen frames, and say nothing. Where half of the frames or
+    more would have no mask, somebody has chosen, and should say so.
 
     Args:
         names: Of the masks' files, without their endings.
         source: The frames.
     """
+    if 2 * len(names) <= source.frames_in_file:
+        return None
     if source.path.is_dir():
         pictures = [file.stem for file in list_images(source.path)]
         return _matched(names, pictures) or _matched(_numbers(names), _numbers(pictures))

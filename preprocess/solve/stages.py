@@ -1,14 +1,14 @@
 """A folder in which long work is done in stages: what is finished is not done again."""
 
 import json
-import resource
 import shutil
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, final
+
+from capture.memory import peak_memory_mb
 
 Told = Callable[[str, float], None]
 """Called now and then with a stage's name and how much of it is done, in [0, 1]."""
@@ -76,12 +76,6 @@ class Stages:
                 (cost["peak_memory_mb"] for cost in self.costs.values()), default=0.0
             ),
         }
-
-
-def peak_memory_mb() -> float:
-    """Of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
 def _removed(path: Path) -> None:

@@ -26,12 +26,13 @@ def film(tmp_path_factory) -> Path:
     [
         (["m_0", "m_1", "m_3"], {0: 0, 1: 1, 3: 2}),  # from 0
         (["000001", "000004", "000005"], {0: 0, 3: 1, 4: 2}),  # from 1: the last is there
-        (["a2_0000", "a2_0004"], {0: 0, 4: 1}),
+        (["a2_0000", "a2_0001", "a2_0004"], {0: 0, 1: 1, 4: 2}),
+        (["m_0", "m_4"], None),  # most would have none
         (["m_0", "m_1", "m_2"], None),  # the first three, or a few chosen ones
-        (["m_1", "m_3"], None),  # from 0 or from 1
-        (["m_0", "m_5"], None),  # of a longer film
-        (["m_0", "n_0"], None),
-        (["zero", "m_1"], None),
+        (["m_1", "m_2", "m_4"], None),  # from 0 or from 1
+        (["m_0", "m_1", "m_5"], None),  # of a longer film
+        (["m_0", "n_0", "m_3"], None),
+        (["zero", "m_1", "m_3"], None),
     ],
 )
 def test_numbers_count_the_frames_of_a_film_of_five(names, rows, film):

@@ -1,0 +1,22 @@
+"""Tests for the peak of memory: this process's own, whoever has started it."""
+
+import subprocess
+import sys
+
+from capture.memory import peak_memory_mb
+
+SAID = "from capture.memory import peak_memory_mb as p; {}; print(p())"
+
+
+def said(held: str) -> float:
+    command = [sys.executable, "-c", SAID.format(held)]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def test_what_was_held_is_counted_and_what_the_parent_holds_is_not():
+    before = said("pass")
+    block = bytearray(b"\1") * (200 << 20)
+    assert peak_memory_mb() > 200.0
+    assert abs(said("pass") - before) < 20.0
+    assert said("bytearray(b'x') * (200 << 20)") > before + 180.0
+    del block

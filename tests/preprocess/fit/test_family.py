@@ -1,0 +1,81 @@
+"""Tests for poses of which nobody says whose: the masks tell SMPL's from the embedded body's."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture.camera import Camera
+from capture.opening import open_source
+from preprocess.body_file import load_body
+from preprocess.camera_file import CameraTrack
+from preprocess.fit.family import with_family
+from preprocess.masks.files import open_masks
+from preprocess.pose import Motion
+from preprocess.shape import shaped_for
+from preprocess.silhouette import SkinPoints, silhouette
+
+SIZE, FRAMES = (96, 128), 6
+CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,
+                camera_from_world=np.eye(4))  # fmt: skip
+CAMERAS = CameraTrack(cameras=(CAMERA,), source="test")
+BETAS = np.array([-0.3, -0.5, 1.4, -1.2, -0.2, 2.5, -2.5, -0.9, 1.0, 2.6])
+
+
+def unnamed(model: str) -> Motion:
+    """Somebody of strong betas who turns half round."""
+    turns = np.linspace(0.0, np.pi, FRAMES) / 2.0
+    return Motion(
+        root_rotations=np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)]),
+        root_translations=np.array([[0.0, 0.1, 3.5]] * FRAMES),
+        joint_rotations=0.15
+        * np.random.default_rng(3).normal(size=(1, 23, 3))
+        * np.ones((6, 1, 1)),
+        valid=np.ones(FRAMES, dtype=bool),
+        betas=BETAS,
+        model=model,
+        model_said=False,
+    )
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """Masks of the person of a motion; SMPL's betas are unknown here: the mean shape is filmed."""
+
+    def make(motion: Motion) -> Path:
+        shaped = shaped_for(load_body(), motion)
+        skin = SkinPoints.of(shaped)
+        for folder in ("images", "masks"):
+            (tmp_path / folder).mkdir()
+        for row in range(FRAMES):
+            alpha = silhouette(skin.posed(motion[row]), CAMERA)
+            picture = (255.0 * np.asarray(alpha)).astype(np.uint8)
+            Image.fromarray(picture).save(tmp_path / "masks" / f"{row}.png")
+            Image.fromarray(picture).convert("RGB").save(tmp_path / "images" / f"{row}.png")
+        return tmp_path
+
+    return make
+
+
+@pytest.mark.parametrize("truth", ["smpl", "body24"])
+def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth):
+    folder = filmed(unnamed(truth))
+    source, masks = open_source(folder / "images"), open_masks(folder / "masks")
+    read = unnamed("body24")
+    found = with_family(read, load_body(), CAMERAS, source, masks, cameras_given=True)
+    assert found.model == truth
+    assert (found.note is not None) == (truth == "smpl")
+    if truth == "smpl":
+        assert "taken for SMPL's" in found.note
+
+
+def test_what_a_file_says_is_never_doubted_and_without_masks_nothing_is(filmed):
+    folder = filmed(unnamed("smpl"))
+    source, masks = open_source(folder / "images"), open_masks(folder / "masks")
+    said = replace(unnamed("body24"), model_said=True)
+    body = load_body()
+    assert with_family(said, body, CAMERAS, source, masks, cameras_given=True) is said
+    read = unnamed("body24")
+    assert with_family(read, body, CAMERAS, source, None, cameras_given=True) is read
