@@ -15,10 +15,12 @@ from export.initialisers import initialisers
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage, read_package
 from export.tables import BRICK, DEPTH_STEPS, LOG_DENSITY, SURFEL_BITS
-from export.web.runtime import MODULE, runtime_files
+from export.web.runtime import MODULE, SCRIPT, runtime_files
 from preprocess.pose import BodyPose
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
+PAGE_SCRIPT = "ort.js"
+"""Hosts such as nginx serve .mjs as a stream of bytes, which browsers do not run as a script."""
 NARROW = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
 """Element types that the page reads (arrays.js)."""
 CONSTANTS = {
@@ -106,6 +108,7 @@ def site(path: Path, clip: Clip, *, name: str, level: int = 6) -> dict[str, byte
         ],
     }
     draft.files["avatar.json"] = json.dumps(content, allow_nan=False).encode()
+    runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT)
     draft.files.update({f"runtime/{file}": held for file, held in runtime.items()})
     return {**page_files(), **draft.files}
 

@@ -190,6 +190,69 @@ def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
+def test_keys_turn_it_before_anything_was_clicked(page):
+    paused(page)
+    page.run("document.activeElement.blur()")
+    before = drawn(page)
+    for _ in range(3):
+        page.press("ArrowLeft")
+    until(lambda: not moves(page), 30.0)
+    assert (drawn(page) != before).mean() > 0.01
+    page.press("Home")
+    until(lambda: not moves(page), 30.0)
+    np.testing.assert_array_equal(drawn(page), before)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(640, 300), (390, 700)])
+def test_the_person_stands_above_the_bar_however_low_the_screen(page, size):
+    paused(page)
+    page.emulate(scheme="light", size=size)
+    try:
+        until(lambda: not moves(page), 30.0)
+        feet, bar = page.run(
+            """(() => {
+              const canvas = document.getElementById("picture");
+              const { width, height, clientHeight } = canvas;
+              const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+              let last = 0;
+              for (let i = 3; i < data.length; i += 4) if (data[i] > 127) last = i;
+              const row = Math.floor(last / 4 / width);
+              const bar = document.getElementById("bar").getBoundingClientRect();
+              return [(row / height) * clientHeight, bar.top];
+            })()"""
+        )
+    finally:
+        page.emulate(scheme="light", size=SIZE)
+    assert 0.5 * bar < feet < bar
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
+    far, near, beside = page.run(
+        """(async () => {
+          const { Orbit } = await import("./orbit.js");
+          const orbit = new Orbit(player.avatar.look), pose = player.pose(0);
+          const camera = () => orbit.camera(pose, 2000, 2000);
+          const width = () => player.drawable({ tier: "hq" }, pose, camera()).width;
+          const far = width();
+          orbit.nearer(100);
+          const near = width();
+          orbit.shift(0, -1e6, 2000, 2000);
+          return [far, near, width()];
+        })()"""
+    )
+    assert far == beside == 2000
+    assert 500 < near < 1800
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
 def test_a_gpu_that_goes_away_leaves_the_drawing_to_the_cpu(page):
     if not page.run("player.graphics.there"):
         pytest.skip("this Chromium has no WebGL2 with float targets")
@@ -272,6 +335,8 @@ def test_a_page_replaces_a_page_but_nothing_else(call_play, package, tmp_path):
         assert outcome.out.strip() == str(out)
     assert (out / "index.html").is_file()
     assert (out / "runtime" / "LICENSE").is_file()
+    assert (out / "runtime" / "ort.js").is_file()
+    assert not list(out.rglob("*.mjs"))  # which many hosts do not serve as a script
     other = tmp_path / "mine"
     other.mkdir()
     (other / "notes.txt").write_text("mine")

@@ -7,8 +7,7 @@ const KINDS = {
 
 /** One array. entry: {file, dtype, shape}. `arrived` hears how many packed bytes came. */
 export async function load(entry, arrived = () => {}) {
-  const answer = await fetch(new URL(entry.file, import.meta.url));
-  if (!answer.ok) throw new Error(`${entry.file} could not be loaded (${answer.status}).`);
+  const answer = await fetched(entry.file);
   const counted = new TransformStream({
     transform(chunk, out) { arrived(chunk.length); out.enqueue(chunk); },
   });
@@ -20,6 +19,14 @@ export async function load(entry, arrived = () => {}) {
     throw new Error(`${entry.file} is damaged: it holds ${planes.length} bytes.`);
   }
   return new Kind(interleaved(planes, Kind.BYTES_PER_ELEMENT).buffer);
+}
+
+/** A file beside the page. */
+export async function fetched(file) {
+  const gone = () => { throw new Error(`${file} could not be loaded: the server does not answer. Is it still running?`); };
+  const answer = await fetch(new URL(file, import.meta.url)).catch(gone);
+  if (!answer.ok) throw new Error(`${file} could not be loaded (${answer.status}): the page's folder is not whole.`);
+  return answer;
 }
 
 /** First bytes of all elements, then all second ones, … back to elements. */

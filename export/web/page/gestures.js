@@ -47,7 +47,8 @@ export function listen(canvas, orbit, changed) {
   }, { passive: false });
   canvas.addEventListener("dblclick", () => { orbit.reset(); changed(); });
 
-  canvas.addEventListener("keydown", (event) => {
+  document.addEventListener("keydown", (event) => {
+    if (event.target !== canvas && event.target !== document.body) return; // a slider has its own keys
     const act = {
       ArrowLeft: () => orbit.turn(STEP, 0), ArrowRight: () => orbit.turn(-STEP, 0),
       ArrowUp: () => orbit.turn(0, STEP), ArrowDown: () => orbit.turn(0, -STEP),

@@ -1,6 +1,6 @@
 // Runs the package's own ONNX graph in WebAssembly, one thread, away from the page.
 
-import { InferenceSession, Tensor, env } from "./runtime/ort.mjs";
+import { InferenceSession, Tensor, env } from "./runtime/ort.js";
 import { answer, arrived, preparing } from "./answering.js";
 import { load } from "./arrays.js";
 

@@ -7,6 +7,16 @@ const AWAY = 3.5; // how far the camera stands, in heights of the person
 const WIDEST = 1.3; // a narrow picture is treated as if it were this much wider than it is
 const MARGIN_M = 0.35; // nothing of the avatar is farther from every joint
 const NEAREST_M = 0.3;
+const ABOUT_M = 0.25; // a joint's own flesh
+const BAR_PX = 76; // the bar's height and the gap below it
+const LIFT = 0.035; // the person's middle is so much of the height above the picture's
+
+/** How much of a picture that many CSS pixels high the person takes, and how far up: above the bar. */
+export function roomIn(height) {
+  const bar = BAR_PX / Math.max(1, height);
+  const share = Math.max(0.3, Math.min(SHARE, 0.97 - bar));
+  return { share, lift: Math.max(LIFT, share / 2 - 0.5 + bar) };
+}
 
 export class Orbit {
   /** look: {axes: rows right, down, forward of the front view; pelvis; height_m; middle_m}. */
@@ -40,15 +50,15 @@ export class Orbit {
     return Math.max(NEAREST_M, (AWAY * this.look.height_m) / this.zoom);
   }
 
-  focal(width, height) {
-    return SHARE * AWAY * Math.min(height, WIDEST * width);
+  focal(width, height, share = SHARE) {
+    return AWAY * Math.min(share * height, SHARE * WIDEST * width);
   }
 
   /**
    * The camera for a pose: focal length, centre, size, and the rigid 3×4 camera-from-world.
-   * The person's middle is `lift` of the height above the picture's.
+   * The standing person takes `share` of the height, its middle is `lift` of it above the picture's.
    */
-  camera(pose, width, height, lift = 0) {
+  camera(pose, width, height, { share = SHARE, lift = 0 } = {}) {
     const { axes, pelvis, middle_m } = this.look;
     const front = [...axes[0], 0, ...axes[1], 0, ...axes[2], 0];
     const turned = product(rigid([this.pitch, 0, 0]), product(rigid([0, this.yaw, 0]), front));
@@ -56,9 +66,32 @@ export class Orbit {
     const back = moved(turned, middle);
     const place = [this.right, this.down, this.distance()];
     [3, 7, 11].forEach((entry, axis) => { turned[entry] = place[axis] - back[axis]; });
-    const focal = this.focal(width, height);
+    const focal = this.focal(width, height, share);
     return { focal: [focal, focal], center: [width / 2, (0.5 - lift) * height], width, height, cameraFromWorld: turned };
   }
+}
+
+/** The same camera for a picture that many times coarser. */
+export function coarser({ focal, center, width, height, cameraFromWorld }, times) {
+  const [wide, high] = [width, height].map((side) => Math.max(16, Math.ceil(side / times)));
+  const [x, y] = [wide / width, high / height];
+  return {
+    focal: [focal[0] * x, focal[1] * y], center: [center[0] * x, center[1] * y],
+    width: wide, height: high, cameraFromWorld,
+  };
+}
+
+/** The least depth at which something of the avatar may be in the picture. */
+export function nearestOf({ focal, center, width, height }, joints) {
+  let nearest = Infinity;
+  for (const [x, y, z] of joints) {
+    const far = z + ABOUT_M;
+    const right = (far * (width - center[0])) / focal[0], left = (-far * center[0]) / focal[0];
+    const low = (far * (height - center[1])) / focal[1], high = (-far * center[1]) / focal[1];
+    const beside = x - ABOUT_M > right || x + ABOUT_M < left || y - ABOUT_M > low || y + ABOUT_M < high;
+    if (far > 0 && !beside) nearest = Math.min(nearest, z - ABOUT_M);
+  }
+  return nearest;
 }
 
 /** The part of a camera's picture in which the avatar can be, from its joints in the camera's frame. */

@@ -9,6 +9,7 @@ const TIERS = { hq: "Full", lite: "Lite" };
 const ENGINES = { wasm: "CPU", webgl: "GPU" };
 const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
 const THEMES = { system: "System", light: "Light", dark: "Dark" };
+const SAID_MS = 6000;
 const $ = (id) => document.getElementById(id);
 
 export async function start() {
@@ -45,6 +46,7 @@ class Loading {
     this.bytes = 0;
     this.total = [avatar.runtime, graph, ...tables].reduce((sum, entry) => sum + entry.bytes, 0);
     $("status").hidden = false;
+    $("status").classList.remove("failed");
   }
 
   hear({ arrived, preparing }) {
@@ -56,6 +58,12 @@ class Loading {
 
   done() {
     $("status").hidden = true;
+  }
+
+  /** Something that was wished for cannot be; what is shown goes on. */
+  refused(message) {
+    this.failed(message);
+    setTimeout(() => { $("status").hidden = true; $("status").classList.remove("failed"); }, SAID_MS);
   }
 
   failed(message) {
@@ -105,7 +113,8 @@ function settings(player, state, show, loading) {
       show.changed();
       loading.done();
     } catch (error) {
-      loading.failed(error.message);
+      loading.refused(error.message);
+      for (const input of document.getElementsByName(`${key}s`)) input.checked = input.value === state[key];
     }
   };
   choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, change("tier"));

@@ -1,9 +1,9 @@
 // The avatar, its motion and whoever draws it, without the page around them.
 
-import { load } from "./arrays.js";
+import { fetched, load } from "./arrays.js";
 import { Engine, graphics } from "./engine.js";
 import { moved } from "./matrices.js";
-import { Orbit, windowOf } from "./orbit.js";
+import { Orbit, coarser, nearestOf, windowOf } from "./orbit.js";
 import { Skeleton, bones } from "./skeleton.js";
 
 const CLOSE = 2; // two pictures are alike where no premultiplied channel differs by more, in 1/255 …
@@ -14,9 +14,7 @@ const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-
 export class Player {
   /** heard: as of Engine. */
   static async load(heard) {
-    const answer = await fetch(new URL("./avatar.json", import.meta.url));
-    if (!answer.ok) throw new Error(`avatar.json could not be loaded (${answer.status}).`);
-    const avatar = await answer.json();
+    const avatar = await (await fetched("avatar.json")).json();
     return new Player(avatar, await load(avatar.motion.poses), heard);
   }
 
@@ -50,6 +48,16 @@ export class Player {
       console.warn("The GPU is not used:", error);
       return "wasm";
     }
+  }
+
+  /** The camera, with fewer pixels where surfels could not cover what is near (export/close_up.py). */
+  drawable({ tier }, pose, camera) {
+    const { rules, layout } = this.avatar.tiers[tier];
+    const seen = this.skeleton.posed(pose).joints.map((joint) => moved(camera.cameraFromWorld, joint));
+    const footprint = Math.max(...camera.focal) * layout.surfel_spacing_m * rules.footprint_spacings;
+    const nearest = Math.max(rules.nearest_m, nearestOf(camera, seen));
+    const times = footprint / nearest / (rules.largest_footprint_px - 1);
+    return times > 1 ? coarser(camera, times) : camera;
   }
 
   /** A pose seen by a camera: {x, y, width, height, rgba, ms}, the part where the avatar is; or null. */

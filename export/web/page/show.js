@@ -1,9 +1,10 @@
 // Draws as fast as it can while something moves, sharply once nothing does, and not at all after.
 
+import { roomIn } from "./orbit.js";
+
 const QUICK_MS = 45; // below this a moving picture may become sharper …
 const SLOW_MS = 75; // … and above this it becomes coarser
 const COARSEST = 270, SHARPEST = 1080; // shorter side, pixels
-const LIFT = 0.035; // the bar takes the lower end of the stage
 const STILL_MS = 180; // so long after the last movement the sharp picture is drawn
 
 export class Show {
@@ -93,10 +94,13 @@ export class Show {
     return [Math.max(16, Math.round(wide * scale)), Math.max(16, Math.round(high * scale))];
   }
 
-  async picture([width, height]) {
+  async picture([wide, high]) {
     const { player, orbit, state, row } = this;
     const pose = player.pose(row);
-    const part = await player.draw(state, pose, orbit.camera(pose, width, height, LIFT));
+    const room = roomIn(this.canvas.clientHeight); // the bar takes the lower end of the stage
+    const camera = player.drawable(state, pose, orbit.camera(pose, wide, high, room));
+    const { width, height } = camera;
+    const part = await player.draw(state, pose, camera);
     if (this.canvas.width !== width || this.canvas.height !== height) {
       Object.assign(this.canvas, { width, height });
     } else {

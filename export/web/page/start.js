@@ -9,8 +9,9 @@ function fail(message) {
 
 if (location.protocol === "file:") {
   fail("Browsers load this page from a web server only. Any will do, for example: python -m http.server in this folder.");
-} else if (typeof DecompressionStream === "undefined" || typeof WebAssembly === "undefined") {
-  fail("This browser is too old for the player: it needs WebAssembly and DecompressionStream (2023 or newer).");
+} else if (typeof DecompressionStream === "undefined" || typeof WebAssembly === "undefined" || !("popover" in HTMLElement.prototype)) {
+  fail("This browser is too old for the player: Chrome 114, Firefox 125, Safari 17 or newer can show it.");
+  document.getElementById("panel").hidden = true;
 } else {
   import("./page.js").then((page) => page.start()).catch((error) => fail(String((error && error.message) || error)));
 }
