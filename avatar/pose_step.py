@@ -43,6 +43,8 @@ def pose_step(
     loss: Float32[np.ndarray, "rays"],
     correction: Float[np.ndarray, "25 3"],
     common: float,
+    *,
+    overstep: float = OVERSTEP,
 ) -> PoseStep:
     """The step that brings a pose to where its rays fit, as far as they determine it.
 
@@ -50,7 +52,9 @@ def pose_step(
         gradients: Of each ray's loss for the correction.
         loss: Of each ray.
         correction: As it is; directions that the rays leave open go back to zero.
-        common: Mean evidence of all frames: they were tracked alike.
+        common: Mean evidence of all frames: they were tracked alike. Infinite where a pose is to
+            move in any case.
+        overstep: Length of the step, in Gauss-Newton's.
     """
     scale = np.full((25, 3), SPREAD_RAD, dtype=np.float32)
     scale[24] = SPREAD_M
@@ -66,7 +70,7 @@ def pose_step(
     evidence = float(np.mean(wish[told] ** 2 / (chance[told] + 1e-12))) if told.any() else 0.0
     share = min(max((0.5 * (evidence + common) - CHANCE) / (CERTAIN - CHANCE), 0.0), 1.0)
     back = prior * (axes.T @ (correction / scale).reshape(75))
-    asked = axes @ ((OVERSTEP * wish + back) / (determined + prior))
+    asked = axes @ ((overstep * wish + back) / (determined + prior))
     change = -share * scale * asked.reshape(25, 3).astype(np.float64)
     shortened = LONGEST / max(float(np.abs(change).max()), LONGEST)
     return PoseStep(shortened * change, evidence)

@@ -8,6 +8,7 @@ frames share is no error of a frame but a change of the canonical body, so the m
 taken out again and again.
 """
 
+import math
 from typing import final
 
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend import Skin
-from avatar.pose_step import CHANCE, pose_step
+from avatar.pose_step import CHANCE, OVERSTEP, pose_step
 from avatar.replay import RootCorrection
 from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
@@ -69,7 +70,7 @@ class PoseTable:
     """
 
     def __init__(
-        self, rig: Rig, capacity: int, device: torch.device, *, mean_pull: float = MEAN_PULL
+        self, rig: Rig, capacity: int, device: torch.device, *, frozen: bool = False
     ) -> None:
         """A table without poses.
 
@@ -77,11 +78,12 @@ class PoseTable:
             rig: Whose body.
             capacity: How many poses it may hold.
             device: Where gradients are gathered.
-            mean_pull: Share of the mean correction taken out at each correction; 0 where the
-                canonical body is known already.
+            frozen: Whether the avatar stays as it is, and only the poses are looked for: no pose
+                can blur it then, so all move, and no farther than their rays ask; and what they
+                share is no change of the canonical body.
         """
         self.rig = rig
-        self._mean_pull = mean_pull
+        self._mean_pull, self._overstep = (0.0, 1.0) if frozen else (MEAN_PULL, OVERSTEP)
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
@@ -100,7 +102,7 @@ class PoseTable:
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
         self._below = _subtrees(rig)
-        self._moving, self._evidence = 1.0, CHANCE
+        self._moving, self._evidence = 1.0, math.inf if frozen else CHANCE
         self._since = np.zeros(capacity, dtype=np.int64)
         self._judged, self._settled = np.zeros((2, capacity), dtype=bool)
         self._asked, self._told = np.zeros((2, capacity))
@@ -190,9 +192,12 @@ class PoseTable:
         if rows < ENOUGH_RAYS:
             return None
         loss = self._losses[slot, :rows].cpu().numpy()
-        step = pose_step(self.gradients(slot), loss, self.corrections[slot], self._evidence)
+        step = pose_step(
+            self.gradients(slot), loss, self.corrections[slot], self._evidence,
+            overstep=self._overstep,
+        )  # fmt: skip
         self._rays[slot] = 0
-        self._evidence += (1.0 - MEMORY) * (step.evidence - self._evidence)
+        self._evidence = MEMORY * self._evidence + (1.0 - MEMORY) * step.evidence
         if self._judged[slot]:
             self._asked[slot] += 1.0
             self._told[slot] += step.evidence

@@ -8,10 +8,6 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-import apps  # sets the commands' environment (threads that wait do not spin) before torch is there
-
-__all__ = ["ROOT", "Hardware", "apps"]
-
 ROOT = Path(__file__).resolve().parents[1]
 LIBRARIES = ("numpy", "numba", "torch", "onnxruntime")
 

@@ -222,6 +222,13 @@ def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_o
     assert torch.equal(table, learnt.trainer.avatar.field.table)
 
 
+def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
+    held = [HeldOut(observation=observation) for observation in clip.observations[9:12]]
+    given = [score(learnt.trainer.avatar, frame).psnr for frame in held]
+    fitted = [frame.psnr for frame in fitted_scores(learnt.trainer, held)]
+    assert all(after >= before for before, after in zip(given, fitted, strict=True))
+
+
 def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator):
     """Its rays pull no more; those of a frame that came later do."""
     table, pose = PoseTable(rig, 2, torch.device("cpu")), pose_of(bent_pose)
