@@ -14,7 +14,10 @@ surfaces are asked to be firm. Asked of twelve frames in exact poses it cost 0.5
 FEWEST, SCANTEST = 4.0, 1.5
 """Both count no further than to a quarter, and to two thirds."""
 FIRM_WEIGHT, SOLID_WEIGHT = 1.5, 0.15
-"""Of both terms, times the share by which frames are fewer than `SCANT_FRAMES`."""
+SOFT_WEIGHT, EVEN_WEIGHT, THIN_DENSITY = 0.15, 0.3, 180.0
+"""Of all five, times the share by which frames are fewer than `SCANT_FRAMES`."""
+STEEPEST = 4.0
+"""Logarithm of the density may change by so much along a finest cell, where that is asked."""
 Skipping = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
@@ -67,6 +70,15 @@ class TrainConfig:
     variation is asked for strongly, it keeps surfaces from becoming fog."""
     solid_weight: float = 0.0
     """Of the opacity deep under the body's skin, which must be solid; 0 turns the term off."""
+    soft_weight: float = 0.0
+    """Of edges steeper than `steepest_per_m`, and of needless density, at the end; it grows as the
+    learning rate falls. What is sharper than the finest cells no picture has shown."""
+    even_weight: float = 0.0
+    """Of the variation of colour between points as close; it grows the same way."""
+    soft_pairs: int = 256
+    """Pairs of close points at which both are measured in each step."""
+    thin_density: float = 0.0
+    """Cells less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
     solid_points: int = 128
     """Points at which that opacity is measured in each step."""
     variation_pairs: int = 128
@@ -105,6 +117,11 @@ class TrainConfig:
                 "empty_weight=0 or empty_term='global'."
             )
 
+    @property
+    def steepest_per_m(self) -> float:
+        """By how much the logarithm of the density may change along a metre."""
+        return STEEPEST / self.finest_m
+
     def variation_at(self, firm_share: float) -> float:
         """The weight of total variation when surfaces have become firm so far, in [0, 1]."""
         return self.variation_weight * self.first_variation ** (1.0 - firm_share)
@@ -129,7 +146,7 @@ class TrainConfig:
                 be noise, in which no pose can be refined. So detail is coarser; surfaces are asked
                 to be smoother. Of fewer than a dozen they are, most of all at first, while poses
                 are found; the body is solid inside; and what poses do not agree upon is no fog in
-                the end, but firm.
+                the end, but firm; no edge is sharper than the finest cells, and haze is gone.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
@@ -151,6 +168,9 @@ class TrainConfig:
             first_variation=scant**3,
             firm_weight=FIRM_WEIGHT * (1.0 - 1.0 / scant),
             solid_weight=SOLID_WEIGHT * (1.0 - 1.0 / scant),
+            soft_weight=SOFT_WEIGHT * (1.0 - 1.0 / scant),
+            even_weight=EVEN_WEIGHT * (1.0 - 1.0 / scant),
+            thin_density=THIN_DENSITY * (1.0 - 1.0 / scant),
             seed=seed,
             hold_every=hold_every,
         )

@@ -69,6 +69,7 @@ class Occupancy:
         *,
         share: float,
         decay: float = DECAY,
+        thinnest: float = 0.0,
         drop_specks: bool = False,
         step_m: float,
         generator: torch.Generator,
@@ -79,6 +80,8 @@ class Occupancy:
             log_density_at: Log density at canonical points.
             share: How much of the band is probed, in (0, 1].
             decay: What a probed cell keeps of its density.
+            thinnest: Cells with less density than this, in 1/m, hold nothing, however long the
+                way through them.
             drop_specks: Whether pieces without contact to the rest are dropped that are small or
                 float off the skin (the paper's code keeps the largest piece alone; a foot may be
                 a piece of its own).
@@ -90,7 +93,7 @@ class Occupancy:
         density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
         flat = self.grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
-        dense = (self.grid.density > self._bar(step_m)).to(torch.uint8)
+        dense = (self.grid.density > max(self._bar(step_m), thinnest)).to(torch.uint8)
         occupied = grown(dense) & self._in_band
         if drop_specks:
             occupied &= 1 - specks(self.grid.density > FIRM_DENSITY, self._near_skin)

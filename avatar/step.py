@@ -68,7 +68,7 @@ def gradients(
         raw, samples, config.step_m, batch.target, background,
         config.alpha_weight, config.hard_weight * hard_share,
     )  # fmt: skip
-    grads = [grad, *_grads_asked(raw_asked, config, firm_share)]
+    grads = [grad, *_grads_asked(raw_asked, asked, config, firm_share)]
     grad_features = field.backward(seen, torch.cat(grads))
     if poses is not None and count:
         _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells, loss)
@@ -84,7 +84,7 @@ def _asked(
     config: TrainConfig,
     generator: torch.Generator,
 ) -> list[Float32[Tensor, "_ 3"]]:
-    """Points at which opacity is asked for, besides the rays': empty ones, pairs, solid ones."""
+    """Points that are asked besides the rays': empty ones, pairs, solid ones, close pairs."""
     none = points[:0]
     return [
         sampler.empty_points(config.empty_points, generator).to(points)
@@ -94,21 +94,30 @@ def _asked(
         sampler.solid_points(config.solid_points, generator).to(points)
         if config.solid_weight
         else none,
+        priors.close_pairs(points, config, generator),
     ]
 
 
 def _grads_asked(
-    raw: list[Float32[Tensor, "_ 4"]], config: TrainConfig, firm_share: float
+    raw: list[Float32[Tensor, "_ 4"]],
+    points: list[Float32[Tensor, "_ 3"]],
+    config: TrainConfig,
+    firm_share: float,
 ) -> list[Float32[Tensor, "_ 4"]]:
     """The gradients of what `_asked` asks, in its order."""
-    empty, pairs, solid = raw
+    empty, pairs, solid, close = raw
     grad_pairs = priors.variation(pairs, config.variation_at(firm_share))
     if config.firm_weight:
         grad_pairs += priors.double_well(pairs, config.firm_weight * firm_share)
+    grad_close = priors.steepness(
+        close, points[3], config.steepest_per_m, config.soft_weight * firm_share
+    )
+    grad_close += priors.unevenness(close, config.even_weight * firm_share)
     return [
         priors.emptiness(empty, config.empty_weight),
         grad_pairs,
         priors.solidity(solid, config.solid_weight),
+        grad_close,
     ]
 
 

@@ -148,7 +148,7 @@ class Trainer:
             self._correct_poses(falling)
         self.replay.learn_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_every == 0:
-            self._update_occupancy()
+            self._update_occupancy(1.0 - falling)
         self.sampler.update(self.steps, self.replay.cells, self._generator)
         self.steps += 1
         follow(self.avatar.field, field, self.steps)
@@ -169,12 +169,13 @@ class Trainer:
                 correction = self.poses.corrections[slot].copy()
                 self.corrections[self.replay.indices[slot]] = correction
 
-    def _update_occupancy(self) -> None:
+    def _update_occupancy(self, firm_share: float) -> None:
         clearing = self.steps < CLEARING_STEPS
         self.avatar.occupancy.update(
             lambda points: self.field.raw_at(points)[:, 3],
             share=0.5 if clearing else 0.25,
             decay=FIRST_DECAY if clearing else DECAY,
+            thinnest=self.config.thin_density * firm_share,
             drop_specks=not clearing,
             step_m=self.config.step_m,
             generator=self._generator,

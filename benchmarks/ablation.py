@@ -177,7 +177,7 @@ def upkeep_ms(run: Run) -> float:
     every = run.trainer.config.occupancy_every
     began = time.process_time()
     for _ in range(3):
-        run.trainer._update_occupancy()
+        run.trainer._update_occupancy(0.0)
     return 1000.0 * (time.process_time() - began) / 3 / every
 
 

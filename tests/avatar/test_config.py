@@ -76,6 +76,7 @@ def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
         assert TrainConfig.within(60.0, footprint_m=0.004, frames=frames) == usual
     dozen = TrainConfig.within(60.0, footprint_m=0.004, frames=12)
     assert dozen.firm_weight == dozen.solid_weight == 0.0
+    assert dozen.soft_weight == dozen.even_weight == dozen.thin_density == 0.0
     assert dozen.first_variation == 1.0
     assert usual.firm_weight == usual.solid_weight == 0.0
     assert usual.variation_at(0.0) == usual.variation_at(1.0) == usual.variation_weight
@@ -86,3 +87,8 @@ def test_surfaces_are_smoothest_at_first():
     weights = [few.variation_at(share) for share in (0.0, 0.5, 1.0)]
     assert weights[2] == few.variation_weight < weights[1] < weights[0]
     assert weights[0] == pytest.approx(1.5**3 * few.variation_weight)
+
+
+def test_edges_may_be_as_steep_as_the_finest_cells_are_fine():
+    coarse, fine = TrainConfig(finest_m=0.008), TrainConfig(finest_m=0.004)
+    assert fine.steepest_per_m == 2.0 * coarse.steepest_per_m == pytest.approx(1000.0)

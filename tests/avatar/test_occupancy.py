@@ -1,5 +1,7 @@
 """Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -84,6 +86,16 @@ def test_empty_points_follow_every_change_of_the_occupancy(occupancy, generator)
 
 def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, generator):
     assert len(occupancy.empty_points(100, generator)) == 0
+
+
+def test_haze_counts_as_nothing_where_that_is_asked(occupancy, generator):
+    def haze(at):
+        return torch.full_like(at[:, 0], math.log(30.0))
+
+    run(occupancy, haze, generator, 60, thinnest=20.0)
+    assert occupancy.grid.occupied.view(-1)[occupancy.band].all()
+    run(occupancy, haze, generator, 60, thinnest=40.0)
+    assert not occupancy.grid.occupied.any()
 
 
 def test_growing_adds_the_six_neighbours():

@@ -1,4 +1,4 @@
-"""What opacity is asked to be where no ray tells: where following each prior alone ends."""
+"""What a field is asked to be where no ray tells: where following each prior alone ends."""
 
 import math
 
@@ -61,6 +61,54 @@ def test_no_prior_asks_anything_of_colours_or_of_no_points(prior):
     raw = torch.randn(10, 4, generator=torch.Generator().manual_seed(0))
     assert not prior(raw, 1.0)[:, :3].any()
     assert prior(raw[:0], 1.0).shape == (0, 4)
+
+
+def along_a_line(*logs: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Raw numbers of two points with these log densities, and where they lie, 2 mm apart."""
+    raw, points = torch.zeros(2, 4), torch.zeros(2, 3)
+    raw[:, 3], points[1, 2] = torch.tensor(logs), 0.002
+    return raw, points
+
+
+def test_a_steep_edge_becomes_as_gentle_as_is_asked_and_a_gentle_one_stays():
+    raw, points = along_a_line(5.0, -5.0)
+    for _ in range(2000):
+        raw -= priors.steepness(raw, points, 600.0, 0.01)
+    assert float(raw[0, 3] - raw[1, 3]) == pytest.approx(1.2, abs=0.03)
+    raw, points = along_a_line(3.0, 2.0)
+    assert not priors.steepness(raw, points, 600.0, 0.01).any()
+
+
+def test_nobody_asks_how_steep_emptiness_is():
+    raw, points = along_a_line(-1.0, -20.0)
+    assert not priors.steepness(raw, points, 600.0, 1.0).any()
+
+
+def test_needless_density_is_asked_to_fall():
+    raw, points = along_a_line(8.0, 8.0)
+    for _ in range(4000):
+        raw -= priors.steepness(raw, points, 600.0, 0.01)
+    assert raw[:, 3].tolist() == pytest.approx([priors.DENSEST_LOG] * 2, abs=0.01)
+
+
+def test_colours_of_a_visible_pair_become_even_and_nobody_sees_others():
+    raw = torch.tensor([[1.0, 0.0, -1.0, 5.0], [-1.0, 0.0, 1.0, -9.0]])
+    for _ in range(2000):
+        raw -= priors.unevenness(raw, 0.01)
+    assert float((raw[0, :3] - raw[1, :3]).abs().max()) < 0.02
+    assert raw[:, 3].tolist() == [5.0, -9.0]
+    raw[:, 3] = 1.0
+    assert not priors.unevenness(raw, 1.0).any()
+
+
+def test_close_pairs_are_drawn_only_where_something_is_asked_of_them(generator):
+    samples = torch.rand(100, 3, generator=generator)
+    before = generator.get_state()
+    assert len(priors.close_pairs(samples, TrainConfig(), generator)) == 0
+    assert torch.equal(generator.get_state(), before)
+    config = TrainConfig(soft_weight=0.1, soft_pairs=5000)
+    one, other = priors.close_pairs(samples, config, generator).chunk(2)
+    assert float((other - one).std()) == pytest.approx(0.5 * config.finest_m, rel=0.03)
 
 
 def test_pairs_lie_about_a_centimetre_apart(generator):

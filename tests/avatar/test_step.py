@@ -22,6 +22,7 @@ CONFIG = TrainConfig(
     rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
     empty_weight=0.3, hard_weight=0.1, variation_weight=0.2, variation_pairs=16,
     first_variation=3.0, firm_weight=0.4, solid_weight=0.1, solid_points=24, most_samples=256,
+    soft_weight=0.2, even_weight=0.3, soft_pairs=40,
 )  # fmt: skip
 
 
@@ -35,10 +36,10 @@ def trainer(rig, clip):
     return trainer
 
 
-def mean_loss(trainer, parameters, samples, empty, pairs, solid, batch, background):
+def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, batch, background):
     """The whole loss of a step, differentiable, in whatever precision the parameters have."""
     table, first, first_bias, second, second_bias = parameters
-    points = torch.cat([samples.points, empty, pairs, solid]).to(table.dtype)
+    points = torch.cat([samples.points, empty, pairs, solid, close]).to(table.dtype)
     features = reference.encode(points, table, trainer.avatar.field.levels)
     hidden = torch.relu(features @ first + first_bias)
     raw = hidden @ second + second_bias
@@ -48,6 +49,8 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, batch, backgrou
         rendered, batch.target.to(table.dtype), background.to(table.dtype),
         CONFIG.alpha_weight, CONFIG.hard_weight,
     ).mean()  # fmt: skip
+    loss = loss + FIRM_SHARE * of_close_pairs(raw[len(raw) - len(close) :], close)
+    raw = raw[: len(raw) - len(close)]
     density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
     opacity = 1.0 - torch.exp(-density * priors.OPACITY_M)
     of_empty, of_pairs, of_solid = opacity.split([len(empty), len(pairs), len(solid)])
@@ -58,6 +61,17 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, batch, backgrou
     one, other = of_pairs.chunk(2)
     variation = 0.2 * 3.0**0.75 * (one - other).abs().mean()
     return loss + variation + 0.4 * FIRM_SHARE * (of_pairs * (1.0 - of_pairs)).mean()
+
+
+def of_close_pairs(raw, points):
+    """What is asked of pairs of close points: gentle edges, no needless density, even colours."""
+    (one, other), (here, there) = raw.chunk(2), points.to(raw.dtype).chunk(2)
+    steep = (one[:, 3] - other[:, 3]).abs() - (here - there).norm(dim=1) * 4.0 / CONFIG.finest_m
+    densest = torch.maximum(one[:, 3], other[:, 3])
+    loss = 0.2 * (steep.clamp(min=0.0) * (densest > 0.0)).mean()
+    loss = loss + 0.2 * 0.4 * (raw[:, 3] - 6.0).clamp(min=0.0).mean()
+    uneven = (torch.sigmoid(one[:, :3]) - torch.sigmoid(other[:, :3])).abs().sum(dim=1)
+    return loss + 0.3 * (uneven * (densest > 2.0)).mean()
 
 
 def one_step(trainer, backend):
@@ -80,9 +94,10 @@ def one_step(trainer, backend):
     apart = priors.APART_M * torch.randn(drawn, 3, generator=generator)
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
     solid = occupancy.solid_points(CONFIG.solid_points, generator)
+    close = priors.close_pairs(samples.points, CONFIG, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
-    return grads, (samples, empty, pairs, solid, batch, background)
+    return grads, (samples, empty, pairs, solid, close, batch, background)
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
@@ -116,7 +131,7 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
     trainer.avatar.occupancy.grid.occupied.zero_()
-    (_, first, *_), (samples, empty, pairs, _, batch, background) = one_step(
+    (_, first, *_), (samples, empty, pairs, _, close, batch, background) = one_step(
         trainer, NumbaBackend()
     )
     assert isinstance(samples, Samples)
@@ -124,7 +139,7 @@ def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     assert torch.isfinite(first).all()
     assert len(batch.target) == CONFIG.rays == len(background)
     assert len(empty) == CONFIG.empty_points
-    assert len(pairs) == 0
+    assert len(pairs) == len(close) == 0
 
 
 def test_the_learning_rate_falls_from_one_to_a_twentieth():
