@@ -28,6 +28,7 @@ from export.lattice import FieldAt
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
 from export.package import AvatarPackage, PackageDraft
 from export.player import ALIKE, Likeness, Player, premultiplied
+from export.rules import DrawingRules
 from export.tables import Tables
 from export.tiers import TIERS
 from export.tuning import Picture, Progress, Renderer, Tuned, View, tuned
@@ -161,7 +162,8 @@ def export_field(
         better = _tuned(baked.result(), rig, renderer, views, config, beside, progress)
         tables = better.tables
         compressed = beside.submit(draft.add_tables, tables)
-        package = _package(tables, config.tiers, rig, views, metrics)
+        rules = {tier: better.rules if tier == "hq" else TIERS[tier] for tier in config.tiers}
+        package = _package(tables, rules, rig, views, metrics)
         others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
         hq = Player(package)
         notes, warnings = {}, [UNTUNED] if config.tuned and better.psnr is None else []
@@ -211,18 +213,17 @@ def _tuned(
                 tables, rig, TIERS["hq"], renderer,
                 views=views, pictures=config.tuned, beside=beside, progress=progress,
             )  # fmt: skip
-    return Tuned(tables=tables, psnr=None)
+    return Tuned(tables=tables, rules=TIERS["hq"], psnr=None)
 
 
 def _package(
     tables: Tables,
-    tiers: Sequence[str],
+    rules: Mapping[str, DrawingRules],
     rig: Rig,
     views: Sequence[View],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
     """The package as it stands before the checks: no scores, no pictures."""
-    rules = {tier: TIERS[tier] for tier in tiers}
     notes = {
         tier: TierNote(
             layout=Layout.of(tables), rules=rule, psnr_to_renderer=0.0, largest_difference=0.0
@@ -246,7 +247,7 @@ def _package(
         graphs={
             tier: build_graph(tables, rule).SerializeToString() for tier, rule in rules.items()
         },
-        tables=dict.fromkeys(tiers, tables),
+        tables=dict.fromkeys(rules, tables),
         golden=(),
         preview=b"",
     )

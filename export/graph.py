@@ -1,5 +1,7 @@
 """The player's graph: bones and camera in, a picture with alpha out. The only door out of numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 
@@ -7,7 +9,16 @@ from export.columns import taken
 from export.initialisers import initialisers
 from export.nodes import Graph, Value
 from export.posing import pose_nodes
-from export.raster import FAR, Splats, Window, keys_behind, nearest_keys, splat
+from export.raster import (
+    FAR,
+    Splats,
+    Window,
+    hidden_by,
+    keys_behind,
+    limits_at,
+    nearest_keys,
+    splat,
+)
 from export.rules import DrawingRules
 from export.scene import Scene, View
 from export.shading import Hull, Layer, rays, shade
@@ -50,8 +61,8 @@ def _picture(scene: Scene) -> Value:
     ray = rays(scene.view, window, pixel)
     first = shade(scene, hull, keys.take(pixel), ray, None)
     channels = [*first.color, first.light]
-    if scene.rules.layers == 2:
-        channels = _with_second(scene, hull, splats, pixel, first)
+    if scene.rules.layers > 1:
+        channels = _with_further(scene, hull, splats, pixel, first)
     return _drawn(scene, window, pixel, channels)
 
 
@@ -67,34 +78,41 @@ def _view(graph: Graph) -> View:
     )
 
 
-def _with_second(
+def _with_further(
     scene: Scene, hull: Hull, splats: Splats, pixel: Value, first: Layer
 ) -> list[Value]:
-    """Colour and light after both layers, one entry a ray of the first."""
-    graph, window = scene.graph, splats.window
-    wanted = first.light > scene.rules.transmitted
-    number = graph.range(graph.size(pixel).cast(np.int32)).compressed(wanted)
-    depth = (first.enter * first.ray[2]).take(number) + scene.rules.gap_m
-    keys = keys_behind(
-        scene, hull.posed, hull.surfels, splats, _cells(window, pixel.take(number)), depth
-    )
-    there = keys < FAR
-    keys, number = keys.compressed(there), number.compressed(there)
-    before = Layer(
-        ray=taken(first.ray, number),
-        canonical=taken(first.canonical, number),
-        camera=taken(first.camera, number),
-        color=first.color,
-        light=first.light.take(number),
-        enter=first.enter,
-        end=first.end.take(number),
-    )
-    second = shade(scene, hull, keys, before.ray, before)
-    color = [
-        c.scattered(number, behind * before.light, reduction="add")
-        for c, behind in zip(first.color, second.color, strict=True)
-    ]
-    return [*color, first.light.scattered(number, before.light * second.light)]
+    """Colour and light after all layers, one entry a ray of the first."""
+    graph, window, hidden = scene.graph, splats.window, None
+    color, light, before = first.color, first.light, first
+    number = graph.range(graph.size(pixel).cast(np.int32))
+    for _ in range(1, scene.rules.layers):
+        wanted = before.light > scene.rules.transmitted
+        kept = graph.range(graph.size(number).cast(np.int32)).compressed(wanted)
+        cell = _cells(window, pixel.take(number.take(kept)))
+        depth = (before.enter * before.ray[2]).take(kept) + scene.rules.gap_m
+        limits = limits_at(scene, window, cell, depth)
+        hidden = hidden or hidden_by(scene, hull.posed, hull.surfels, splats, limits)
+        keys = keys_behind(scene, hidden, limits, cell)
+        there = keys < FAR
+        keys, kept = keys.compressed(there), kept.compressed(there)
+        number = number.take(kept)
+        seen_from = Layer(
+            ray=taken(before.ray, kept),
+            canonical=taken(before.canonical, kept),
+            camera=taken(before.camera, kept),
+            color=before.color,
+            light=before.light.take(kept),
+            enter=before.enter,
+            end=before.end.take(kept),
+        )
+        layer = shade(scene, hull, keys, seen_from.ray, seen_from)
+        color = [
+            c.scattered(number, behind * seen_from.light, reduction="add")
+            for c, behind in zip(color, layer.color, strict=True)
+        ]
+        before = replace(layer, light=seen_from.light * layer.light)
+        light = light.scattered(number, before.light)
+    return [*color, light]
 
 
 def _cells(window: Window, pixel: Value) -> Value:

@@ -22,7 +22,7 @@ class Pieces:
         slope: Voxels from one sample to the next.
         step_m: The same along the ray, metres.
         count: Samples.
-        layer: 0, or 1 for the second depth layer.
+        layer: Depth layer, from 0.
     """
 
     first: Int64[np.ndarray, "rays_and_one"]
@@ -52,12 +52,12 @@ class Pieces:
         )
 
     @classmethod
-    def of_second(cls, look: Look, bricks: Bricks, rules: DrawingRules) -> "Pieces":
-        """The second layer's, of all rays of a look: none where there is only one layer."""
-        rays, count = look.second, rules.second_block
+    def behind(cls, look: Look, number: int, bricks: Bricks, rules: DrawingRules) -> "Pieces":
+        """Those of a look's further layer: 1 for the first one behind."""
+        (again, rays), count = look.behind[number - 1], rules.second_block
         step_m = (rays.end - rays.begin) / np.float32(count)
         return cls._sorted(
-            look.again, len(look.pixel), bricks, rays.start, rays.direction, step_m, (count, 1)
+            again, len(look.pixel), bricks, rays.start, rays.direction, step_m, (count, number)
         )
 
     @classmethod
@@ -93,6 +93,12 @@ class Pieces:
             for name in _COLUMNS
         }
         return Pieces(first=self.first + behind.first, **columns)
+
+    def of_layers(self, count: int) -> "Pieces":
+        """Those of the first few depth layers alone."""
+        kept = np.flatnonzero(self.layer < count)
+        columns = {name: getattr(self, name)[kept] for name in _COLUMNS}
+        return Pieces(first=np.searchsorted(kept, self.first).astype(np.int64), **columns)
 
     @classmethod
     def joined(cls, many: "Sequence[Pieces]") -> "Pieces":

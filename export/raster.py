@@ -182,25 +182,44 @@ def _spread(scene: Scene, buffer: Value, splats: Splats) -> Value:
     return scene.graph.loop(splats.side - 1, [buffer], once)[0]
 
 
-def keys_behind(
-    scene: Scene, posed: Posed, surfels: Surfels, splats: Splats, cell: Value, limit: Value
-) -> Value:
-    """The least key of what lies deeper than a limit and faces the camera.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Hidden:
+    """Surfels that may lie behind something, on their way into further z-buffers.
+
+    One entry for each pixel of a footprint: values of the graph.
+
+    Attributes:
+        window: Where the buffers are.
+        cell: Pixel of the buffer.
+        key: As in `Splats`.
+        depth: Metres along z.
+    """
+
+    window: Window
+    cell: Value
+    key: Value
+    depth: Value
+
+
+def limits_at(scene: Scene, window: Window, cell: Value, depth: Value) -> Value:
+    """A buffer of depths, metres along z: those given, and nowhere else anything is deeper."""
+    empty = scene.graph.filled(scene.graph.shape(window.cells + 1), np.float32(NOWHERE))
+    return empty.scattered(cell, depth)
+
+
+def hidden_by(
+    scene: Scene, posed: Posed, surfels: Surfels, splats: Splats, limits: Value
+) -> Hidden:
+    """Surfels that are deeper than a limit somewhere on their footprint, and face the camera.
 
     Args:
         scene: What is drawn.
         posed: The skin's nodes in the camera's frame.
         surfels: All of them.
         splats: The same, projected.
-        cell: Cells of the buffer.
-        limit: Of each, metres along z.
-
-    Returns:
-        A key for each of the cells.
+        limits: The first ones (`limits_at`); later ones only grow deeper.
     """
     graph, window, side = scene.graph, splats.window, splats.side
-    limits = graph.filled(graph.shape(window.cells + 1), np.float32(NOWHERE))
-    limits = limits.scattered(cell, limit)
     lowest = _spread(scene, limits, splats)
     lost = (side - 1) * (window.stride + 1)
     lowest = graph.concatenated([lowest, graph.filled(graph.shape(lost), np.float32(NOWHERE))])
@@ -215,7 +234,12 @@ def keys_behind(
     covered = first + (down * window.stride + (offset - down * side)).cast(np.int32)
     copies = graph.shape(side * side, 1)
     key, depth = (graph.node("Expand", v, copies).reshaped(-1) for v in (key, depth))
-    covered = covered.reshaped(-1)
-    behind = depth > limits.take(covered)
-    covered = graph.where(behind, covered, window.cells.cast(np.int32))
-    return _scattered(scene, window, covered, key).take(cell)
+    return Hidden(window=window, cell=covered.reshaped(-1), key=key, depth=depth)
+
+
+def keys_behind(scene: Scene, hidden: Hidden, limits: Value, cell: Value) -> Value:
+    """The least key of what lies deeper than the limits, for some cells of the buffer."""
+    window = hidden.window
+    behind = hidden.depth > limits.take(hidden.cell)
+    covered = scene.graph.where(behind, hidden.cell, window.cells.cast(np.int32))
+    return _scattered(scene, window, covered, hidden.key).take(cell)

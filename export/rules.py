@@ -8,7 +8,7 @@ class DrawingRules:
     """The rules of one tier.
 
     Attributes:
-        layers: Depth layers, 1 or 2.
+        layers: Depth layers, at least 1.
         samples: Samples along `span_m` of a ray, unless the player asks for another number.
         span_m: Metres; samples lie `span_m / samples` apart, and closer where a ray ends.
         block: Samples between two corrections of a ray's canonical path.
@@ -18,7 +18,7 @@ class DrawingRules:
             posed positions are taken as linear between the nodes.
         blocks: At most so many; the last one takes what is left of a ray. Where the player asks for
             more samples, steady and other blocks are so many times more.
-        second_block: Samples of a ray in the second layer, all at once.
+        second_block: Samples of a ray in each further layer, all at once.
         longest_correction_m: No correction is longer than this.
         ended: A ray ends where less than this share of the light is left.
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
@@ -34,12 +34,12 @@ class DrawingRules:
             folded: surfels are looked at along their normals, and paths not corrected.
         hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
             filled.
-        gap_m: Surfels of the second layer lie at least this far behind the first's.
-        same_m, same_share: Where the two layers' surfels are no farther apart in canonical space
+        gap_m: Surfels of a further layer lie at least this far behind those of the one before it.
+        same_m, same_share: Where two layers' surfels are no farther apart in canonical space
             than this, and so many times as far as in the camera's, they belong to one sheet: the
             second ray begins where the first one ends.
-        facing: Least cosine with which a surfel of the second layer faces the camera.
-        transmitted: Least transmittance of the first layer that the second is drawn for.
+        facing: Least cosine with which a surfel of a further layer faces the camera.
+        transmitted: Least light that is left, that a further layer is drawn for.
         nearest_m: Nearer surfels are not drawn.
     """
 

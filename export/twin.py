@@ -6,6 +6,7 @@ shares no code with the graph.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -54,10 +55,22 @@ class _Posed:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Before:
-    """What the first layer saw at the second's pixels: its surfels, and where its rays ended."""
+    """What a layer saw at the next one's pixels: its surfels, and where its rays ended."""
 
     surfel: Int64[np.ndarray, "pixels"]
     end: Float32[np.ndarray, "pixels"]
+
+
+class Deeper(NamedTuple):
+    """A further layer.
+
+    Attributes:
+        again: Which of the first layer's rays have it, ascending.
+        rays: Theirs.
+    """
+
+    again: Int64[np.ndarray, "rays"]
+    rays: Rays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,34 +82,38 @@ class Look:
         nodes: The skin in this pose.
         first: Their rays.
         seen: What these show: premultiplied colour and alpha.
-        again: Which of them have a second layer, ascending.
-        second: The rays of that.
+        behind: The further layers.
     """
 
     pixel: Int64[np.ndarray, "pixels"]
     nodes: PosedNodes
     first: Rays
     seen: Float32[np.ndarray, "pixels 4"]
-    again: Int64[np.ndarray, "pixels2"]
-    second: Rays
+    behind: tuple[Deeper, ...]
 
 
 def draw(tables: Tables, rules: DrawingRules, shot: Shot) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied colour and alpha in [0, 1]."""
     width, height = shot.size_px
     look = look_at(tables, rules, shot)
+    seen = look.seen.copy()
+    for again, rays in look.behind:
+        seen[again] += _block(tables, rules, rays) * (1.0 - seen[again, 3:])
     picture = np.zeros((width * height, 4), dtype=np.float32)
-    picture[look.pixel] = look.seen
-    ones = np.ones(len(look.again))
-    behind = sampled(tables.bricks, look.second, ones, rules.second_block, np.inf).colors
-    picture[look.pixel[look.again]] += behind * (1.0 - look.seen[look.again, 3:])
+    picture[look.pixel] = seen
     return picture.reshape(height, width, 4)
+
+
+def _block(tables: Tables, rules: DrawingRules, rays: Rays) -> Float32[np.ndarray, "rays 4"]:
+    """What rays of a further layer show."""
+    ones = np.ones(len(rays.begin))
+    return sampled(tables.bricks, rays, ones, rules.second_block, np.inf).colors
 
 
 def look_at(
     tables: Tables, rules: DrawingRules, shot: Shot, marched: Marched | None = None
 ) -> Look:
-    """Finds the rays of both layers.
+    """Finds the rays of all layers.
 
     Args:
         tables: What is drawn.
@@ -118,22 +135,24 @@ def look_at(
         seen = march(tables.bricks, rules, posed.nodes, first, shot.samples)
     else:
         seen = marched(posed.nodes, first)
-    again, second = covered[:0], Rays(*(part[:0] for part in first))
-    if rules.layers == 2:
+    behind = list[Deeper]()
+    light, end, keys = 1.0 - seen[:, 3], first.end.copy(), filled[covered]
+    again = np.arange(len(covered))
+    while len(behind) < rules.layers - 1:
+        again = again[light[again] > rules.transmitted]
         limit = np.full((height, width), 1e6, dtype=np.float32)
-        deeper = depth + np.float32(rules.gap_m)
-        limit.reshape(-1)[covered] = np.where(1.0 - seen[:, 3] <= rules.transmitted, 1e6, deeper)
-        behind = deep_enough > np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
+        limit.reshape(-1)[covered[again]] = depth[again] + np.float32(rules.gap_m)
+        there = deep_enough > np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
         buffer = np.full(cells, FAR, dtype=np.int64)
-        np.minimum.at(buffer.reshape(-1), cell[behind], key[behind])
-        keys = buffer[side:-side, side:-side].ravel()
-        pixel = np.flatnonzero(keys < FAR)
-        again = np.searchsorted(covered, pixel)
-        before = _Before(surfel=_surfel(filled[pixel]), end=first.end[again])
-        second, _ = _entering(tables, rules, shot, posed, pixel, keys[pixel], before)
-    return Look(
-        pixel=covered, nodes=posed.nodes, first=first, seen=seen, again=again, second=second
-    )
+        np.minimum.at(buffer.reshape(-1), cell[there], key[there])
+        found = buffer[side:-side, side:-side].ravel()[covered]
+        again = np.flatnonzero(found < FAR)
+        before = _Before(surfel=_surfel(keys[again]), end=end[again])
+        rays, entered = _entering(tables, rules, shot, posed, covered[again], found[again], before)
+        behind.append(Deeper(again, rays))
+        light[again] *= 1.0 - _block(tables, rules, rays)[:, 3]
+        depth[again], end[again], keys[again] = entered, rays.end, found[again]
+    return Look(pixel=covered, nodes=posed.nodes, first=first, seen=seen, behind=tuple(behind))
 
 
 def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:

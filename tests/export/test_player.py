@@ -8,6 +8,8 @@ import pytest
 
 from avatar.metrics import psnr
 from capture.errors import BadInput
+from export.graph import build_graph
+from export.package import read_package
 from export.player import Likeness, Player, premultiplied, verify
 from export.skin import finer_nodes
 from export.twin import Shot, draw
@@ -45,6 +47,34 @@ def test_the_graph_draws_what_its_twin_draws(
     likeness = Likeness.of(drawn, draw(tables, rules, shot))
     assert drawn[..., 3].mean() > 0.05
     assert likeness.alike, likeness
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3, 4])
+def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
+    exported, tables, stand_in, bent, camera, layers
+):
+    package = read_package(exported.path)
+    note = package.manifest.tiers["hq"]
+    rules = replace(note.rules, layers=layers)
+    tiers = {**package.manifest.tiers, "hq": replace(note, rules=rules)}
+    graph = build_graph(tables, rules).SerializeToString()
+    player = Player(
+        replace(
+            package,
+            manifest=replace(package.manifest, tiers=tiers),
+            graphs={**package.graphs, "hq": graph},
+        )
+    )
+    view = camera(131, 120, distance_m=1.6)
+    shot = Shot(
+        bones=player.bones(bent, view),
+        focal=np.array(view.focal_px, np.float32),
+        center=np.array(view.center_px, np.float32),
+        size_px=(131, 120),
+        samples=rules.samples,
+    )
+    drawn = premultiplied(player.render(bent, view))
+    assert Likeness.of(drawn, draw(tables, rules, shot)).alike
 
 
 @pytest.mark.parametrize(("posed", "least"), [("canonical", 44.0), ("bent", 34.5)])

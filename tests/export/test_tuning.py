@@ -43,7 +43,7 @@ def renderer(stand_in, tables):
 def traced(stand_in, tables, views):
     look = look_at(tables, RULES, shot_of(stand_in.rig, *views["bent"]))
     first = Pieces.of_first(look.first, look.nodes, tables.bricks, RULES)
-    return look, first.followed_by(Pieces.of_second(look, tables.bricks, RULES))
+    return look, first.followed_by(Pieces.behind(look, 1, tables.bricks, RULES))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def tune(stand_in, views):
 
 def test_what_tuning_thinks_is_shown_is_what_the_player_shows(stand_in, tables, views, traced):
     look, pieces = traced
-    assert len(look.again) > 20
+    assert len(look.behind[0].again) > 20
     assert pieces.layer.max() == 1
     drawn = draw(tables, RULES, shot_of(stand_in.rig, *views["bent"])).reshape(-1, 4)[look.pixel]
     out = shown(pieces, RULES, tables.bricks.index, *codes_of(tables))
@@ -179,3 +179,30 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     assert any("interrupted" in warning for warning in report.warnings)
     package = read_package(report.path)
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
+
+
+def test_fewer_layers_are_those_that_would_have_been_drawn_alone(stand_in, tables, views):
+    shot = shot_of(stand_in.rig, *views["bent"])
+    three = replace(RULES, layers=3)
+    look, codes = look_at(tables, three, shot), codes_of(tables)
+    pieces = Pieces.of_first(look.first, look.nodes, tables.bricks, three)
+    for number in (1, 2):
+        pieces = pieces.followed_by(Pieces.behind(look, number, tables.bricks, three))
+    assert len(look.behind[1].again) > 5
+    assert set(look.behind[1].again) <= set(look.behind[0].again)
+    for layers in (1, 2, 3):
+        rules = replace(RULES, layers=layers)
+        drawn = draw(tables, rules, shot).reshape(-1, 4)[look.pixel]
+        out = shown(pieces.of_layers(layers), rules, tables.bricks.index, *codes)
+        assert np.abs(out - drawn).max() < 2e-3
+
+
+def test_one_layer_more_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
+    def deeper(pose, camera):
+        return draw(tables, replace(RULES, layers=3), shot_of(stand_in.rig, pose, camera))
+
+    def as_asked(pose, camera):
+        return draw(tables, RULES, shot_of(stand_in.rig, pose, camera))
+
+    assert tune(tables, deeper).rules.layers == 3
+    assert tune(tables, as_asked).rules == RULES
