@@ -16,9 +16,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 def _stopped(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
-    """Ctrl-C while a command still loads what it needs is no fault, and shows none."""
+    """Ctrl-C while a command still loads what it needs is no fault, and shows none.
+
+    Nor is a reader that has seen enough: `ia-play --help | head`.
+    """
     if issubclass(kind, KeyboardInterrupt):
         print("stopped by Ctrl-C.", file=sys.stderr)  # noqa: T201 - no console is there yet
+    elif issubclass(kind, BrokenPipeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still held back goes nowhere
     else:
         sys.__excepthook__(kind, error, traceback)
 

@@ -4,6 +4,10 @@ import onnxruntime
 
 from capture.errors import BadInput
 
+OLDEST = "1.24"
+FROM_MEMORY = "add_external_initializers_from_files_in_memory"
+"""What older releases cannot do from Python."""
+
 
 def provider_named(name: str) -> str:
     """onnxruntime's own name of a provider: "cpu" is "CPUExecutionProvider".
@@ -50,9 +54,12 @@ def session_of(
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names, buffers = list(tables), list(tables.values())
-    options.add_external_initializers_from_files_in_memory(
-        names, buffers, [len(buffer) for buffer in buffers]
-    )
+    if not hasattr(options, FROM_MEMORY):
+        raise BadInput(
+            f"onnxruntime {onnxruntime.__version__} is too old for the player; {OLDEST} or newer "
+            "is needed: pip install --upgrade onnxruntime (or the build of it that you use)."
+        )
+    getattr(options, FROM_MEMORY)(names, buffers, [len(buffer) for buffer in buffers])
     wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # what it lacks, the CPU does
     try:
         session = onnxruntime.InferenceSession(graph, options, providers=wanted)

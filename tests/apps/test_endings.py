@@ -106,6 +106,16 @@ def test_a_command_that_is_stopped_while_it_loads_shows_no_traceback(name, shown
     assert done.returncode != 0
 
 
+def test_a_reader_that_has_seen_enough_is_no_fault():
+    code = "import sys; sys.argv = ['ia-play']; import apps; [print('x' * 999) for _ in range(999)]"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
 def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "deep" / "report.json"
     write_text(path, "old")

@@ -4,6 +4,7 @@ import zipfile
 from dataclasses import replace
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from avatar.metrics import psnr
@@ -173,6 +174,18 @@ def test_a_pose_without_numbers_is_refused(player, bent, camera):
     lost = replace(bent, joint_rotations=np.full((23, 3), np.nan))
     with pytest.raises(BadInput, match="joint_rotations holds NaN"):
         player.render(lost, camera(9, 9))
+
+
+def test_an_onnxruntime_that_is_too_old_is_named(exported, monkeypatch):
+    class Older:
+        """The options of 1.23, as far as they are asked."""
+
+        def add_session_config_entry(self, key, value):
+            pass
+
+    monkeypatch.setattr(onnxruntime, "SessionOptions", Older)
+    with pytest.raises(BadInput, match=r"too old for the player; 1\.24 or newer"):
+        Player.load(exported.path)
 
 
 def test_sizes_may_be_numpys_integers(player, bent, camera):
