@@ -3,6 +3,9 @@
 import os
 from functools import cache
 
+SILENT = 0
+"""OpenCV's own number."""
+
 
 @cache
 def silence_opencv() -> None:
@@ -10,4 +13,5 @@ def silence_opencv() -> None:
     import cv2  # heavy, and this file must not make others so
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
+    (set_level or cv2.utils.logging.setLogLevel)(SILENT)
