@@ -16,7 +16,7 @@ HEAD_COUNTS = 2.0
 """A face is what people look at: the head's skin counts as so much more."""
 NEARLY_ALL = 0.95
 NOBODY = "Nobody has been seen yet."
-EVERYTHING = "Everything was seen from all sides."
+EVERYTHING = "It was seen from all sides: no piece as large as a hand is missing."
 SCATTERED = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
 
 MOST = 0.7

@@ -85,6 +85,8 @@ class RunFolder:
         Call it when nothing can be wrong with the input any more.
         """
         self.path.mkdir(parents=True, exist_ok=True)
+        for half in self.path.glob(f".{self.package.name}.*"):  # of a run that was killed
+            half.unlink(missing_ok=True)
         if resume:
             return
         for file in (self.package, self.report, self.page, self.cameras, self.poses):

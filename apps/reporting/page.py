@@ -72,10 +72,12 @@ def report_page(
 
 
 def _lead(report: Report) -> str:
-    training = report.training
+    training, machine = report.training, report.machine
+    threads = "one thread" if machine.threads == 1 else f"{machine.threads} threads"
+    where = f"a CPU, {threads}" if machine.device == "cpu" else "a GPU"
     return (
         f"An avatar from {report.frames.used} frames, learnt in {training.wall_seconds:.0f} "
-        f"seconds on {report.machine.threads} thread(s) of this {report.machine.device}."
+        f"seconds on {where}."
     )
 
 

@@ -216,6 +216,15 @@ def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):
     assert [file.name for file in run.path.iterdir()] == ["notes.txt"]
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_what_a_killed_run_left_half_written_goes(tmp_path, resume):
+    run = RunFolder(path=tmp_path)
+    (tmp_path / ".avatar.iavatar.k2j3h4").write_bytes(b"half")
+    (tmp_path / ".avatar.txt").write_bytes(b"mine")
+    run.begin(resume=resume)
+    assert [file.name for file in tmp_path.iterdir()] == [".avatar.txt"]
+
+
 def test_a_run_folder_that_stayed_empty_goes(tmp_path):
     run = RunFolder(path=tmp_path / "run")
     run.begin(resume=False)

@@ -13,6 +13,7 @@ import torch
 
 from apps.learning import learn
 from avatar import checkpoint
+from avatar.advice import EVERYTHING
 from export.player import Player
 
 KEYS = {
@@ -101,7 +102,7 @@ def test_an_actor_who_turns_twice_is_seen_from_all_sides(report):
     coverage = report["coverage"]
     assert coverage["seen"] > 0.95
     assert coverage["well"] < coverage["seen"]
-    assert coverage["advice"] == "Everything was seen from all sides."
+    assert coverage["advice"] == EVERYTHING
     assert len(coverage["parts"]) == 14
     assert coverage["parts"]["torso"]["back"] > 0.95
 
