@@ -38,12 +38,19 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
         return VideoFile(path, selection)
     if (path / "images").is_dir():
         return ImageFolder(path / "images", selection)
-    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+    videos = _videos(path)
     if list_images(path) and not videos:
         return ImageFolder(path, selection)
     if len(videos) != 1:
         raise _unclear(path, videos)
     return VideoFile(videos[0], selection)
+
+
+def _videos(folder: Path) -> list[Path]:
+    """The videos in a folder; one of masks is none where there is another."""
+    files = (file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+    seen = sorted(file for file in files if not file.name.startswith("."))
+    return [file for file in seen if not file.stem.lower().startswith("mask")] or seen
 
 
 def _unclear(path: Path, videos: list[Path]) -> BadInput:

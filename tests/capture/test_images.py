@@ -131,6 +131,18 @@ def test_a_capture_folder_gives_its_images_or_its_only_video(write_images, write
     assert open_source(tmp_path).path == folder
 
 
+def test_a_video_of_masks_and_hidden_files_are_not_the_film(write_video, tmp_path):
+    film = write_video(frames=3)
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name in ("masks", "take"):
+        (folder / f"{name}{film.suffix}").write_bytes(film.read_bytes())
+    (folder / f"._take{film.suffix}").write_bytes(b"macOS")
+    assert open_source(folder).path == folder / f"take{film.suffix}"
+    (folder / f"take{film.suffix}").unlink()
+    assert open_source(folder).path == folder / f"masks{film.suffix}"
+
+
 def test_two_videos_in_a_folder_are_too_many(write_video, tmp_path):
     write_video("a.mp4", frames=2)
     write_video("b.mp4", frames=2)
