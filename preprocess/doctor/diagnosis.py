@@ -84,7 +84,7 @@ def diagnose(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
     named, healed, tried = _mended(claim, evidence, frames)
     for sought in (centring,) if jumps(claim)[0] else (centring, standing):
         so_far = mean(evidence.scores(healed))
-        if so_far >= DOUBTFUL or evidence.boxes:
+        if (so_far >= DOUBTFUL and len(named) < MOST_CURES) or evidence.boxes:
             break
         found = sought(claim, evidence)
         if found is None:

@@ -13,7 +13,7 @@ from capture.images import IMAGE_SUFFIXES, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
 from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
-from preprocess.masks.polarity import is_turned, show_background
+from preprocess.masks.polarity import check_are_masks, is_turned, show_background
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content
 
@@ -53,7 +53,8 @@ class Masks:
         """Looks at a few of the masks that `read` gives as they are stored.
 
         Raises:
-            BadInput: If none of them can be read or, with `invert` None, told from the background.
+            BadInput: If none of them can be read, they are no masks or, with `invert` None, cannot
+                be told from the background.
         """
         self.path = path
         self.count = count
@@ -62,6 +63,7 @@ class Masks:
         self._doubts = invert is None
         rows = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
+        check_are_masks(samples, path)
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
         self.inverted = show_background(samples, path) if invert is None else invert

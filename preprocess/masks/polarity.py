@@ -9,6 +9,8 @@ from capture.errors import BadInput
 
 HALF = 0.5
 """Nobody covers more of the pictures, and of their rims."""
+DARK, BRIGHT = 0.1, 0.9
+"""Between them are only the rims of soft masks."""
 
 
 def show_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
@@ -32,6 +34,16 @@ def show_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bo
             "person is 0) or --no-mask-invert (the person is 255)."
         )
     return bool(area > HALF)
+
+
+def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> None:
+    """Raises BadInput for pictures, depths and the like: masks are nearly everywhere 0 or 1."""
+    between = [float(((mask > DARK) & (mask < BRIGHT)).mean()) for mask in samples]
+    if np.median(between) > HALF:
+        raise BadInput(
+            f"{path} holds pictures, not masks: {np.median(between):.0%} of their pixels are "
+            "neither dark nor bright. Expected 255 where the person is, and 0 elsewhere."
+        )
 
 
 def is_turned(alpha: Float32[np.ndarray, "height width"]) -> bool:

@@ -136,6 +136,15 @@ def test_masks_that_do_not_tell_which_side_is_the_person_are_refused(write):
         open_masks(write([framed]))
 
 
+def test_pictures_are_no_masks(write, rng):
+    photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
+    for invert in (None, False):
+        with pytest.raises(BadInput, match="pictures, not masks: 7"):
+            open_masks(write(photographs, f"photographs {invert}"), invert=invert)
+    soft = cv2.GaussianBlur(person(), (5, 5), 0)
+    assert open_masks(write([soft], "soft")).count == 1
+
+
 def test_masks_that_show_nothing_are_refused(write):
     with pytest.raises(BadInput, match="empty or full"):
         open_masks(write([np.zeros((40, 30), np.uint8)] * 3))
