@@ -47,6 +47,9 @@ KNOWN = (
 CLIFF = Lens(share=1.0, of="diagonal")
 """The camera in which CLIFF's `global_t` is."""
 
+SEXES = {"f": "female", "m": "male"}
+"""Bodies of SMPL whose betas are not the neutral one's."""
+
 UNIT = 0.01
 """A stated scale that is nearer to 1 says nothing."""
 
@@ -75,7 +78,20 @@ def tracks(content: Any, path: Path, default_model: str) -> People | None:
     motion = motion_of(arrays_of(named, path), path, default_model=default_model)
     if "global_t" in held:
         motion = replace(motion, lens=CLIFF, space="camera")
+    sex = str(_gender(held, content)).lower()[:1]
+    if default_model == "smpl" and motion.model == "smpl" and sex in SEXES:
+        motion = replace(
+            motion,
+            note=f"The shape in {path.name} is one of SMPL's {SEXES[sex]} body; another body "
+            "(--body) makes somebody else of it.",
+        )
     return {"0": motion}
+
+
+def _gender(held: Mapping[Any, Any], content: Mapping[Any, Any]) -> Any:
+    """What the file says of the body's gender, if it does."""
+    said = held.get("gender", content.get("gender", ""))
+    return said.item() if isinstance(said, np.ndarray) and said.size == 1 else said
 
 
 def renamed(held: Mapping[Any, Any]) -> dict[str, Any]:
