@@ -2,9 +2,9 @@
 
 Layout: a folder of .npz, .json or .pkl, or one file with a list or with objects by frames' names,
 each with the keys of `preprocess.poses.native` for one row: ExAvatar's `smplx_params/0.json`
-{root_pose, body_pose, trans}, SMPLer-X's `00001_0.npz`, ARAH's `models/000001.npz` {root_orient,
-pose_body, trans}, HumanNeRF's `metadata.json` {frame_000001: {poses, cam_intrinsics,
-cam_extrinsics}}, whose camera alone says where the person is.
+{root_pose, body_pose, trans}, LHM's with focal and princpt beside, SMPLer-X's `00001_0.npz`, ARAH's
+`models/000001.npz` {root_orient, pose_body, trans}, HumanNeRF's `metadata.json` {frame_000001:
+{poses, cam_intrinsics, cam_extrinsics}}, whose camera alone says where the person is.
 """
 
 import re

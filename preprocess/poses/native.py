@@ -107,6 +107,8 @@ def renamed(held: Mapping[Any, Any]) -> dict[str, Any]:
         if key not in found and known is not None and not isinstance(found[known], dict):
             found[key] = found[known]
             foreign = not ours
+    if "K" not in found and {"focal", "princpt"} <= found.keys():
+        found["K"] = _lens(found["focal"], found["princpt"])
     if "model" not in found:
         kind = str(found.get("surface_model_type", "")).replace("-", "").lower()
         if OF_SMPLX & found.keys() or "smplx" in kind:
@@ -114,6 +116,15 @@ def renamed(held: Mapping[Any, Any]) -> dict[str, Any]:
         elif "gender" in found or foreign:
             found["model"] = "smpl"  # nobody else's programs know the embedded body
     return found
+
+
+def _lens(focal: Any, center: Any) -> Any:
+    """K of LHM's `focal` and `princpt`; NaN where they are none, which is refused."""
+    try:
+        (fx, fy), (cx, cy) = np.asarray(focal, float).ravel(), np.asarray(center, float).ravel()
+    except (TypeError, ValueError):
+        return np.full((3, 3), np.nan)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def arrays_of(named: Mapping[str, Any], path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:

@@ -163,6 +163,17 @@ def test_frames_of_a_folder_belong_to_who_is_in_their_names(world):
     np.testing.assert_allclose(apart, np.tile([1.0, 0.0, 0.0], (9, 1)), atol=1e-12)
 
 
+def test_the_camera_in_lhms_files_is_the_trackers(world):
+    for path in sorted(ex_avatar(world).iterdir()):
+        content = json.loads(path.read_text())
+        content |= {"focal": [900, 901], "princpt": [320.0, 180.0], "img_size_wh": [640, 360]}
+        path.write_text(json.dumps({**content, "betas": [0.1] * 10, "pad_ratio": 0}))
+    motion = read_poses(world.folder / "smplx_params")
+    np.testing.assert_array_equal(motion.intrinsic, [[900, 0, 320], [0, 901, 180], [0, 0, 1]])
+    assert motion.model == "smplx"
+    np.testing.assert_allclose(motion.betas, 0.1)
+
+
 def test_people_whom_slahmr_lost_are_lost_and_cameras_stay_with_their_rows(world):
     assert "1 (9 poses)" in read_poses(slahmr(world)).note
     with np.load(slahmr(world)) as stored:
