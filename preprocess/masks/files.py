@@ -13,7 +13,7 @@ from capture.images import IMAGE_SUFFIXES, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
 from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
-from preprocess.masks.polarity import check_are_masks, is_turned, show_background
+from preprocess.masks.polarity import are_numbers, check_are_masks, is_turned, show_background
 from preprocess.npz import read_npz
 from preprocess.poses.content import read_content
 
@@ -63,10 +63,16 @@ class Masks:
         self._doubts = invert is None
         rows = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
+        self._numbers = are_numbers(samples)
+        samples = [self._meant(sample) for sample in samples]
         check_are_masks(samples, path)
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
         self.inverted = show_background(samples, path) if invert is None else invert
+
+    def _meant(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
+        """The same as alpha, where the files hold objects' numbers."""
+        return (stored > 0.0).astype(np.float32) if self._numbers else stored
 
     def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         """The mask in one row, scaled to a picture's size.
@@ -75,7 +81,7 @@ class Masks:
             BadInput: If it cannot be read, is not of the picture's shape, or is the other way round
                 than most (nobody having said which way they are).
         """
-        stored = self._read(row)
+        stored = self._meant(self._read(row))
         height, width = stored.shape
         if not same_shape((width, height), size_px):
             raise BadInput(

@@ -9,6 +9,9 @@ from capture.errors import BadInput
 
 HALF = 0.5
 """Nobody covers more of the pictures, and of their rims."""
+MOST_OBJECTS = 32
+LEAST_AREA = 0.01
+"""Specks of compression cover less than objects do."""
 DARK, BRIGHT = 0.1, 0.9
 """Between them are only the rims of soft masks."""
 
@@ -44,6 +47,15 @@ def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> No
             f"{path} holds pictures, not masks: {np.median(between):.0%} of their pixels are "
             "neither dark nor bright. Expected 255 where the person is, and 0 elsewhere."
         )
+
+
+def are_numbers(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
+    """Whether masks hold objects' numbers, 1, 2, …, of 255, rather than brightness."""
+    if max(float(mask.max()) for mask in samples) > MOST_OBJECTS / 255.0:
+        return False
+    found = np.unique(np.concatenate([np.unique(mask) for mask in samples]))
+    area = float(np.median([float((mask > 0.0).mean()) for mask in samples]))
+    return len(found) <= MOST_OBJECTS and area > LEAST_AREA
 
 
 def is_turned(alpha: Float32[np.ndarray, "height width"]) -> bool:

@@ -136,6 +136,16 @@ def test_masks_that_do_not_tell_which_side_is_the_person_are_refused(write):
         open_masks(write([framed]))
 
 
+def test_numbers_of_objects_in_grey_are_masks_and_dark_noise_is_none(write, rng):
+    two = np.where(person() > 127, 2, 0).astype(np.uint8)
+    two[:5, :5] = 1
+    masks = open_masks(write([two, two], "numbers"))
+    np.testing.assert_array_equal(masks.alpha(0, SIZE), (two > 0).astype(np.float32))
+    noise = (rng.uniform(size=(40, 30)) < 0.005).astype(np.uint8) * 3
+    dark = open_masks(write([noise, noise], "noise"), invert=False)
+    assert dark.alpha(1, SIZE).max() < 0.02
+
+
 def test_pictures_are_no_masks(write, rng):
     photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
     for invert in (None, False):
