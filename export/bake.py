@@ -34,6 +34,9 @@ MARGIN_M = 0.012
 VOXEL_SHARE = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 FINEST_M, COARSEST_M = 0.0038, 0.006
+FINER = 0.79
+"""So much finer are voxels where the player is too far from the renderer: 0.6 to 1.1 dB, and 1.4
+times the bytes. An avatar learnt from few photographs weighs less than others."""
 HASTY = 1.5
 """How much coarser a package is that cannot wait."""
 POSITION_STEP, NORMAL_STEP = 32, 7
@@ -70,6 +73,10 @@ class BakeConfig:
         """For a field whose finest cells are that long: about two voxels each; fine-tuned."""
         voxel_m = float(np.clip(VOXEL_SHARE * finest_m, FINEST_M, COARSEST_M))
         return cls(voxel_m=voxel_m, tuned=TUNED)
+
+    def finer(self) -> "BakeConfig":
+        """For an avatar that these voxels do not show well enough."""
+        return replace(self, voxel_m=FINER * self.voxel_m)
 
     def hasty(self) -> "BakeConfig":
         """For a package that is wanted at once, and that a finer one will follow."""

@@ -29,9 +29,10 @@ from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
 from export.package import AvatarPackage, PackageDraft
 from export.player import ALIKE, Likeness, Player, premultiplied
 from export.rules import DrawingRules
+from export.seen import Picture, Renderer, View
 from export.tables import Tables
 from export.tiers import TIERS
-from export.tuning import Picture, Progress, Renderer, Tuned, View, tuned
+from export.tuning import Progress, Tuned, far_off, tuned
 from export.twin import Shot, draw
 from preprocess.pose import BodyPose
 
@@ -159,7 +160,12 @@ def export_field(
     with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
         baked = beside.submit(tables_of, lattice, rig, config)
         exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
-        better = _tuned(baked.result(), rig, renderer, views, config, beside, progress)
+
+        def finer() -> Tables:
+            better = config.finer()
+            return tables_of(read(field_at, rig, occupied=occupied, config=better), rig, better)
+
+        better = _tuned(baked.result(), finer, rig, renderer, views, config, beside, progress)
         tables = better.tables
         compressed = beside.submit(draft.add_tables, tables)
         rules = {tier: better.rules if tier == "hq" else TIERS[tier] for tier in config.tiers}
@@ -199,6 +205,7 @@ def export_field(
 
 def _tuned(
     tables: Tables,
+    finer: Callable[[], Tables],
     rig: Rig,
     renderer: Renderer,
     views: Sequence[View],
@@ -206,11 +213,17 @@ def _tuned(
     beside: Executor,
     progress: Progress,
 ) -> Tuned:
-    """Fine-tunes, if that is wanted; Ctrl-C leaves the bricks as they are, and goes on."""
+    """Fine-tunes, if that is wanted, finer bricks where the player is too far from the renderer.
+
+    Ctrl-C leaves the bricks as they are, and goes on.
+    """
     if config.tuned:
         with suppress(KeyboardInterrupt):
+            rules = TIERS["hq"]
+            if far_off(tables, rig, rules, renderer, views=views, beside=beside):
+                tables = finer()
             return tuned(
-                tables, rig, TIERS["hq"], renderer,
+                tables, rig, rules, renderer,
                 views=views, pictures=config.tuned, beside=beside, progress=progress,
             )  # fmt: skip
     return Tuned(tables=tables, rules=TIERS["hq"], psnr=None)

@@ -92,12 +92,13 @@ def _with_further(
         depth = (before.enter * before.ray[2]).take(kept) + scene.rules.gap_m
         limits = limits_at(scene, window, cell, depth)
         hidden = hidden or hidden_by(scene, hull.posed, hull.surfels, splats, limits)
-        keys = keys_behind(scene, hidden, limits, cell)
+        keys = keys_behind(scene, hull.surfels, hidden, limits, cell, before.surfel.take(kept))
         there = keys < FAR
         keys, kept = keys.compressed(there), kept.compressed(there)
         number = number.take(kept)
         seen_from = Layer(
             ray=taken(before.ray, kept),
+            surfel=before.surfel.take(kept),
             canonical=taken(before.canonical, kept),
             camera=taken(before.camera, kept),
             color=before.color,

@@ -15,6 +15,8 @@ from export.rules import DrawingRules
 from preprocess.pose import BodyPose
 
 FORMAT = 3
+LATER = {"sheet_gap_m"}
+"""What the first packages of this format do not have: then it is as it always was."""
 GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""
 JOINTS = (
@@ -193,6 +195,8 @@ def _record(kind: type[Record], values: dict[str, Any]) -> Record:
     """A record of numbers and of tuples of three numbers."""
     content: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
+        if field.name in LATER and field.name not in values:
+            continue
         value, whole = values[field.name], "int" in str(field.type)
         if "tuple" in str(field.type):
             content[field.name] = tuple(_number(v, whole) for v in value)

@@ -94,12 +94,6 @@ class Pieces:
         }
         return Pieces(first=self.first + behind.first, **columns)
 
-    def of_layers(self, count: int) -> "Pieces":
-        """Those of the first few depth layers alone."""
-        kept = np.flatnonzero(self.layer < count)
-        columns = {name: getattr(self, name)[kept] for name in _COLUMNS}
-        return Pieces(first=np.searchsorted(kept, self.first).astype(np.int64), **columns)
-
     @classmethod
     def joined(cls, many: "Sequence[Pieces]") -> "Pieces":
         """The rays of many looks, one after the other."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from export.columns import Vector, dot
 from export.nodes import Value
 from export.posing import Posed
 from export.scene import Scene
@@ -220,7 +221,7 @@ def hidden_by(
         limits: The first ones (`limits_at`); later ones only grow deeper.
     """
     graph, window, side = scene.graph, splats.window, splats.side
-    lowest = _spread(scene, limits, splats)
+    lowest = _spread(scene, limits, splats) - slack_of(scene)
     lost = (side - 1) * (window.stride + 1)
     lowest = graph.concatenated([lowest, graph.filled(graph.shape(lost), np.float32(NOWHERE))])
     number = graph.range(graph.constant(np.int32(len(scene.tables.surfels))))
@@ -237,9 +238,47 @@ def hidden_by(
     return Hidden(window=window, cell=covered.reshaped(-1), key=key, depth=depth)
 
 
-def keys_behind(scene: Scene, hidden: Hidden, limits: Value, cell: Value) -> Value:
-    """The least key of what lies deeper than the limits, for some cells of the buffer."""
-    window = hidden.window
-    behind = hidden.depth > limits.take(hidden.cell)
-    covered = scene.graph.where(behind, hidden.cell, window.cells.cast(np.int32))
-    return _scattered(scene, window, covered, hidden.key).take(cell)
+def slack_of(scene: Scene) -> float:
+    """By how much other sheets' surfels may fall short of a limit, metres; 0 if by nothing."""
+    return max(scene.rules.gap_m - scene.rules.sheet_gap_m, 0.0)
+
+
+def keys_behind(
+    scene: Scene, surfels: Surfels, hidden: Hidden, limits: Value, cell: Value, before: Value
+) -> Value:
+    """The least key of what lies deeper than the limits, for some cells of the buffer.
+
+    Args:
+        scene: What is drawn.
+        surfels: The hull.
+        hidden: What comes into question.
+        limits: As `limits_at` makes them.
+        cell: Cells of the buffer.
+        before: The surfel that was seen in each of them.
+    """
+    graph, window = scene.graph, hidden.window
+    limit = limits.take(hidden.cell)
+    cells, keys = hidden.cell, hidden.key
+    if slack_of(scene) > 0.0:
+        near = graph.range(graph.size(keys).cast(np.int32))
+        near = near.compressed(hidden.depth > limit - slack_of(scene))
+        cells, keys = cells.take(near), keys.take(near)
+        passed = graph.filled(graph.shape(window.cells + 1), np.int32(0)).scattered(cell, before)
+        same = _one_sheet(scene, surfels, keys.masked((1 << SURFEL_BITS) - 1), passed.take(cells))
+        deeper = hidden.depth.take(near) > limit.take(near)
+        cells = graph.where(deeper, cells, graph.where(same, window.cells.cast(np.int32), cells))
+    else:
+        cells = graph.where(hidden.depth > limit, cells, window.cells.cast(np.int32))
+    return _scattered(scene, window, cells, keys).take(cell)
+
+
+def _one_sheet(scene: Scene, surfels: Surfels, one: Value, other: Value) -> Value:
+    """Whether pairs of surfels are no farther apart in canonical space than as they are posed."""
+    rules = scene.rules
+
+    def apart(columns: Vector) -> Value:
+        between = [column.take(one) - column.take(other) for column in columns]
+        return dot(between, between).sqrt()
+
+    canonical = [scene.columns[f"position_{letter}"] for letter in "xyz"]
+    return apart(canonical) < apart(surfels.camera) * rules.same_share + rules.same_m

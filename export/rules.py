@@ -35,6 +35,8 @@ class DrawingRules:
         hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
             filled.
         gap_m: Surfels of a further layer lie at least this far behind those of the one before it.
+        sheet_gap_m: The same of surfels of another sheet; below 0 they may lie before. Where two
+            limbs touch, each lies within the other's border. No less than `gap_m` turns it off.
         same_m, same_share: Where two layers' surfels are no farther apart in canonical space
             than this, and so many times as far as in the camera's, they belong to one sheet: the
             second ray begins where the first one ends.
@@ -70,3 +72,4 @@ class DrawingRules:
     facing: float = 0.2
     transmitted: float = 0.02
     nearest_m: float = 0.1
+    sheet_gap_m: float = 0.01

@@ -20,13 +20,15 @@ class Layer:
 
     Attributes:
         ray: Directions in the camera's frame, of length 1.
-        canonical, camera: Where the surfel that each ray sees is.
+        surfel: What each ray sees, and
+        canonical, camera: where that is.
         color: Premultiplied.
         light: What is let through, in [0, 1].
         enter, end: Where the ray enters the hull and where it ends, metres along it.
     """
 
     ray: Vector
+    surfel: Value
     canonical: Vector
     camera: Vector
     color: Vector
@@ -96,6 +98,7 @@ def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | No
         color, light = block.color, block.light
     return Layer(
         ray=ray,
+        surfel=surfel,
         canonical=canonical,
         camera=camera,
         color=color,

@@ -8,29 +8,22 @@ rays of the renderer, and each shares its error among the voxels that it has rea
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from avatar.rig import Rig
 from capture.camera import Camera
 from export.codec import with_borders
-from export.descent import pushed, shown
-from export.pieces import Pieces
+from export.descent import pushed
 from export.rules import DrawingRules
+from export.seen import Codes, Onlooker, Renderer, Seen, View
 from export.tables import BRICK, COLOR_STEP, DENSITY_STEP, Bricks, Tables, rounded
-from export.twin import Shot, look_at
-from export.twin_march import PosedNodes, Rays
-from preprocess.pose import BodyPose
 
 TUNED_PX, JUDGED_PX = 540, 256
 """Longer side of the pictures that bricks are tuned on, and of those that judge."""
 ENLARGED = 2
 """No picture is more than so many times as large as the one that was asked for."""
-MOST_PIECES = 1_600_000
-"""No more pictures are learnt from when there are so many: through fog fewer of them are enough."""
 LEAST_GAIN_DB = 0.01
 ROUNDS = 4
 """Three quarters of what can be gained come with the first two; more learn the rays by heart."""
@@ -45,61 +38,17 @@ TILTED = 0.2
 """Deviation of the cameras' height, radians about the pelvis."""
 NOVEL = 2
 """New poses that judge, besides the views that were given."""
-LAYER_GAIN_DB = 0.2
-"""One depth layer more is drawn where new poses win this much by it. It costs 3 % of a picture's
-time: an actor wins 0.06, a real person learnt from few photographs half a decibel."""
+WANTED_DB = 40.0
+"""Where the player is farther from the renderer than this in poses as filmed, more of what lies
+behind the first depth layer is drawn, if new poses win by it."""
+NEAR = 2
+"""Pictures that say how much it shows, of poses near the given ones."""
+DEEPER = {"layers": 3, "sheet_gap_m": -0.015}
+"""6 % of a picture's time. Where limbs touch it wins a decibel and more."""
+LEAST_DEEPER_GAIN_DB = 0.2
 
-View = tuple[BodyPose, Camera]
-"""A pose and a camera that looks at it."""
-Picture = Float32[np.ndarray, "height width 4"]
-Renderer = Callable[[BodyPose, Camera], Picture]
-"""The exact picture of the avatar: premultiplied RGBA in [0, 1]."""
 Progress = Callable[[float], None]
 """Told how much of the work is done, from 0 to 1."""
-
-
-class Codes(NamedTuple):
-    """Codes of every brick's own voxels, the empty brick's first, before they are rounded."""
-
-    density: Float32[np.ndarray, "voxels"]
-    color: Float32[np.ndarray, "voxels 3"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Seen:
-    """Pictures as rays.
-
-    Attributes:
-        pieces: Where the player samples.
-        wanted: What the renderer shows there.
-        pictures: For each picture its first ray, and the end.
-        pixels: How many pixels each picture has.
-        missed: Of each, the squared error on white of pixels that the player leaves empty.
-    """
-
-    pieces: Pieces
-    wanted: Float32[np.ndarray, "rays 4"]
-    pictures: Int64[np.ndarray, "pictures_and_one"]
-    pixels: Int64[np.ndarray, "pictures"]
-    missed: Float32[np.ndarray, "pictures"]
-
-    def of_layers(self, count: int) -> "Seen":
-        """The same, drawn with so many depth layers."""
-        return replace(self, pieces=self.pieces.of_layers(count))
-
-    def psnr(self, tables: Tables, rules: DrawingRules, codes: Codes) -> float:
-        """Of the player's pictures on white to the renderer's, dB, mean over pictures."""
-        return float(np.mean(self.psnr_of_each(tables, rules, codes)))
-
-    def psnr_of_each(
-        self, tables: Tables, rules: DrawingRules, codes: Codes
-    ) -> Float64[np.ndarray, "pictures"]:
-        """The same of each picture."""
-        out = shown(self.pieces, rules, tables.bricks.index, *codes)
-        error = (_on_white(out) - _on_white(self.wanted)) ** 2
-        per_ray = np.concatenate([[0.0], np.cumsum(error.sum(axis=1), dtype=np.float64)])
-        squares = per_ray[self.pictures[1:]] - per_ray[self.pictures[:-1]] + self.missed
-        return -10.0 * np.log10(squares / (3.0 * self.pixels) + 1e-10)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,7 +57,7 @@ class Tuned:
 
     Attributes:
         tables: The best that was seen; the given ones if nothing was better.
-        rules: How they are drawn: as asked, or with one depth layer more.
+        rules: How they are drawn: as asked, or with more behind the first depth layer.
         psnr: Of pictures that were not learnt from to the renderer's, dB, before and after; None
             where nothing was tuned.
     """
@@ -116,6 +65,24 @@ class Tuned:
     tables: Tables
     rules: DrawingRules
     psnr: tuple[float, float] | None
+
+
+def far_off(
+    tables: Tables,
+    rig: Rig,
+    rules: DrawingRules,
+    renderer: Renderer,
+    *,
+    views: Sequence[View],
+    beside: Executor,
+) -> bool:
+    """Whether the player is farther from the renderer than is wanted, as baked. As for `tuned`."""
+    onlooker = Onlooker(
+        tables=tables, codes=_codes(tables.bricks), rig=rig, renderer=renderer, beside=beside,
+        told=lambda: None,
+    )  # fmt: skip
+    near = list(_near(views, rig, NEAR, BENT, np.random.default_rng(1), JUDGED_PX))
+    return onlooker.psnr(onlooker.looked(near, rules), rules) < WANTED_DB
 
 
 def tuned(
@@ -132,8 +99,8 @@ def tuned(
     """Bricks with which the player shows more of what the renderer shows.
 
     Learns from poses near the given ones, seen from all sides. After each round the rounded bricks
-    are judged by the given views and by new poses, which no round has seen. Before that the new
-    poses say whether one depth layer more is worth its time.
+    are judged by the given views and by new poses, which no round has seen. Before that, where the
+    player shows too little, the new poses say whether drawing more of what lies behind helps.
 
     Args:
         tables: As baked.
@@ -149,30 +116,15 @@ def tuned(
     learnt = list(_near(views, rig, pictures, BENT, generator, TUNED_PX))
     asked = [(pose, _within(camera, JUDGED_PX)) for pose, camera in views]
     asked += list(_near(views, rig, NOVEL, NOVEL_BENT, generator, JUDGED_PX))
-    total = len(learnt) + len(asked) + ROUNDS
-    steps = iter(range(1, total + 1))
-
-    codes = _codes(tables.bricks)
-
-    def looked(some: Sequence[View], rules: DrawingRules) -> Seen:
-        parts = []
-        for pose, camera in some:
-            traced = beside.submit(_traced, tables, codes, rig, rules, pose, camera)
-            picture = renderer(pose, camera)
-            parts.append((*traced.result(), picture))
-            progress(next(steps) / total)
-            if sum(len(pieces.step_m) for _, pieces, _ in parts) > MOST_PIECES:
-                break
-        return _seen(parts)
-
-    deeper = replace(rules, layers=rules.layers + 1)
-    judge = looked(asked, deeper)
-    gain = [
-        seen.psnr_of_each(tables, rules, codes)[-NOVEL:].mean()
-        for seen in (judge.of_layers(rules.layers), judge)
-    ]
-    rules = deeper if gain[1] - gain[0] >= LAYER_GAIN_DB else rules
-    judge, lesson = judge.of_layers(rules.layers), looked(learnt, rules)
+    near = list(_near(views, rig, NEAR, BENT, generator, JUDGED_PX))
+    total = len(learnt) + len(asked) + NEAR + 2 * NOVEL + ROUNDS
+    steps, codes = iter(range(1, total + 1)), _codes(tables.bricks)
+    onlooker = Onlooker(
+        tables=tables, codes=codes, rig=rig, renderer=renderer, beside=beside,
+        told=lambda: progress(next(steps) / total),
+    )  # fmt: skip
+    rules = _deep_enough(onlooker, rules, near=near, novel=asked[-NOVEL:])
+    judge, lesson = onlooker.looked(asked, rules), onlooker.looked(learnt, rules)
     best, first = codes, judge.psnr(tables, rules, codes)
     score = first
     for latent in _rounds(lesson, tables, rules, codes):
@@ -186,6 +138,17 @@ def tuned(
         return Tuned(tables=tables, rules=rules, psnr=(first, first))
     bricks = _bricks(tables.bricks, best)
     return Tuned(tables=replace(tables, bricks=bricks), rules=rules, psnr=(first, score))
+
+
+def _deep_enough(
+    onlooker: Onlooker, rules: DrawingRules, *, near: Sequence[View], novel: Sequence[View]
+) -> DrawingRules:
+    """The rules, or those that draw more of what lies behind, if new poses win by it."""
+    if onlooker.psnr(onlooker.looked(near, rules), rules) >= WANTED_DB:
+        return rules
+    deeper = replace(rules, **DEEPER)
+    before, after = (onlooker.psnr(onlooker.looked(novel, each), each) for each in (rules, deeper))
+    return deeper if after >= before + LEAST_DEEPER_GAIN_DB else rules
 
 
 def _rounds(lesson: Seen, tables: Tables, rules: DrawingRules, baked: Codes) -> Iterator[Codes]:
@@ -220,49 +183,6 @@ def _bricks(bricks: Bricks, codes: Codes) -> Bricks:
     return replace(bricks, voxels=with_borders(bricks.index, core.reshape(shape)))
 
 
-def _traced(
-    tables: Tables, codes: Codes, rig: Rig, rules: DrawingRules, pose: BodyPose, camera: Camera
-) -> tuple[Int64[np.ndarray, "rays"], Pieces]:
-    """Numbers of the covered pixels, and the player's samples on their rays."""
-    camera_from_body = camera.camera_from_world @ rig.world_from_body(pose)
-    bones = camera_from_body @ rig.body_from_canonical(pose.joint_rotations)
-    shot = Shot(
-        bones=bones[:, :3].astype(np.float32),
-        focal=np.array(camera.focal_px, dtype=np.float32),
-        center=np.array(camera.center_px, dtype=np.float32),
-        size_px=camera.size_px,
-        samples=rules.samples,
-    )
-    bricks, pieces = tables.bricks, list[Pieces]()
-
-    def marched(nodes: PosedNodes, rays: Rays) -> Float32[np.ndarray, "rays 4"]:
-        pieces.append(Pieces.of_first(rays, nodes, bricks, rules))
-        return shown(pieces[0], rules, bricks.index, *codes)
-
-    look = look_at(tables, rules, shot, marched)
-    whole = pieces[0]
-    for number in range(1, rules.layers):
-        whole = whole.followed_by(Pieces.behind(look, number, bricks, rules))
-    return look.pixel, whole
-
-
-def _seen(parts: Sequence[tuple[Int64[np.ndarray, "_"], Pieces, Picture]]) -> Seen:
-    wanted, missed = [], []
-    for pixel, _, picture in parts:
-        colors = picture.reshape(-1, 4)
-        left = (_on_white(colors) - 1.0) ** 2
-        left[pixel] = 0.0
-        wanted.append(colors[pixel])
-        missed.append(left.sum(dtype=np.float64))
-    return Seen(
-        pieces=Pieces.joined([pieces for _, pieces, _ in parts]),
-        wanted=np.concatenate(wanted),
-        pictures=np.cumsum([0, *(len(pixel) for pixel, _, _ in parts)]),
-        pixels=np.array([picture[..., 0].size for *_, picture in parts]),
-        missed=np.array(missed, dtype=np.float32),
-    )
-
-
 def _near(
     views: Sequence[View],
     rig: Rig,
@@ -291,7 +211,3 @@ def _near(
 
 def _within(camera: Camera, longest_px: int) -> Camera:
     return camera.fitted(min(longest_px, ENLARGED * max(camera.size_px)))
-
-
-def _on_white(colors: Float32[np.ndarray, "rays 4"]) -> Float32[np.ndarray, "rays 3"]:
-    return np.clip(colors[:, :3] + (1.0 - colors[:, 3:]), 0.0, 1.0)

@@ -142,7 +142,15 @@ def look_at(
         again = again[light[again] > rules.transmitted]
         limit = np.full((height, width), 1e6, dtype=np.float32)
         limit.reshape(-1)[covered[again]] = depth[again] + np.float32(rules.gap_m)
-        there = deep_enough > np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
+        limits = np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
+        there = deep_enough > limits
+        if rules.sheet_gap_m < rules.gap_m:
+            passed = np.zeros((height, width), dtype=np.int64)
+            passed.reshape(-1)[covered[again]] = _surfel(keys[again])
+            limits -= np.float32(rules.gap_m - rules.sheet_gap_m)
+            near = np.flatnonzero(~there & (deep_enough > limits))
+            before = np.pad(passed, side).reshape(-1)[cell[near]]
+            there[near] = ~_one_sheet(rules, tables, posed.splatted, _surfel(key[near]), before)
         buffer = np.full(cells, FAR, dtype=np.int64)
         np.minimum.at(buffer.reshape(-1), cell[there], key[there])
         found = buffer[side:-side, side:-side].ravel()[covered]
@@ -153,6 +161,20 @@ def look_at(
         light[again] *= 1.0 - _block(tables, rules, rays)[:, 3]
         depth[again], end[again], keys[again] = entered, rays.end, found[again]
     return Look(pixel=covered, nodes=posed.nodes, first=first, seen=seen, behind=tuple(behind))
+
+
+def _one_sheet(
+    rules: DrawingRules,
+    tables: Tables,
+    camera: Float32[np.ndarray, "surfels 3"],
+    one: Int64[np.ndarray, "pairs"],
+    other: Int64[np.ndarray, "pairs"],
+) -> Bool[np.ndarray, "pairs"]:
+    """Whether pairs of surfels are no farther apart in canonical space than as they are posed."""
+    places = tables.surfels.positions
+    apart = np.linalg.norm(places[one] - places[other], axis=1)
+    posed = np.linalg.norm(camera[one] - camera[other], axis=1)
+    return apart < posed * rules.same_share + rules.same_m
 
 
 def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:

@@ -16,6 +16,7 @@ from export import build
 from export.bake import COARSEST_M, FINEST_M, BakeConfig
 from export.build import export_avatar, export_field
 from export.errors import ExportRefused
+from export.manifest import Manifest
 from export.package import read_package, write_package
 from export.player import Player
 
@@ -353,3 +354,14 @@ def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, 
         player = Player(replace(read_package(exported.path), graphs={"hq": graph}))
         with pytest.raises(BadInput, match=message):
             player.render(*views["bent"])
+
+
+def test_a_package_from_before_sheets_had_a_gap_of_their_own_is_read(exported):
+    text = json.loads(read_package(exported.path).manifest.to_json())
+    rules = text["tiers"]["hq"]["rules"]
+    del rules["sheet_gap_m"]
+    known = Manifest.from_json(json.dumps(text).encode()).tiers["hq"].rules
+    assert known.sheet_gap_m == known.gap_m
+    del rules["gap_m"]
+    with pytest.raises(BadInput, match="damaged"):
+        Manifest.from_json(json.dumps(text).encode())

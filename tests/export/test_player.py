@@ -50,13 +50,14 @@ def test_the_graph_draws_what_its_twin_draws(
     assert likeness.alike, likeness
 
 
+@pytest.mark.parametrize("sheet_gap_m", [0.01, -0.015])
 @pytest.mark.parametrize("layers", [1, 2, 3, 4])
 def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
-    exported, tables, stand_in, bent, camera, layers
+    exported, tables, stand_in, bent, camera, layers, sheet_gap_m
 ):
     package = read_package(exported.path)
     note = package.manifest.tiers["hq"]
-    rules = replace(note.rules, layers=layers)
+    rules = replace(note.rules, layers=layers, sheet_gap_m=sheet_gap_m)
     tiers = {**package.manifest.tiers, "hq": replace(note, rules=rules)}
     graph = build_graph(tables, rules).SerializeToString()
     player = Player(
