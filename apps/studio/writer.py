@@ -220,6 +220,12 @@ def _write_video(
     silence_opencv()
     code = cv2.VideoWriter.fourcc(*"FFV1")
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, stage.cameras[0].size_px)
+    if not writer.isOpened():
+        path.write_bytes(bytes(1 << 16))  # says so if there is no room
+        raise BadInput(
+            f"OpenCV {cv2.__version__} cannot write a lossless video (FFV1 in .mp4); 4.13 or newer "
+            "can: pip install --upgrade opencv-contrib-python-headless."
+        )
     generator = np.random.default_rng([config.seed, 5])
     try:
         for index, (rgb, alpha) in enumerate(stage.pictures(motion)):
