@@ -220,11 +220,11 @@ def _tuned(
     if config.tuned:
         with suppress(KeyboardInterrupt):
             rules = TIERS["hq"]
-            if far_off(tables, rig, rules, renderer, views=views, beside=beside):
-                tables = finer()
+            far = far_off(tables, rig, rules, renderer, views=views, beside=beside)
+            tables = finer() if far else tables
             return tuned(
                 tables, rig, rules, renderer,
-                views=views, pictures=config.tuned, beside=beside, progress=progress,
+                views=views, pictures=config.tuned, beside=beside, deepens=far, progress=progress,
             )  # fmt: skip
     return Tuned(tables=tables, rules=TIERS["hq"], psnr=None)
 

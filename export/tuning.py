@@ -39,9 +39,9 @@ TILTED = 0.2
 NOVEL = 2
 """New poses that judge, besides the views that were given."""
 WANTED_DB = 40.0
-"""Where the player is farther from the renderer than this in poses as filmed, more of what lies
-behind the first depth layer is drawn, if new poses win by it."""
-NEAR = 2
+"""Where the player is farther from the renderer than this in poses as filmed, voxels are finer, and
+more of what lies behind the first depth layer is drawn, if new poses win by it."""
+NEAR = 4
 """Pictures that say how much it shows, of poses near the given ones."""
 DEEPER = {"layers": 3, "sheet_gap_m": -0.015}
 """6 % of a picture's time. Where limbs touch it wins a decibel and more."""
@@ -94,13 +94,13 @@ def tuned(
     views: Sequence[View],
     pictures: int,
     beside: Executor,
+    deepens: bool = False,
     progress: Progress = lambda _: None,
 ) -> Tuned:
     """Bricks with which the player shows more of what the renderer shows.
 
     Learns from poses near the given ones, seen from all sides. After each round the rounded bricks
-    are judged by the given views and by new poses, which no round has seen. Before that, where the
-    player shows too little, the new poses say whether drawing more of what lies behind helps.
+    are judged by the given views and by new poses, which no round has seen.
 
     Args:
         tables: As baked.
@@ -110,20 +110,20 @@ def tuned(
         views: Poses and cameras of the avatar.
         pictures: How many to learn from, at most.
         beside: Where the player's rays are followed meanwhile.
+        deepens: Whether more of what lies behind is drawn if new poses win by it.
         progress: Told how much is done.
     """
     generator = np.random.default_rng(0)
     learnt = list(_near(views, rig, pictures, BENT, generator, TUNED_PX))
     asked = [(pose, _within(camera, JUDGED_PX)) for pose, camera in views]
     asked += list(_near(views, rig, NOVEL, NOVEL_BENT, generator, JUDGED_PX))
-    near = list(_near(views, rig, NEAR, BENT, generator, JUDGED_PX))
-    total = len(learnt) + len(asked) + NEAR + 2 * NOVEL + ROUNDS
+    total = len(learnt) + len(asked) + 2 * NOVEL + ROUNDS
     steps, codes = iter(range(1, total + 1)), _codes(tables.bricks)
     onlooker = Onlooker(
         tables=tables, codes=codes, rig=rig, renderer=renderer, beside=beside,
         told=lambda: progress(next(steps) / total),
     )  # fmt: skip
-    rules = _deep_enough(onlooker, rules, near=near, novel=asked[-NOVEL:])
+    rules = _deep_enough(onlooker, rules, asked[-NOVEL:]) if deepens else rules
     judge, lesson = onlooker.looked(asked, rules), onlooker.looked(learnt, rules)
     best, first = codes, judge.psnr(tables, rules, codes)
     score = first
@@ -140,12 +140,8 @@ def tuned(
     return Tuned(tables=replace(tables, bricks=bricks), rules=rules, psnr=(first, score))
 
 
-def _deep_enough(
-    onlooker: Onlooker, rules: DrawingRules, *, near: Sequence[View], novel: Sequence[View]
-) -> DrawingRules:
+def _deep_enough(onlooker: Onlooker, rules: DrawingRules, novel: Sequence[View]) -> DrawingRules:
     """The rules, or those that draw more of what lies behind, if new poses win by it."""
-    if onlooker.psnr(onlooker.looked(near, rules), rules) >= WANTED_DB:
-        return rules
     deeper = replace(rules, **DEEPER)
     before, after = (onlooker.psnr(onlooker.looked(novel, each), each) for each in (rules, deeper))
     return deeper if after >= before + LEAST_DEEPER_GAIN_DB else rules

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export import tuning
 from export.bake import FINER
 from export.build import export_field
 from export.descent import pushed, shown
@@ -141,17 +140,16 @@ def test_what_is_exact_already_stays(tune, renderer, tables):
     assert after.psnr[0] == after.psnr[1] > 60.0
 
 
-def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt, monkeypatch):
+def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
     def lies(pose, camera):
         """The truth to whoever judges, who comes first; something else to whoever learns."""
         lies.asked += 1
         picture = renderer(pose, camera)
-        return picture if lies.asked <= 6 else picture[..., [2, 1, 0, 3]]
+        return picture if lies.asked <= 4 else picture[..., [2, 1, 0, 3]]
 
-    monkeypatch.setattr(tuning, "WANTED_DB", 0.0)
     lies.asked = 0
     assert tune(spoilt, lies).tables is spoilt
-    assert lies.asked == 12
+    assert lies.asked == 10
 
 
 def test_progress_is_told_and_only_grows(tune, renderer, spoilt):
@@ -185,9 +183,7 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
-def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(
-    tune, tables, stand_in, monkeypatch
-):
+def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
     more = replace(RULES, **DEEPER)
 
     def deeper(pose, camera):
@@ -196,10 +192,9 @@ def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(
     def as_asked(pose, camera):
         return draw(tables, RULES, shot_of(stand_in.rig, pose, camera))
 
-    assert tune(tables, deeper).rules == RULES  # near enough
-    monkeypatch.setattr(tuning, "WANTED_DB", 200.0)
-    assert tune(tables, deeper).rules == more
-    assert tune(tables, as_asked).rules == RULES
+    assert tune(tables, deeper).rules == RULES
+    assert tune(tables, deeper, deepens=True).rules == more
+    assert tune(tables, as_asked, deepens=True).rules == RULES
 
 
 def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
