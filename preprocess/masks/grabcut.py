@@ -12,13 +12,14 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess.body import ShapedBody
 from preprocess.masks.behind import Behind
+from preprocess.masks.hair import HAIR_M, HEAD, knots, near_head
 from preprocess.masks.matte import softened
 from preprocess.masks.shell import Around, Shell
 from preprocess.pose import BodyPose
@@ -48,12 +49,6 @@ and the limits must be wider."""
 WIDER_M, NARROWER_M, WIDEST_M = 0.012, 0.002, 0.05
 OUTSIDE_WIDER = 1.5
 """By how much the limits follow from frame to frame; outside it counts so much more."""
-
-HEAD_M, HAIR_M = 0.3, 0.06
-"""Hair stands off farther than clothes: so near to the head's middle, outside the shell at least so
-much is in doubt, and what is found there is no leak."""
-HEAD = 15
-"""The head's joint."""
 
 AROUND_M = 0.25
 """How much of the background is looked at."""
@@ -175,7 +170,7 @@ class GrabCut:
             raise BadInput("the posed body is not in the picture")
         fine = self._shell.drawn(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
-        hair = _near(around.skin[self._head], camera, HEAD_M * around.px_per_m)
+        hair = near_head(around.skin[self._head], camera, around.px_per_m)
         shape = _Shape(fine=fine, covered=covered, away=_away(covered > 0.5), hair=hair)
         if (shape.away < 0.0).sum() < 16:
             raise BadInput("the posed body is not in the picture")
@@ -248,7 +243,7 @@ class GrabCut:
         Cut and shell are usually `_off_m` apart. What that is more than the cut's own error is the
         pose's, and so the shell's. Where they are farther apart than that, one of them is wrong:
         the cut, as far as the shell is known and the poses are good. Where what lies behind
-        decided, the shell has no say.
+        decided, and about hair that stands off in one piece, the shell has no say.
         """
         shell = max(self._off_m**2 - CUT_OFF_M**2, SHELL_OFF_M**2)
         shell += (UNKNOWN_OFF_M * (1.0 - around.known)) ** 2
@@ -256,6 +251,8 @@ class GrabCut:
         apart = (cut.away - shape.away) / np.float32(around.px_per_m)
         leaked = np.maximum(apart**2 - np.float32(self._off_m**2), np.float32(0.0))
         leaked[shape.hair & (apart < 0.0)] = 0.0
+        beyond = cut.person & shape.hair & (shape.away > 0.0)
+        shell = shell + (knots(beyond, around.px_per_m) * np.float32(HAIR_M)) ** 2
         cut_off = np.float32(CUT_OFF_M**2) + np.float32(trusted) * leaked
         return cut_off / (cut_off + np.float32(shell)) * (np.float32(1.0) - cut.sure)
 
@@ -276,16 +273,6 @@ def _mixed(
         way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
         covered = cv2.resize(shape.fine, size_px, interpolation=way)
     return weight * covered + (np.float32(1.0) - weight) * alpha
-
-
-def _near(
-    points: Float[np.ndarray, "points 3"], camera: Camera, radius_px: float
-) -> Bool[np.ndarray, "height width"]:
-    """The pixels around the middle of some points."""
-    x, y = camera.project(points.mean(axis=0, keepdims=True))[0]
-    width, height = camera.size_px
-    across, down = np.arange(width) + 0.5 - x, np.arange(height) + 0.5 - y
-    return across**2 + (down**2)[:, None] < radius_px**2
 
 
 def _away(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:

@@ -13,9 +13,10 @@ from preprocess.kinematics import rotation_matrices
 from preprocess.masks import segmenter
 from preprocess.masks.behind import BRIGHTEST, DARKEST, UNLIKE, Behind
 from preprocess.masks.grabcut import GrabCut, _away, _Cut, _Shape
+from preprocess.masks.hair import knots
 from preprocess.masks.outline import Outline
 from preprocess.masks.segmenter import make_segmenter, segmenter_name
-from preprocess.masks.shell import Around, Shell
+from preprocess.masks.shell import FEET, Around, Shell
 from preprocess.pose import BodyPose
 
 SIZE = (160, 200)
@@ -233,6 +234,33 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
             shell.vote(around, camera, rgb, leaked.astype(np.float32), away, (limit, limit))
         thickness.append(float(np.median(shell._thickness()[0][around.rim])))
     assert thickness[0] < thickness[1] - 0.005
+
+
+def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
+    """Of five masks two reach 3 cm beyond the skin, the others end at it."""
+    large, shell, pose = camera.resized((480, 600)), Shell(shaped), standing(shaped)
+    for thick_m in (0.03, 0.0, 0.0, 0.03, 0.0) * 4:
+        around = shell.around(pose, large)
+        assert around is not None
+        mask = Outline(shaped).filled(around.skin + thick_m * around.normals, large)
+        covered = cv2.resize(
+            shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA
+        )
+        rgb = np.repeat(mask[..., None] * np.uint8(200), 3, axis=2)
+        shell.vote(around, large, rgb, mask.astype(np.float32), _away(covered > 0.5), (0.2, 0.2))
+    thickness, known = shell._thickness()
+    feet, legs = np.isin(shell._limb, FEET), np.isin(shell._limb, (1, 2, 4, 5))
+    assert np.median(thickness[feet & (known == 1.0)]) > 0.02
+    assert np.median(thickness[legs & (known == 1.0)]) < 0.01
+
+
+def test_a_knot_of_hair_is_wide_in_all_directions_and_a_leak_is_not():
+    beyond = np.zeros((40, 60), dtype=bool)
+    beyond[4:10, 30:36] = True  # 6 cm wide and high
+    beyond[20:22, 30:50] = True  # a stripe 2 cm high
+    expected = np.zeros_like(beyond)
+    expected[3:11, 29:37] = True
+    np.testing.assert_array_equal(knots(beyond, 100.0), expected)
 
 
 def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
