@@ -92,10 +92,10 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     from export.player import Player
     from preprocess.body_file import load_body
     from preprocess.camera_file import read_cameras
+    from preprocess.content import read_content
     from preprocess.masks.files import open_masks, read_mask
     from preprocess.person_file import read_person
     from preprocess.poses import read_poses
-    from preprocess.poses.content import read_content
 
     embedded, film = load_body(), open_source(seeds / "captures" / "film")
 

@@ -141,3 +141,13 @@ class Camera:
         rays, zero = rays.reshape(-1, 1, 3).astype(np.float64), np.zeros(3)
         bent, _ = cv2.projectPoints(rays, zero, zero, np.eye(3), np.array(self.distortion))
         return np.asarray(bent).reshape(plane.shape)
+
+
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether two pictures have one aspect ratio: the larger shrinks to the smaller within 1 px."""
+    large, small = sorted((a, b), key=max, reverse=True)
+    scale = max(small) / max(large)
+    return all(
+        abs(side * scale - wanted) <= max(1.0, 0.01 * wanted)
+        for side, wanted in zip(large, small, strict=True)
+    )

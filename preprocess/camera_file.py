@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from capture.camera import Camera
+from capture.camera import Camera, same_shape
 from capture.errors import BadInput
 from capture.source import Source
 from preprocess.cameras.door import read_named
 from preprocess.cameras.matching import bridged, by_frame
 from preprocess.cameras.rigs import find_rig, read_rig
-from preprocess.masks.files import same_shape
 from preprocess.npz import read_npz
 from preprocess.pose import Lens, Motion
 

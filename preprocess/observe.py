@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.camera import Camera
+from capture.camera import Camera, same_shape
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
-from preprocess.masks.files import Masks, same_shape
+from preprocess.masks.files import Masks
 from preprocess.masks.naming import rows_by_name
 from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.cameras.named import checked_rigid, pinhole
-from preprocess.poses.content import read_content
+from preprocess.content import read_content
 
 INTRINSICS, EXTRINSICS, ZJU = "intri.yml", "extri.yml", "annots.npy"
 

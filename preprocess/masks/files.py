@@ -8,14 +8,15 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 from PIL import Image, ImageOps
 
+from capture.camera import same_shape
 from capture.errors import BadInput
 from capture.images import IMAGE_SUFFIXES, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
+from preprocess.content import read_content
 from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
 from preprocess.masks.polarity import are_numbers, check_are_masks, is_turned, show_background
 from preprocess.npz import read_npz
-from preprocess.poses.content import read_content
 
 NOT_TRACKS = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
 """What a file raises that is nearly one of tracks."""
@@ -121,16 +122,6 @@ def open_masks(path: Path, *, invert: bool | None = None, person: str | None = N
         return _folder_of_masks(path, invert)
     count, read = _file_of_masks(path, person)
     return Masks(path, count, read, invert=invert)
-
-
-def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether two pictures have one aspect ratio: the larger shrinks to the smaller within 1 px."""
-    large, small = sorted((a, b), key=max, reverse=True)
-    scale = max(small) / max(large)
-    return all(
-        abs(side * scale - wanted) <= max(1.0, 0.01 * wanted)
-        for side, wanted in zip(large, small, strict=True)
-    )
 
 
 def _folder_of_masks(path: Path, invert: bool | None) -> Masks:

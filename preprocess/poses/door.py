@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import BadInput
+from preprocess.content import read_content
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion
 from preprocess.poses import (
@@ -23,7 +24,6 @@ from preprocess.poses import (
     wham,
 )
 from preprocess.poses.bridge import LONGEST_GAP, bridged
-from preprocess.poses.content import read_content
 from preprocess.poses.track import People
 from preprocess.poses.unknown import described
 

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from capture.camera import same_shape
 from capture.errors import BadInput
 from capture.opening import open_source
 from capture.quiet import silence_opencv
-from preprocess.masks.files import masks_in_poses, open_masks, same_shape
+from preprocess.masks.files import masks_in_poses, open_masks
 from preprocess.masks.one_file import decoded
 
 SIZE = (30, 40)

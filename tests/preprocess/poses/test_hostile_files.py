@@ -26,9 +26,9 @@ import torch
 from benchmarks.mutations import mutated, random_opcodes
 from capture.errors import BadInput
 from preprocess.body_file import load_body
+from preprocess.content import read_content
 from preprocess.pickles import content as pickles
 from preprocess.poses import read_poses
-from preprocess.poses.content import read_content
 
 FILES = int(os.environ.get("IA_FUZZ", "300"))
 MOST_BYTES = 64 << 20
@@ -231,7 +231,7 @@ def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
     path = tmp_path / "bomb"
     path.write_bytes(make())
     monkeypatch.setattr(pickles, "MAX_BYTES", 16 << 20)
-    monkeypatch.setattr("preprocess.poses.content.MAX_BYTES", 16 << 20)
+    monkeypatch.setattr("preprocess.content.MAX_BYTES", 16 << 20)
     tracemalloc.start()
     try:
         with pytest.raises(BadInput):
