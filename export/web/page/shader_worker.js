@@ -146,6 +146,7 @@ function targetsOf(tier, width, height) {
     nearest_color: target(gl.RGBA8, 1, 1), nearest_depth: target(gl.DEPTH_COMPONENT32F, 1, 1),
     keys: target(gl.R32I, w + border, h + border), depth: target(gl.DEPTH_COMPONENT24, w + border, h + border),
     first_color: target(gl.RGBA32F, w, h), first_extent: target(gl.RGBA32F, w, h),
+    further_color: target(gl.RGBA32F, w, h), further_extent: target(gl.RGBA32F, w, h),
     rgba: target(gl.RGBA8, w, h),
   };
   t.all = Object.values(t).filter((value) => typeof value === "object");
@@ -154,7 +155,8 @@ function targetsOf(tier, width, height) {
     nearest: framebuffer([t.nearest_color], t.nearest_depth),
     keys: framebuffer([t.keys], t.depth),
     first: framebuffer([t.first_color, t.first_extent]),
-    second: framebuffer([t.rgba]),
+    further: framebuffer([t.further_color, t.further_extent]),
+    shown: framebuffer([t.rgba]),
   };
   t.buffers = Object.values(t.into);
   tier.targets = t;
@@ -180,17 +182,27 @@ function draw({ tier: name, bones, camera, width, height, samples }) {
   pass("splat", "keys", [width + border, height + border], tier.textures.surfels);
   gl.disable(gl.DEPTH_TEST);
   pass("first", "first", [width, height]);
-  if (tier.note.rules.layers > 1) {
+  for (let layer = 1; layer < tier.note.rules.layers; layer++) {
     gl.enable(gl.DEPTH_TEST);
     clear(t, "keys");
     pass("behind", "keys", [width + border, height + border], tier.textures.surfels);
     gl.disable(gl.DEPTH_TEST);
+    pass("further", "further", [width, height]);
+    for (const part of [t, t.into]) swap(part); // what was drawn last is what the next begins with
   }
-  pass("second", "second", [width, height]);
+  pass("shown", "shown", [width, height]);
   const rgba = new Uint8Array(4 * width * height);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
   if (gl.isContextLost()) throw new Error("The GPU was taken away; choose the CPU, or load the page again.");
   return { rgba: rgba.buffer, ms: performance.now() - began };
+}
+
+/** Exchanges the two sets of targets that layers are drawn into by turns. */
+function swap(part) {
+  for (const name of Object.keys(part).filter((each) => each.startsWith("first"))) {
+    const other = name.replace("first", "further");
+    [part[name], part[other]] = [part[other], part[name]];
+  }
 }
 
 function clear(t, into) {

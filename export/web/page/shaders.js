@@ -215,7 +215,16 @@ void main() {
 #ifdef BEHIND
   ivec2 here = ivec2(gl_FragCoord.xy) - largest_footprint_px;
   if (any(lessThan(here, ivec2(0))) || any(greaterThanEqual(here, size))) discard;
-  if (!(deep_enough > texelFetch(first_extent, here, 0).x)) discard;
+  vec4 before = texelFetch(first_extent, here, 0);
+  float slack = max(gap_m - sheet_gap_m, 0.0); // surfels of another sheet may fall so much short
+  if (!(deep_enough > before.x - slack)) discard;
+  if (deep_enough <= before.x) {
+    mat3 unused;
+    vec3 mine = texelFetch(surfel_place, at(key & SURFEL_MASK), 0).xyz;
+    vec3 other = texelFetch(surfel_place, at(int(before.z)), 0).xyz;
+    float posed = distance(carried(mine, unused), carried(other, unused));
+    if (distance(mine, other) < posed * same_share + same_m) discard;
+  }
 #endif
   nearest_key = key;
 }`;
@@ -335,7 +344,7 @@ vec3 start_of(Entry e) { return e.canonical + e.beside + (e.begin - e.along) * e
 
 const FIRST = `
 layout(location = 0) out vec4 color;
-layout(location = 1) out vec4 extent; // depth that the second layer must exceed, end, surfel
+layout(location = 1) out vec4 extent; // depth that the next layer must exceed, end, surfel
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int key = key_at(pixel);
@@ -356,26 +365,36 @@ void main() {
   extent = vec4(wanted ? e.enter * ray.z + gap_m : 1e6, e.end, float(surfel), 1.0);
 }`;
 
-const SECOND = `
-uniform sampler2D first_color;
+const FURTHER = `
+uniform sampler2D first_color; // of the layer before
 uniform sampler2D first_extent;
-layout(location = 0) out vec4 rgba;
+layout(location = 0) out vec4 color;
+layout(location = 1) out vec4 extent; // as in the first layer
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
-  vec4 color = texelFetch(first_color, pixel, 0);
-  int key = layers > 1 ? key_at(pixel) : FAR;
-  if (key != FAR) {
-    vec4 before = texelFetch(first_extent, pixel, 0);
-    vec3 ray = ray_of(pixel);
-    Entry e = entry_of(key & SURFEL_MASK, ray);
-    mat3 unused;
-    vec3 first = texelFetch(surfel_place, at(int(before.z)), 0).xyz;
-    bool one_sheet = distance(e.canonical, first) < distance(e.camera, carried(first, unused)) * same_share + same_m;
-    if (one_sheet) e.begin = min(max(e.begin, before.y), e.end);
-    float stride = (e.end - e.begin) / float(second_block);
-    vec4 found = sampled(start_of(e), e.direction, stride, 1.0, second_block);
-    if (e.there) color += (1.0 - color.a) * vec4(found.rgb, 1.0 - found.a);
-  }
+  color = texelFetch(first_color, pixel, 0);
+  extent = vec4(1e6, 0.0, 0.0, 0.0);
+  int key = key_at(pixel);
+  if (key == FAR) return;
+  vec4 before = texelFetch(first_extent, pixel, 0);
+  vec3 ray = ray_of(pixel);
+  int surfel = key & SURFEL_MASK;
+  Entry e = entry_of(surfel, ray);
+  mat3 unused;
+  vec3 first = texelFetch(surfel_place, at(int(before.z)), 0).xyz;
+  bool one_sheet = distance(e.canonical, first) < distance(e.camera, carried(first, unused)) * same_share + same_m;
+  if (one_sheet) e.begin = min(max(e.begin, before.y), e.end);
+  float stride = (e.end - e.begin) / float(second_block);
+  vec4 found = sampled(start_of(e), e.direction, stride, 1.0, second_block);
+  if (e.there) color += (1.0 - color.a) * vec4(found.rgb, 1.0 - found.a);
+  extent = vec4(1.0 - color.a > transmitted ? e.enter * ray.z + gap_m : 1e6, e.end, float(surfel), 1.0);
+}`;
+
+const SHOWN = `
+uniform sampler2D first_color;
+layout(location = 0) out vec4 rgba;
+void main() {
+  vec4 color = texelFetch(first_color, ivec2(gl_FragCoord.xy), 0);
   rgba = clamp(vec4(color.rgb / max(color.a, 1e-6), color.a), 0.0, 1.0);
 }`;
 
@@ -390,7 +409,7 @@ void main() { nothing = vec4(0.0); }`;
 
 const behind = (source) => source.replace("es\n", "es\n#define BEHIND\n");
 
-/** Sources of the six passes, [vertex, fragment] each. */
+/** Sources of the seven passes, [vertex, fragment] each. */
 export function sources(note) {
   const head = COMMON + constants(note);
   const surfels = head + POSING + SURFEL;
@@ -400,7 +419,8 @@ export function sources(note) {
     nearest: [surfels + NEAREST, head + NOTHING],
     splat: [surfels + SIDE + SPLAT, head + SPLATTED],
     first: [head + WHOLE_SCREEN, shading + SIDE + FIRST],
-    behind: [behind(surfels + SIDE + SPLAT), behind(head + SPLATTED)],
-    second: [head + WHOLE_SCREEN, shading + SECOND],
+    behind: [behind(surfels + SIDE + SPLAT), behind(surfels + SPLATTED)],
+    further: [head + WHOLE_SCREEN, shading + FURTHER],
+    shown: [head + WHOLE_SCREEN, head + SHOWN],
   };
 }
