@@ -76,9 +76,14 @@ def _evaluations(
         elif run.has_checkpoint():
             yield _of_run(run, given, console, stop)
         elif subjects := subjects_in(path):
+            if given.on is not None:
+                raise BadInput(f"{path} is a dataset with test frames of its own; leave --on out.")
             for subject, place in subjects:
-                if not stop.is_set():
-                    yield from _of_subject(subject, place, path, given, console, stop)
+                run = _run_of(subject, path, given)
+                if not stop.is_set() and _learn(subject, place, run, given, console):
+                    yield _of_subject(subject, place, run, given, console, stop)
+                else:
+                    stop.set()
         else:
             raise BadInput(
                 f"{path} is no run (it has no checkpoint/), no .iavatar package, and holds no "
@@ -118,43 +123,48 @@ def _of_run(
     return _both(str(run.path), run, frames, given, console, stop)
 
 
+def _run_of(subject: "Subject", dataset: Path, given: EvaluateArguments) -> RunFolder:
+    """Where a subject is learnt."""
+    above = given.out or Path("runs") / dataset.resolve().name
+    return RunFolder(path=above / subject.name)
+
+
 def _of_subject(
     subject: "Subject",
     place: Path,
-    dataset: Path,
+    run: RunFolder,
     given: EvaluateArguments,
     console: Console,
     stop: threading.Event,
-) -> "Iterator[Evaluation]":
-    """A subject of the dataset, learnt if it was not yet, in the paper's frames."""
+) -> "Evaluation":
+    """A subject of the dataset that was learnt, in the paper's frames."""
     from apps.evaluating.frames import frames_on
     from apps.evaluating.protocol import PIXELS, TEST_POSES, poses_of
     from apps.ingest_arguments import parsed_frames
 
-    above = given.out or Path("runs") / dataset.resolve().name
-    run = RunFolder(path=above / subject.name)
-    _learn(subject, place, run, given, console)
     wanted = replace(
         given.wanted(place), poses=poses_of(place, TEST_POSES), frames=parsed_frames(subject.test)
     )
     frames = frames_on(wanted, run.person, given.size or PIXELS)
-    yield replace(
-        _both(subject.name, run, frames, given, console, stop),
-        paper=subject.paper,
-    )
+    return replace(_both(subject.name, run, frames, given, console, stop), paper=subject.paper)
 
 
 def _learn(
     subject: "Subject", place: Path, run: RunFolder, given: EvaluateArguments, console: Console
-) -> None:
-    """Makes the subject's run as ia-ingest does, from all of the paper's training frames."""
+) -> bool:
+    """Makes the subject's run as ia-ingest does, from all of the paper's training frames.
+
+    Returns:
+        Whether it is whole; Ctrl-C leaves a part, with which the next evaluation goes on.
+    """
+    from apps.evaluating.frames import learnt_seconds
     from apps.evaluating.protocol import PIXELS, TRAIN_POSES, poses_of
     from apps.ingest import ingest
     from apps.ingest_arguments import IngestArguments
 
-    if run.report.is_file() and run.has_checkpoint():
+    if run.has_checkpoint() and learnt_seconds(run) >= given.seconds:
         console.say(f"{subject.name} was learnt before, in {run.path}.")
-        return
+        return True
     console.say(f"Learning {subject.name}.")
     words = IngestArguments(
         video=place,
@@ -169,14 +179,12 @@ def _learn(
         device=given.device,
     )
     try:
-        code = ingest(words, console)
+        return ingest(words, console) != INTERRUPTED
     except Stop as end:
-        if end.code != NO_PACKAGE:
+        if end.code not in (NO_PACKAGE, INTERRUPTED):
             raise
-        console.warn(str(end))  # the renderer can be scored all the same
-        return
-    if code == INTERRUPTED:
-        raise KeyboardInterrupt
+        console.warn(str(end))  # without a package the renderer can be scored all the same
+        return end.code == NO_PACKAGE
 
 
 def _both(

@@ -24,11 +24,11 @@ RAYS_A_CORRECTION = 512
 
 def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
     """Scores of held-out frames after their poses have been fitted to them (see `fitted`)."""
-    return tuple(score(trainer.avatar, frame) for frame in fitted(trainer, held))
+    return tuple(found for _, found in fitted(trainer, held))
 
 
-def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[HeldOut]:
-    """Held-out frames in poses that have been fitted to them, each with its warp.
+def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Score]]:
+    """Held-out frames in poses that have been fitted to them, each with its score.
 
     The avatar stays as it is: nothing of these frames is learnt but where the body was. A few
     hundred rays at a time say where to go, so an exact pose comes out a millimetre off; where the
@@ -66,5 +66,5 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[HeldOut]:
         pose = poses.pose(slot)
         cells = WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
         moved = HeldOut(observation=replace(frame.observation, pose=pose), cells=cells)
-        given = frame.solved(avatar.rig)
-        yield max(given, moved, key=lambda held: score(avatar, held).psnr)
+        either = [(one, score(avatar, one)) for one in (frame, moved)]
+        yield max(either, key=lambda scored: scored[1].psnr)

@@ -97,6 +97,11 @@ def learnt_px(run: RunFolder) -> int | None:
     return max(size) if size else None
 
 
+def learnt_seconds(run: RunFolder) -> float:
+    """For how long a run has learnt, as its report says; 0 if it was not finished or stopped."""
+    return read_report(run)["training"]["wall_seconds"] if run.report.is_file() else 0.0
+
+
 def read_report(run: RunFolder) -> dict[str, Any]:
     """A run's report.json.
 

@@ -76,9 +76,9 @@ class Judge:
     def _fit(self, some: Sequence[Observation]) -> None:
         trainer = self._trainer
         assert trainer is not None
-        for held in fitted(trainer, [HeldOut(observation=seen) for seen in some]):
+        for held, _ in fitted(trainer, [HeldOut(observation=seen) for seen in some]):
             seen = held.observation
-            draw = partial(render, trainer.avatar, seen.pose, seen.camera, cells=held.cells)
+            draw = partial(render, trainer.avatar, seen.pose, seen.camera)
             self._fitted.scores.append(scored(seen, draw))
 
 
@@ -91,7 +91,6 @@ def judged(
     stop: threading.Event,
     *,
     fits: bool,
-    paper: dict[str, float] | None = None,
 ) -> Evaluation:
     """An avatar's rows.
 
@@ -103,7 +102,6 @@ def judged(
         console: Where progress is shown.
         stop: Ends it before all frames were scored.
         fits: Whether poses are fitted to the frames, too.
-        paper: What the paper says of the same frames.
 
     Raises:
         BadInput: If the package is damaged.
@@ -112,7 +110,7 @@ def judged(
     with console.bar(f"scoring {name}", float(frames.count or 0)) as bar:
         judge.look(frames, bar, stop)
     video = str(frames.recording.paths.video)
-    return Evaluation(name=name, capture=video, size=judge.size_px, rows=judge.rows, paper=paper)
+    return Evaluation(name=name, capture=video, size=judge.size_px, rows=judge.rows)
 
 
 def _played(player: Player, seen: Observation) -> Picture:

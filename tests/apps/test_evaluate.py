@@ -7,12 +7,13 @@ import threading
 import numpy as np
 import pytest
 
-from apps import evaluate
+from apps import evaluate, ingest
 from apps.evaluating import judge, protocol
 from apps.evaluating.rows import Evaluation, FrameScore, Row, scored
 from apps.evaluating.table import table
 from apps.recording.recording import Recording, RecordingPaths
 from apps.terminal.console import Console
+from apps.terminal.exit_codes import INTERRUPTED
 from avatar.hold import truth_on_white
 from tests.apps.conftest import Outcome
 
@@ -65,40 +66,72 @@ def test_a_package_alone_is_scored_as_within_its_run(run, film, call_evaluate, t
         assert row["psnr"] == whole[way]["psnr"]
 
 
-def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
-    film, call_evaluate, call_ingest, tmp_path, monkeypatch
-):
-    subject = protocol.Subject(
-        name="male-3-casual", train="0:16:2", test="16:24:3", paper={"psnr": 29.65, "ssim": 0.973}
-    )
-    monkeypatch.setattr(protocol, "SUBJECTS", (subject,))
-    place = tmp_path / "PeopleSnapshot" / subject.name
-    shutil.copytree(film, place)
-    poses = dict(np.load(place / "poses.npz"))
-    kept = {key: value for key, value in poses.items() if key not in ("frame", "time", "valid")}
-    (place / "poses").mkdir()
+@pytest.fixture
+def dataset(film, call_ingest, tmp_path, monkeypatch):
+    """Two subjects in the paper's layout, with shorter lists."""
     lists = {protocol.TRAIN_POSES: np.s_[0:16:2], protocol.TEST_POSES: np.s_[16:24:3]}
-    for path, rows in lists.items():
-        timed = {key: kept[key][rows] for key in ("global_orient", "body_pose", "transl")}
-        np.savez(place / path, **(kept | timed))
-    (place / "poses.npz").unlink()
-    out = tmp_path / "evaluation"
-    words = (place.parent, "--out", out, "--seconds", 1, "--size", 64, "--json", tmp_path / "t")
-    ended = call_evaluate(*words)
+    subjects = tuple(
+        protocol.Subject(
+            name=name, train="0:16:2", test="16:24:3", paper={"psnr": 29.65, "ssim": 0.973}
+        )
+        for name in ("female-3-casual", "male-3-casual")
+    )
+    monkeypatch.setattr(protocol, "SUBJECTS", subjects)
+    for subject in subjects:
+        place = tmp_path / "PeopleSnapshot" / subject.name
+        shutil.copytree(film, place)
+        poses = dict(np.load(place / "poses.npz"))
+        kept = {key: each for key, each in poses.items() if key not in ("frame", "time", "valid")}
+        (place / "poses").mkdir()
+        for path, rows in lists.items():
+            timed = {key: kept[key][rows] for key in ("global_orient", "body_pose", "transl")}
+            np.savez(place / path, **(kept | timed))
+        (place / "poses.npz").unlink()
+    return tmp_path / "PeopleSnapshot"
+
+
+def psnrs(ended):
+    return [line.split("|")[5] for line in ended.out.splitlines()]
+
+
+def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
+    dataset, call_evaluate, tmp_path
+):
+    place, out = dataset / "male-3-casual", tmp_path / "evaluation"
+
+    def call(seconds):
+        words = ("--out", out, "--size", 64, "--json", tmp_path / "t")
+        return call_evaluate(place, *words, "--seconds", seconds)
+
+    ended = call(1)
     assert ended.code == 0, ended.err
-    frames = json.loads((out / subject.name / "report.json").read_text())["frames"]
+    frames = json.loads((out / place.name / "report.json").read_text())["frames"]
     assert (frames["used"] + frames["alike"], frames["held_out"]) == (8, 0)
-    scored_frames = [
-        frame["frame"] for frame in rows_of(tmp_path / "t")["renderer", "given"]["frames"]
-    ]
-    assert scored_frames == [16, 19, 22]
+    row = rows_of(tmp_path / "t")["renderer", "given"]
+    assert [frame["frame"] for frame in row["frames"]] == [16, 19, 22]
     assert "InstantAvatar (paper)" in ended.out
     assert "29.65" in ended.out
-    again = call_evaluate(*words)
+    again = call(1)
     assert "was learnt before" in again.err
-    assert [line.split("|")[5] for line in again.out.splitlines()] == [
-        line.split("|")[5] for line in ended.out.splitlines()
-    ]
+    assert psnrs(again) == psnrs(ended)
+    longer = call(1.5)
+    assert "Going on after 1 seconds" in longer.err
+    assert "was learnt before" not in longer.err
+
+
+def test_a_stopped_lesson_leaves_the_table_of_those_before(
+    dataset, call_evaluate, tmp_path, monkeypatch
+):
+    learn = ingest.ingest
+
+    def stopped_in_the_second(given, console):
+        return INTERRUPTED if given.video.name == "male-3-casual" else learn(given, console)
+
+    monkeypatch.setattr(ingest, "ingest", stopped_in_the_second)
+    ended = call_evaluate(dataset, "--out", tmp_path / "out", "--seconds", 1, "--size", 64)
+    assert ended.code == INTERRUPTED
+    assert "female-3-casual" in ended.out
+    assert "male-3-casual" not in ended.out.replace("female-3-casual", "")
 
 
 def test_the_papers_lists_are_as_long_as_the_paper_says():
@@ -175,6 +208,7 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
         (["{run}/avatar.iavatar"], "--on"),
         (["{tmp}"], "no run"),
         (["{tmp}/nothing"], "does not exist"),
+        (["{data}", "--on", "{film}"], "leave --on out"),
         (["{run}", "--size", "4"], "16 pixels"),
         (["{run}", "--on", "{film}", "--frames", "500:"], "frames"),
         (["{lost}"], "report.json"),
@@ -185,7 +219,8 @@ def test_what_cannot_be_scored_is_said(run, film, call_evaluate, tmp_path, words
     lost = tmp_path / "lost"
     shutil.copytree(run, lost)
     (lost / "report.json").unlink()
-    places = {"run": run, "film": film, "tmp": tmp_path, "lost": lost}
+    (data := tmp_path / "sets" / "male-3-casual").mkdir(parents=True)
+    places = {"data": data, "run": run, "film": film, "tmp": tmp_path, "lost": lost}
     ended = call_evaluate(*(word.format(**places) for word in words))
     assert ended.code == 2
     assert told in ended.complaint("ia-evaluate")
