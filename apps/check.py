@@ -15,7 +15,7 @@ from apps.checking.examine import Examined, examine, share
 from apps.checking.mended import check_place, write_mended
 from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames
-from apps.recording.recording import RecordingPaths
+from apps.recording.wanted import RecordingPaths
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
 from apps.terminal.whole import write_text

@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.learning.run_folder import RunFolder
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from apps.solving.job import SolveJob
 from apps.terminal.whole import check_place
 from avatar.config import HOLD_EVERY
@@ -197,7 +199,7 @@ class IngestArguments:
         """Opens what the arguments name."""
         run = self.run_folder()
         goes_on = self.resume and run.has_checkpoint() and run.person.is_file()
-        recording = Recording.open(self.wanted(), avatars=run.person if goes_on else None)
+        recording = open_recording(self.wanted(), avatars=run.person if goes_on else None)
         size_px = self.size or learnable_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
         return recording.played() if self.realtime else recording

@@ -19,7 +19,9 @@ import numpy as np
 from rich.console import Console as RichConsole
 from scipy.spatial.transform import Rotation
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined
 from apps.solving.solving import Solving
@@ -131,7 +133,7 @@ def solved_film(capture: Path, runs: Path) -> tuple[Solved, Recording]:
     with Solving(job, runs / capture.name) as solving:
         solved = solving.wait(Console(RichConsole(stderr=True, quiet=True)))
     assert solved is not None
-    return solved, joined(Recording.open(job.paths), solved)
+    return solved, joined(open_recording(job.paths), solved)
 
 
 def told(capture: Path, runs: Path) -> tuple[str, bool | None]:
@@ -154,7 +156,7 @@ def told(capture: Path, runs: Path) -> tuple[str, bool | None]:
 def heights(capture: Path, runs: Path) -> tuple[float, float]:
     """Errors of the scale if the tracker's body is too tall: without, and with the height."""
     solved, _ = solved_film(capture, runs)
-    plain = Recording.open(job_of(capture).paths)
+    plain = open_recording(job_of(capture).paths)
     tall = height_of(plain.shaped)
 
     def sized(recording: Recording, height_m: float) -> Recording:

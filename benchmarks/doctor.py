@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from apps.checking.examine import examine
-from apps.recording.recording import RecordingPaths
+from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from benchmarks import spoils
 from benchmarks.hardware import Hardware

@@ -12,10 +12,11 @@ from pathlib import Path
 
 
 def main() -> None:
-    from apps.recording.recording import Recording, RecordingPaths
+    from apps.recording.opening import open_recording
+    from apps.recording.wanted import RecordingPaths
 
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
-    recording = Recording.open(RecordingPaths(video=capture))
+    recording = open_recording(RecordingPaths(video=capture))
 
     import torch
 

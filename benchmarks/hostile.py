@@ -87,7 +87,8 @@ def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Ge
 def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     """What each kind of file is read by, as the commands do."""
     from apps.checking.examine import examine
-    from apps.recording.recording import Recording, RecordingPaths
+    from apps.recording.opening import open_recording
+    from apps.recording.wanted import RecordingPaths
     from capture.opening import open_source
     from export.player import Player
     from preprocess.body_file import load_body
@@ -111,7 +112,7 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     def captures(path: Path) -> object:
         if len(path.read_bytes() if path.is_file() else path.name) % 7 == 0:
             examine(RecordingPaths(video=path))
-        recording = Recording.open(RecordingPaths(video=path))
+        recording = open_recording(RecordingPaths(video=path))
         return list(recording.observations())
 
     def pictures(path: Path) -> object:

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.reporting.curve import CurvePoint, largest_fall
 from apps.studio.writer import ShootConfig, shoot
 from avatar.hold import on_white, truth_on_white
@@ -142,7 +143,7 @@ def ingested(job: MainJob, capture: Path, run: Path) -> tuple[dict[str, Any], fl
 def observations(capture: Path) -> list[Observation]:
     """The poses that were never filmed, with their true pictures and masks."""
     wanted = RecordingPaths(video=capture / "truth" / "novel", cameras=str(capture / "cameras.npz"))
-    return [seen for seen in Recording.open(wanted).observations() if isinstance(seen, Observation)]
+    return [seen for seen in open_recording(wanted).observations() if isinstance(seen, Observation)]
 
 
 def learning_rows(report: dict[str, Any]) -> list[Row]:

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar.config import TrainConfig
 from avatar.hold import HeldOut, prepared
@@ -42,7 +44,7 @@ def filmed(out: Path, size: int, **more: Any) -> Path:
 
 def opened(capture: Path, *, frames: slice | None = None, size: int | None = None) -> Recording:
     """A filmed sample or another capture, as it is or with a longer side of `size` pixels."""
-    return Recording.open(RecordingPaths(video=capture, frames=frames), size_px=size)
+    return open_recording(RecordingPaths(video=capture, frames=frames), size_px=size)
 
 
 def recipe(recording: Recording, seconds: float, **changes: Any) -> TrainConfig:

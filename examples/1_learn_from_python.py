@@ -15,7 +15,8 @@ import apps  # noqa: F401 - sets OpenMP's variables, which torch reads when it i
 
 import torch
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished, Warned
@@ -35,7 +36,7 @@ def main(folder: Path) -> None:
     shoot(folder / "capture", ShootConfig(frames=48, size=96), overwrite=True)
 
     # Everything that is known about it, checked before a frame is read.
-    recording = Recording.open(RecordingPaths(video=folder / "capture"))
+    recording = open_recording(RecordingPaths(video=folder / "capture"))
 
     # The rig never changes; the recipe follows from your patience and the size of a pixel.
     rig = Rig.of(recording.shaped)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
 from capture.camera import Camera, same_shape
 from capture.errors import BadInput
@@ -17,12 +17,8 @@ from preprocess.masks.naming import rows_by_name
 from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
 from preprocess.pairing import row_by_order
+from preprocess.pairing_by_time import row_by_time
 from preprocess.pose import BodyPose, Motion
-
-NEAR_S = 0.05
-"""A pose from farther away is no frame's own, however few poses there are."""
-FEWEST = 0.1
-"""Share of the frames, or of the poses, that must belong together by their times."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,9 +163,8 @@ def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None
             )
         return lambda frame: rows.get(frame.index)
     if motion.times_s is not None:
-        row_of = _row_by_time(motion.times_s, _step_s(source))
-        _check_times(motion.times_s, source, row_of)
-        return lambda frame: row_of(frame.time_s)
+        by_time = row_by_time(motion.times_s, source)
+        return lambda frame: by_time(frame.time_s)
     by_order = row_by_order(len(motion), source, "poses")
     return lambda frame: by_order(frame.index)
 
@@ -229,55 +224,6 @@ def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
         return size_px
     scale = longer_px / max(size_px)
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
-
-
-def _step_s(source: Source) -> float | None:
-    """From one wanted frame to the next, as the container claims."""
-    if not source.duration_s or not source.frame_count:
-        return None
-    return source.duration_s / source.frame_count
-
-
-def _check_times(
-    times_s: Float[np.ndarray, "poses"], source: Source, row_of: Callable[[float], int | None]
-) -> None:
-    """Raises if hardly any frame has a pose at its time."""
-    step, count = _step_s(source), source.frame_count
-    if step is None or count is None:
-        return
-    start = source.selection.start * step / source.selection.step
-    found = {row_of(start + step * number) for number in range(count)} - {None}
-    most = min(count, len(times_s))
-    if len(found) < max(min(2, most), FEWEST * most):
-        known = times_s[np.isfinite(times_s)]
-        said = f"{known.min():.6g} to {known.max():.6g} s" if len(known) else "unknown times"
-        raise BadInput(
-            f"The poses are those of {said}, the frames of {source.path} those of {start:.3g} to "
-            f"{start + step * count:.3g} s; `time` was expected in seconds since the video's first "
-            "frame. Is it in milliseconds, or by another clock?"
-        )
-
-
-def _row_by_time(
-    times_s: Float[np.ndarray, "poses"], frame_step_s: float | None
-) -> Callable[[float], int | None]:
-    """The row nearest to a time, if it is nearer than half the usual step, and near at all."""
-    finite = np.flatnonzero(np.isfinite(times_s))
-    rows = finite[np.argsort(times_s[finite], kind="stable")]
-    times = times_s[rows]
-    steps = np.diff(times)
-    reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
-    reach = min(reach, max(NEAR_S, 0.5 * (frame_step_s or 0.0)))
-
-    def row(time_s: float) -> int | None:
-        place = int(np.searchsorted(times, time_s))
-        around = range(max(0, place - 1), min(len(times), place + 1))
-        nearest = min(around, key=lambda i: abs(times[i] - time_s), default=None)
-        if nearest is None or abs(times[nearest] - time_s) > reach + 1e-6:
-            return None
-        return int(rows[nearest])
-
-    return row
 
 
 def own_alpha(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:

@@ -4,7 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from capture.errors import BadInput
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.cure import shifted
@@ -143,11 +145,11 @@ def _claim(recording: Recording) -> Claim:
 def _opened(wanted: RecordingPaths) -> tuple[Recording, str | None]:
     """The capture, and why a run would refuse its masks if it cannot tell which side is whom."""
     try:
-        return Recording.open(wanted, doubtful=True), None
+        return open_recording(wanted, doubtful=True), None
     except BadInput as error:
         if wanted.mask_invert is not None:
             raise
-        recording = Recording.open(replace(wanted, mask_invert=False), doubtful=True)
+        recording = open_recording(replace(wanted, mask_invert=False), doubtful=True)
         return recording, str(error)
 
 

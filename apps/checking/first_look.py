@@ -1,7 +1,8 @@
 """What the doctor says before a run begins: nothing, a warning, or why it should not begin."""
 
 from apps.checking.examine import Examined, examine, examined, looks_well
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from apps.terminal.console import Console
 from capture.camera_device import camera_address
 from capture.errors import BadInput

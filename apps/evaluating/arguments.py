@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from apps.ingest_arguments import parsed_frames
-from apps.recording.recording import RecordingPaths
+from apps.recording.wanted import RecordingPaths
 from capture.errors import BadInput
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 from apps.ingest_arguments import IngestArguments, learnable_px
 from apps.learning.run_folder import RunFolder
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from capture.errors import BadInput
 from preprocess.observation import Observation
 
@@ -58,7 +60,7 @@ def frames_on(wanted: RecordingPaths, person: Path | None, size_px: int | None) 
     Raises:
         BadInput: If a part is missing or does not fit.
     """
-    return Frames(recording=Recording.open(wanted, size_px=size_px, avatars=person))
+    return Frames(recording=open_recording(wanted, size_px=size_px, avatars=person))
 
 
 def held_out_frames(run: RunFolder, size_px: int | None) -> Frames:
@@ -78,7 +80,7 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> Frames:
     if given.cameras == "solve" and run.cameras.is_file():
         wanted = replace(wanted, cameras=str(run.cameras), poses=run.poses)
     person = run.person if run.person.is_file() else None
-    recording = Recording.open(wanted, avatars=person)
+    recording = open_recording(wanted, avatars=person)
     own_px = given.size or learnable_px(given.training_seconds(recording))
     numbers = report["held_out"]["frames"]
     if not numbers:

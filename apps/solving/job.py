@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apps.recording.recording import RecordingPaths
+from apps.recording.wanted import RecordingPaths
 
 VERSION = 3
 """Of the method: other numbers would come out of the same pictures."""

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from apps.recording.opening import open_recording
 from apps.recording.recording import Recording
 from apps.solving.job import SolveJob
 from capture.errors import BadInput
@@ -54,7 +55,7 @@ def work(job: SolveJob, folder: Path, told: Told) -> Solved:
         BadInput: If they cannot be solved with certainty.
     """
     cv2.setNumThreads(job.threads)
-    recording = Recording.open(job.paths, doubtful=True)
+    recording = open_recording(job.paths, doubtful=True)
     intrinsic, longer = recording.cameras[0].intrinsic, max(recording.source.size_px)
     known = recording.motion.intrinsic is not None
     settings = Settings(

@@ -10,7 +10,8 @@ import pytest
 
 from apps import ingest, play
 from apps.learning import deliver, learn, snapshot
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
@@ -79,7 +80,7 @@ def run(film, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def rig(film) -> Rig:
     """The rig of the actor, whom all of these films are about."""
-    return Rig.of(Recording.open(RecordingPaths(video=film)).shaped)
+    return Rig.of(open_recording(RecordingPaths(video=film)).shaped)
 
 
 @pytest.fixture

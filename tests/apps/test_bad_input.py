@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 
 MASK = (64, 64)
 
@@ -113,7 +114,7 @@ def test_endings_in_capitals_are_endings(capture):
         (capture / f"{name}.npz").rename(capture / f"{name}.NPZ")
     (capture / "video.mp4").rename(capture / "My Video.MOV")
     paths = {"poses": capture / "poses.NPZ", "cameras": str(capture / "cameras.NPZ")}
-    recording = Recording.open(RecordingPaths(video=capture / "My Video.MOV", **paths))
+    recording = open_recording(RecordingPaths(video=capture / "My Video.MOV", **paths))
     assert recording.cameras.source == "cameras.NPZ"
     assert recording.source.frame_count == 24
 

@@ -10,7 +10,8 @@ import pytest
 
 from apps import check, ingest
 from apps.checking.examine import looks_well
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from benchmarks import spoils
 from preprocess.pose_file import read_motion
@@ -93,7 +94,7 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
     assert found["iou"]["now"] + 0.05 < found["iou"]["after_fix"]
     assert found["tried"][0]["cause"] == cause
     assert code == 0
-    assert looks_well(Recording.open(RecordingPaths(video=out)))
+    assert looks_well(open_recording(RecordingPaths(video=out)))
     if cause in ("frame_offset", "frame_rate"):
         mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
         assert mended.frames is not None
@@ -178,8 +179,8 @@ def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
 
 
 def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, spoilt):
-    assert looks_well(Recording.open(RecordingPaths(video=dancing)))
-    assert not looks_well(Recording.open(RecordingPaths(video=spoilt(spoils.late(1)))))
+    assert looks_well(open_recording(RecordingPaths(video=dancing)))
+    assert not looks_well(open_recording(RecordingPaths(video=spoilt(spoils.late(1)))))
 
 
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):

@@ -11,7 +11,8 @@ from apps import evaluate, ingest
 from apps.evaluating import judge, protocol
 from apps.evaluating.rows import Evaluation, FrameScore, Row, scored
 from apps.evaluating.table import table
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import INTERRUPTED
 from avatar.hold import truth_on_white
@@ -143,7 +144,7 @@ def test_the_papers_lists_are_as_long_as_the_paper_says():
 
 
 def test_a_box_is_scored_without_the_white_around_it(film):
-    (seen, *_) = Recording.open(RecordingPaths(video=film)).observations()
+    (seen, *_) = open_recording(RecordingPaths(video=film)).observations()
     truth = truth_on_white(seen)
     wrong = np.dstack([np.clip(truth - 0.1, 0.0, 1.0), np.ones(truth.shape[:2])]).astype(np.float32)
     score = scored(seen, lambda: wrong)
@@ -172,7 +173,7 @@ def test_a_table_is_markdown_and_its_means_are_means():
 
 
 def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):
-    seen = list(Recording.open(RecordingPaths(video=film)).observations())[:3]
+    seen = list(open_recording(RecordingPaths(video=film)).observations())[:3]
     stop, console = threading.Event(), Console()
 
     def stopped_in_the_second():

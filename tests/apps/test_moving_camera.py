@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from apps import check, play
 from apps.checking.examine import looks_well
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from preprocess.observation import Observation
 from preprocess.pose_file import read_motion, write_motion
 from preprocess.poses.place import moved
@@ -22,7 +23,7 @@ def walk(capture):
 
     Body and camera are moved together, each frame otherwise: pictures stay as they are.
     """
-    still = Recording.open(RecordingPaths(video=capture))
+    still = open_recording(RecordingPaths(video=capture))
     frames, camera = len(still.motion), still.cameras[0]
     worlds = np.broadcast_to(np.eye(4), (frames, 4, 4)).copy()
     angles = np.linspace(0.0, 1.5, frames)
@@ -48,7 +49,7 @@ def walk(capture):
 
 def test_each_frame_is_seen_by_its_own_camera(walk):
     folder, still = walk
-    moving = Recording.open(RecordingPaths(video=folder))
+    moving = open_recording(RecordingPaths(video=folder))
     assert moving.cameras.moves
     assert moving.footprint_m() == pytest.approx(still.footprint_m(), rel=1e-6)
     assert looks_well(moving)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from benchmarks import spoils
 from capture.errors import BadInput
 from preprocess.kinematics import rotation_matrices
@@ -21,7 +23,7 @@ from preprocess.rotations import axis_angles
 @pytest.fixture
 def own(film) -> Recording:
     """The film with its own poses, in the world."""
-    return Recording.open(RecordingPaths(video=film))
+    return open_recording(RecordingPaths(video=film))
 
 
 @pytest.fixture
@@ -42,7 +44,7 @@ def test_a_trackers_file_and_the_films_own_poses_are_one(film, own, in_camera, t
     rows |= {"img_focal": camera.focal_px[0], "img_center": np.array(camera.center_px)}
     np.save(tmp_path / "hps_track_0.npy", rows)
     poses, cameras = tmp_path / "hps_track_0.npy", str(film / "cameras.npz")
-    other = Recording.open(RecordingPaths(video=film, poses=poses, cameras=cameras))
+    other = open_recording(RecordingPaths(video=film, poses=poses, cameras=cameras))
     read = placed(read_poses(poses), own.shaped, own.cameras, cameras_given=True)
     for row in range(0, 24, 5):  # before they are fitted to a body that is not SMPL's
         joints = [own.shaped.with_pose(m[row]).joints() for m in (own.motion, read)]
@@ -57,14 +59,14 @@ def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp
     path = tmp_path / "wham_output.pkl"
     path.write_bytes(pickle.dumps({1: visitor, 2: actor}))
     paths = {"video": film, "poses": path}
-    longest = Recording.open(RecordingPaths(**paths))
+    longest = open_recording(RecordingPaths(**paths))
     assert len(longest.motion) == 24
     assert any("2 people; 2 was taken" in note for note in longest.notes)
-    chosen = Recording.open(RecordingPaths(**paths, person="1"))
+    chosen = open_recording(RecordingPaths(**paths, person="1"))
     assert len(chosen.motion) == 6
     assert not any("people" in note for note in chosen.notes)
     with pytest.raises(BadInput, match="nobody called '7'"):
-        Recording.open(RecordingPaths(**paths, person="7"))
+        open_recording(RecordingPaths(**paths, person="7"))
 
 
 def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
@@ -72,9 +74,9 @@ def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
     bare.mkdir()
     for name in ("video.mp4", "poses.npz", "cameras.npz"):
         shutil.copy(film / name, bare / name)
-    recording = Recording.open(RecordingPaths(video=bare))
+    recording = open_recording(RecordingPaths(video=bare))
     assert any("estimated" in note and "segmenter:grabcut" in note for note in recording.notes)
-    true = Recording.open(RecordingPaths(video=film))
+    true = open_recording(RecordingPaths(video=film))
     assert true.told_of_masks() == {"masks": "masks", "mask_agreement": None}
     alike = [
         np.minimum(a.alpha, b.alpha).sum() / np.maximum(a.alpha, b.alpha).sum()
@@ -92,7 +94,7 @@ def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_p
     far = own.motion.root_translations.copy()
     far[:, 2] -= 0.4  # of somebody an eighth taller than SMPL's mean, as its tracker thinks
     np.savez(tmp_path / "poses.npz", **rows, transl=far)
-    fitted = Recording.open(RecordingPaths(video=film, poses=tmp_path / "poses.npz"))
+    fitted = open_recording(RecordingPaths(video=film, poses=tmp_path / "poses.npz"))
     note = next(note for note in fitted.notes if "body model 'smpl'" in note)
     before, after = (float(number) for number in re.findall(r"(0\.\d\d) (?:before|after)", note))
     assert after > before + 0.05
@@ -108,9 +110,9 @@ def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
     (folder / "DONE").touch()
     paths = {"video": folder, "poses": film / "poses.npz", "cameras": f"{film}/cameras.npz"}
     with pytest.raises(BadInput, match="segmenter:grabcut"):
-        Recording.open(RecordingPaths(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
+        open_recording(RecordingPaths(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
     named = Path("segmenter:grabcut")
-    live = Recording.open(RecordingPaths(**paths, live=True, masks=named, idle_s=1.0))
+    live = open_recording(RecordingPaths(**paths, live=True, masks=named, idle_s=1.0))
     assert any("estimated" in note for note in live.notes)
     found = list(live.observations())
     assert [observation.frame.index for observation in found] == [0, 1, 2, 3]
@@ -120,7 +122,7 @@ def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
 def test_a_focal_length_that_nobody_knows_is_found_in_the_masks(capture, own):
     spoils.in_camera_space(capture)
     (capture / "cameras.npz").unlink()
-    found = Recording.open(RecordingPaths(video=capture))
+    found = open_recording(RecordingPaths(video=capture))
     assert found.cameras[0].focal_px == pytest.approx(own.cameras[0].focal_px, rel=0.04)
     assert any("found from the masks" in note for note in found.notes)
 
@@ -131,7 +133,7 @@ def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
     intrinsic = own.cameras[0].intrinsic.copy()
     intrinsic[[0, 1], [0, 1]] *= 0.8
     changed(capture / "poses.npz", K=intrinsic)
-    found = Recording.open(RecordingPaths(video=capture))
+    found = open_recording(RecordingPaths(video=capture))
     assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
 
 
@@ -148,7 +150,7 @@ def test_a_live_strangers_poses_are_fitted_while_they_come(film, own, tmp_path):
     far[:, 2] -= 0.4
     np.savez(folder / "poses.npz", **rows, transl=far)
     cameras = f"{film}/cameras.npz"
-    live = Recording.open(RecordingPaths(video=folder, cameras=cameras, live=True, idle_s=1.0))
+    live = open_recording(RecordingPaths(video=folder, cameras=cameras, live=True, idle_s=1.0))
     assert any("fitted to the masks as they come" in note for note in live.notes)
     assert live.told_of_body() is None
     assert len(list(live.observations())) == 24
@@ -169,6 +171,6 @@ def test_smplx_poses_of_a_live_source_turn_about_smpls_pelvis(film, own, tmp_pat
     rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
     np.savez(folder / "poses.npz", **rows, transl=own.motion.root_translations)
     named = {"video": folder, "cameras": f"{film}/cameras.npz", "masks": film / "masks"}
-    live = Recording.open(RecordingPaths(**named, live=True, idle_s=1.0))
+    live = open_recording(RecordingPaths(**named, live=True, idle_s=1.0))
     pelves = live.shaped.joints[0] + live.motion.root_translations
     np.testing.assert_allclose(pelves, SMPLX_PELVIS + own.motion.root_translations)

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.studio import motions, walk
 from apps.studio.actor import Actor
 from apps.studio.pattern import leaves, repeated
@@ -185,7 +186,7 @@ def test_the_cameras_are_told_only_by_the_truth(capture):
 def test_true_cameras_and_none_see_the_same_person(capture):
     true = capture / "truth" / "cameras.npz"
     recordings = [
-        Recording.open(RecordingPaths(video=capture, cameras=cameras))
+        open_recording(RecordingPaths(video=capture, cameras=cameras))
         for cameras in (str(true), None)
     ]
     assert [recording.cameras.moves for recording in recordings] == [True, False]

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from apps.learning.watcher import shown
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.recording import Recording
+from apps.recording.wanted import RecordingPaths
 from apps.view.poser import CHOICES, DANCE, FILMED, NEWEST, STANDING, Poser
 from apps.view.scene import PAPER, Look, drawn
 from avatar.cells import WarpCells
@@ -21,7 +23,7 @@ from preprocess.observe import Dropped
 
 @pytest.fixture(scope="module")
 def recording(film) -> Recording:
-    return Recording.open(RecordingPaths(video=film))
+    return open_recording(RecordingPaths(video=film))
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.recording.recording import Recording, RecordingPaths
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
 from apps.solving import solving as solving_module
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined
@@ -65,7 +66,7 @@ def solved_of(run: Path) -> Solved:
 
 
 def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
-    still = Recording.open(job_of(walkaround).paths)
+    still = open_recording(job_of(walkaround).paths)
     found = joined(still, solved_of(solved_run))
     true = read_cameras(walkaround / "truth" / "cameras.npz", still.source.size_px)
     centers, truth = (
@@ -99,7 +100,7 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
     poses.write_bytes((walkaround / "poses.npz").read_bytes())
     changed(poses, K=None)
     stated, silent = (
-        Recording.open(replace(job_of(walkaround).paths, **parts))
+        open_recording(replace(job_of(walkaround).paths, **parts))
         for parts in ({}, {"poses": poses, "masks": Path("segmenter:grabcut")})
     )
     assert silent.cameras[0].focal_px[0] > 1.2 * stated.cameras[0].focal_px[0]  # a phone's
@@ -113,9 +114,9 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
 
 
 def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
-    plain = Recording.open(job_of(walkaround).paths)
+    plain = open_recording(job_of(walkaround).paths)
     tall = height_of(plain.shaped)
-    taller = Recording.open(job_of(walkaround, height_m=1.1 * tall).paths)
+    taller = open_recording(job_of(walkaround, height_m=1.1 * tall).paths)
     assert height_of(taller.shaped) == pytest.approx(1.1 * tall)
     for row in (0, 9):  # pictures cannot tell
         np.testing.assert_allclose(
@@ -129,7 +130,7 @@ def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
 
 
 def test_a_camera_that_stood_stays_where_it_is(walkaround, solved_run):
-    recording = Recording.open(job_of(walkaround).paths)
+    recording = open_recording(job_of(walkaround).paths)
     standing = replace(solved_of(solved_run), still=True, moved=0.001, model=None, gates=())
     found = joined(recording, standing)
     assert found.cameras is recording.cameras
@@ -194,7 +195,7 @@ def test_a_process_that_breaks_is_said_with_its_log(walkaround, tmp_path):
 
 def test_without_masks_the_posed_body_says_where_the_person_is(walkaround):
     masked, posed = (
-        Recording.open(replace(job_of(walkaround).paths, masks=masks))
+        open_recording(replace(job_of(walkaround).paths, masks=masks))
         for masks in (walkaround / "masks", Path("segmenter:grabcut"))
     )
     frame = next(masked.source.frames())
@@ -226,7 +227,7 @@ def test_a_run_learns_beside_the_solving_and_tells_of_both(
     track = read_cameras(out / "cameras.npz", (256, 144))
     motion = read_motion(out / "poses.npz")
     assert len(track.cameras) == len(motion) == FRAMES
-    again = Recording.open(
+    again = open_recording(
         RecordingPaths(
             video=walkaround / "video.mp4", poses=out / "poses.npz",
             cameras=str(out / "cameras.npz"), masks=walkaround / "masks",
@@ -306,7 +307,7 @@ def test_heights_that_nobody_has_are_refused(walkaround, call_ingest, tmp_path, 
 
 def test_a_height_contradicts_cameras_that_have_a_world(walkaround):
     with pytest.raises(BadInput, match="--height-cm contradicts"):
-        Recording.open(
+        open_recording(
             replace(
                 job_of(walkaround).paths, height_m=1.8,
                 cameras=str(walkaround / "truth" / "cameras.npz"),

@@ -1,0 +1,37 @@
+"""What a user names of a recording."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.growing import IDLE_S
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingPaths:
+    """What the user named; the rest is looked for (see `find_capture`).
+
+    Attributes:
+        video: Video file, folder of pictures, or capture folder.
+        poses, masks: Files or folders, or None.
+        cameras: A file, "static", "solve" (poses are then in the camera of each frame, and so is
+            all the rest until cameras were solved), or None.
+        body: A body file; None for the embedded body.
+        frames: Which frames are wanted.
+        mask_invert: Whether the person is dark in the masks; None finds out.
+        live: Whether `video` is a folder that grows; a camera is live without it.
+        person: Whose poses, where the file holds several people's; None for the longest track.
+        idle_s: Of a live source: how long nothing new may come.
+        height_m: How tall the person is; None if only the poses tell.
+    """
+
+    video: Path
+    poses: Path | None = None
+    masks: Path | None = None
+    cameras: str | None = None
+    body: Path | None = None
+    frames: slice | None = None
+    mask_invert: bool | None = None
+    live: bool = False
+    person: str | None = None
+    idle_s: float = IDLE_S
+    height_m: float | None = None
