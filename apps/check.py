@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.checking.examine import Examined, examine, share
@@ -16,6 +15,7 @@ from apps.checking.mended import check_place, write_mended
 from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames
 from apps.recording.wanted import RecordingPaths
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
 from apps.terminal.whole import write_text
@@ -49,7 +49,7 @@ class CheckArguments:
     unreadable; 3 disk full; 130 Ctrl-C.
     """
 
-    video: Positional[Path]
+    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of pictures, or capture folder."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """SMPL poses, as ia-ingest takes them."""
@@ -105,7 +105,7 @@ class CheckArguments:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = tyro.cli(CheckArguments, prog="ia-check", args=arguments)
+    given = parsed(CheckArguments, "ia-check", arguments)
     return exit_code("ia-check", lambda: check(given, Console()))
 
 

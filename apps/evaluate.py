@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
 from apps.evaluating.arguments import EvaluateArguments
 from apps.learning.run_folder import RunFolder
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
 from capture.errors import BadInput
@@ -24,7 +23,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = tyro.cli(EvaluateArguments, prog="ia-evaluate", args=arguments)
+    given = parsed(EvaluateArguments, "ia-evaluate", arguments)
     return exit_code("ia-evaluate", lambda: evaluate(given, Console()))
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import tyro
 from tyro.conf import Positional, arg
 
 from apps.learning.run_folder import RunFolder
 from apps.playing.novel import novel_motion
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, NO_PACKAGE, Stop, exit_code
 from capture.camera import Camera
@@ -50,7 +50,7 @@ class ExportArguments:
     Exit codes: 0 done; 1 too blurred for a package so far; 2 bad input; 3 disk full; 130 Ctrl-C.
     """
 
-    run: Positional[Path]
+    run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
     """Folder that ia-ingest wrote (--out), with a checkpoint/ in it; for meshes a package, too."""
     to: Literal["iavatar", "glb", "ply"] = "iavatar"
     """Format: the package that ia-play plays; glTF 2.0 binary; or a still, coloured mesh."""
@@ -64,7 +64,7 @@ class ExportArguments:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = tyro.cli(ExportArguments, prog="ia-export", args=arguments)
+    given = parsed(ExportArguments, "ia-export", arguments)
     return exit_code("ia-export", lambda: export(given, Console()))
 
 

@@ -4,16 +4,33 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, exit_code
 from capture.errors import BadInput
 from export.web import runtime
 
+PROGRAM = "python -m apps.fetch_runtime"
 
-def main() -> int:
+
+@dataclass(frozen=True, kw_only=True)
+class FetchArguments:
+    """Fetches onnxruntime-web, pinned, which `ia-play --web` needs; `make web` calls it.
+
+    It comes through this machine's npm (33 MB, once), is compared with the sum that we know, and
+    kept beside the page. Nothing is done if it is there already.
+
+    Exit codes: 0 done; 2 no npm, or it could not fetch; 3 disk full; 130 Ctrl-C.
+    """
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
+    parsed(FetchArguments, PROGRAM, arguments)
     return exit_code("make web", lambda: fetch(Console()))
 
 

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import tyro
-
 from apps.checking.first_look import first_look, hint
 from apps.ingest_arguments import VIEW_PORT, IngestArguments
 from apps.learning.run_folder import RunFolder
 from apps.recording.recording import Recording
 from apps.solving.attempt import Attempt, attempted
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
 from apps.terminal.interrupt import asked_to_stop, nothing_to_save
@@ -37,7 +36,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     words = with_port(sys.argv[1:] if arguments is None else arguments, "--view", VIEW_PORT)
-    given = tyro.cli(IngestArguments, prog=PROGRAM, args=words)
+    given = parsed(IngestArguments, PROGRAM, words)
     return exit_code(PROGRAM, lambda: ingest(given, Console()))
 
 

@@ -49,7 +49,7 @@ class IngestArguments:
     device, the checkpoint is kept; 130 Ctrl-C, after checkpoint and package were written.
     """
 
-    video: Positional[Path]
+    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of pictures, or capture folder; camera:0 for a camera, or the address of
     a stream, as in camera:rtsp://…"""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None

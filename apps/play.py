@@ -5,9 +5,9 @@ import time
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import tyro
 
 from apps.playing.arguments import TURN_S, WEB_PORT, PlayArguments
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, exit_code
 from apps.terminal.port import with_port, with_value
@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     words = with_port(sys.argv[1:] if arguments is None else arguments, "--web", WEB_PORT)
     words = with_value(words, "--turntable", TURN_S)
-    given = tyro.cli(PlayArguments, prog="ia-play", args=words)
+    given = parsed(PlayArguments, "ia-play", words)
     return exit_code("ia-play", lambda: play(given, Console()))
 
 

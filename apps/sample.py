@@ -12,6 +12,7 @@ from rich.console import Console as RichConsole
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apps.studio.writer import ShootConfig, shoot
+from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, exit_code
 
@@ -45,7 +46,7 @@ class SampleConfig:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    config = tyro.cli(SampleConfig, prog="ia-sample", args=arguments)
+    config = parsed(SampleConfig, "ia-sample", arguments)
     return exit_code("ia-sample", lambda: _sample(config, Console()))
 
 

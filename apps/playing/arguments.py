@@ -41,7 +41,7 @@ class PlayArguments:
     is written is written whole or not at all.
     """
 
-    avatar: Positional[Path]
+    avatar: Annotated[Positional[Path], arg(metavar="AVATAR")]
     """The .iavatar package."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Poses to move it through: an .npz with global_orient, body_pose, transl (or poses, trans), or
@@ -81,7 +81,7 @@ class PlayArguments:
     """The camera goes round the person once in so many seconds (6 if left out; negative: the other
     way): round a standing person, or round the motion while it plays."""
     tier: Literal["hq", "lite"] = "hq"
-    """Quality: lite takes three quarters of the time."""
+    """Quality: lite takes two thirds of the time."""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Samples along 5 cm of a ray, 1 to 256; without it what the tier says."""
     workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
