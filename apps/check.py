@@ -11,17 +11,20 @@ from typing import Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.checking.examine import Examined, examine, share
-from apps.checking.mended import check_place, write_mended
+from apps.checking.mended import check_new_folder, write_mended
 from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames
 from apps.recording.wanted import RecordingPaths
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
-from apps.terminal.whole import write_text
+from apps.terminal.whole import check_file_place, write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from preprocess.doctor.diagnosis import GOOD, USABLE
+
+SHEETS = (".png", ".jpg", ".jpeg", ".webp")
+"""How the name of a picture that --sheet names may end."""
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -96,6 +99,18 @@ class CheckArguments:
             person=self.person,
         )
 
+    def check_places(self) -> None:
+        """Whether what is found can be written where it should go.
+
+        Raises:
+            BadInput: If not.
+        """
+        if self.json is not None:
+            check_file_place(self.json, "--json")
+        if self.sheet is not None and self.sheet.suffix.lower() not in SHEETS:
+            raise BadInput(f"--sheet is {self.sheet}; a name in {', '.join(SHEETS)} was expected.")
+        check_file_place(self.sheet_path(), "--sheet")
+
     def sheet_path(self) -> Path:
         """Where the sheet goes."""
         name = self.video.resolve()
@@ -117,8 +132,9 @@ def check(given: CheckArguments, console: Console) -> int:
         OSError: If something cannot be written.
     """
     wanted = given.wanted()
+    given.check_places()
     if given.fix is not None:
-        check_place(given.fix)
+        check_new_folder(given.fix)
     try:
         with console.waiting("looking at poses, masks and cameras"):
             examined = examine(wanted)

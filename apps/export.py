@@ -15,6 +15,7 @@ from apps.playing.novel import novel_motion
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, NO_PACKAGE, Stop, exit_code
+from apps.terminal.whole import check_file_place
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose
@@ -78,8 +79,7 @@ def export(given: ExportArguments, console: Console) -> int:
     """
     if given.out.suffix != f".{given.to}":
         raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
-    if not given.out.resolve().parent.is_dir():
-        raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
+    check_file_place(given.out, "--out")
     if given.poses is not None and given.to != "glb":
         raise BadInput(f"--poses go into a .glb; a .{given.to} holds no motion. Leave them out.")
     if given.to == "iavatar":

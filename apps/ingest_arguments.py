@@ -14,7 +14,7 @@ from apps.recording.opening import open_recording
 from apps.recording.recording import Recording
 from apps.recording.wanted import RecordingPaths
 from apps.solving.job import SolveJob
-from apps.terminal.whole import check_place
+from apps.terminal.whole import check_file_place
 from avatar.config import HOLD_EVERY
 from capture.camera_device import camera_address
 from capture.errors import BadInput
@@ -146,7 +146,7 @@ class IngestArguments:
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.json is not None:
-            check_place(self.json, "--json")
+            check_file_place(self.json, "--json")
         if self.mask_invert and self.no_mask_invert:
             raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
 

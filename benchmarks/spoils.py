@@ -101,7 +101,7 @@ def cut(frames: int) -> Spoil:
     """The first rows are missing, and nothing tells the frames' numbers."""
 
     def spoil(folder: Path) -> None:
-        _poses(folder, lambda m: _rows(m, np.arange(frames, len(m))))
+        _poses(folder, lambda m: m.taken(np.arange(frames, len(m))))
 
     return spoil
 
@@ -111,7 +111,7 @@ def resampled(rate: float) -> Spoil:
 
     def spoil(folder: Path) -> None:
         _poses(
-            folder, lambda m: _rows(m, np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int))
+            folder, lambda m: m.taken(np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int))
         )
 
     return spoil
@@ -128,18 +128,6 @@ def slow_clock(factor: float) -> Spoil:
         _poses(folder, change)
 
     return spoil
-
-
-def _rows(motion: Motion, rows: np.ndarray) -> Motion:
-    return replace(
-        motion,
-        root_rotations=motion.root_rotations[rows],
-        root_translations=motion.root_translations[rows],
-        joint_rotations=motion.joint_rotations[rows],
-        valid=motion.valid[rows],
-        frames=None,
-        times_s=None,
-    )
 
 
 def opengl_poses(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """What a body does: one pose of the 24-joint tree, and poses over time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -114,4 +114,26 @@ class Motion:
             root_rotation=self.root_rotations[row],
             root_translation=self.root_translations[row],
             joint_rotations=self.joint_rotations[row],
+        )
+
+    def taken(
+        self, rows: Int[np.ndarray, "some"], frames: Int[np.ndarray, "some"] | None = None
+    ) -> "Motion":
+        """Some of its rows, for frames of other numbers.
+
+        Args:
+            rows: Which ones, in their new order.
+            frames: The frame that each belongs to; None if nobody says so.
+        """
+        cameras, bridged = self.camera_from_world, self.bridged
+        return replace(
+            self,
+            root_rotations=self.root_rotations[rows],
+            root_translations=self.root_translations[rows],
+            joint_rotations=self.joint_rotations[rows],
+            valid=self.valid[rows],
+            frames=frames,
+            times_s=None,
+            camera_from_world=None if cameras is None else cameras[rows],
+            bridged=None if bridged is None else bridged[rows],
         )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from apps.checking.examine import Examined
-from apps.terminal.whole import whole_folder
+from apps.terminal.whole import check_place, whole_folder
 from capture.errors import BadInput
 from capture.images import list_images
 from preprocess.doctor.claim import Claim, step_of
@@ -22,14 +22,15 @@ WHOLE = 1e-6
 """Frame numbers this close to whole ones are whole."""
 
 
-def check_place(out: Path) -> None:
+def check_new_folder(out: Path) -> None:
     """Whether a capture can be written there.
 
     Raises:
-        BadInput: If something is there already.
+        BadInput: If something is there already, or nothing can be.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInput(f"--fix {out} is there already; name a folder that is new or empty.")
+    check_place(out, "--fix")
 
 
 def write_mended(examined: Examined, out: Path) -> None:
@@ -43,7 +44,7 @@ def write_mended(examined: Examined, out: Path) -> None:
     """
     if examined.diagnosis is None or not examined.diagnosis.cures:
         raise BadInput("No mistake was found that could be mended, so --fix writes nothing.")
-    check_place(out)
+    check_new_folder(out)
     recording, healed = examined.recording, examined.diagnosis.healed
     with whole_folder(out) as part:
         if recording.source.path.is_dir():
@@ -69,20 +70,8 @@ def numbered(claim: Claim, frames: int, *, resampled: bool) -> Motion:
     if not resampled and np.abs(claim.places - claim.places.round()).max() < WHOLE:
         numbers = claim.places.round().astype(np.int64)
         inside = np.flatnonzero((numbers >= 0) & (numbers < frames))
-        return _rows(claim.motion, inside, numbers[inside])
+        return claim.motion.taken(inside, numbers[inside])
     return _between(claim, frames)
-
-
-def _rows(motion: Motion, rows: np.ndarray, numbers: np.ndarray) -> Motion:
-    return replace(
-        motion,
-        root_rotations=motion.root_rotations[rows],
-        root_translations=motion.root_translations[rows],
-        joint_rotations=motion.joint_rotations[rows],
-        valid=motion.valid[rows],
-        frames=numbers,
-        times_s=None,
-    )
 
 
 def _between(claim: Claim, frames: int) -> Motion:
@@ -109,6 +98,8 @@ def _between(claim: Claim, frames: int) -> Motion:
         valid=near,
         frames=numbers,
         times_s=None,
+        camera_from_world=None,
+        bridged=None,
     )
 
 

@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 
 from apps.ingest_arguments import parsed_frames
 from apps.recording.wanted import RecordingPaths
+from apps.terminal.whole import check_file_place
 from capture.errors import BadInput
 
 
@@ -88,6 +89,9 @@ class EvaluateArguments:
             told.append("--frames")
         if told and self.on is None:
             raise BadInput(f"{', '.join(told)} belong to a capture: name it with --on.")
+        for flag, place in (("--json", self.json), ("--markdown", self.markdown)):
+            if place is not None:
+                check_file_place(place, flag)
         for path in self.what:
             if not path.exists():
                 raise BadInput(f"{path} does not exist; a run's folder or a package was expected.")

@@ -122,8 +122,8 @@ def read_report(run: RunFolder) -> dict[str, Any]:
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise BadInput(
-            f"{run.report} is no report that ia-ingest wrote ({type(error).__name__}: {error}); "
-            "name a capture with --on."
+            f"{run.report} is no report that ia-ingest wrote ({type(error).__name__}: {error}). "
+            "Let the run write it again (ia-ingest … --resume), or give both --on and --size."
         ) from error
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.playing.viewpoint import CLOSE_UP, Viewpoint
+from apps.terminal.whole import check_file_place
 from capture.errors import BadInput
 
 WEB_PORT = 8010
@@ -109,6 +110,8 @@ class PlayArguments:
         self._check_mode()
         if self.json is not None and not (self.bench or self.verify):
             raise BadInput("--json writes the figures of --bench or --verify; give one of them.")
+        if self.json is not None:
+            check_file_place(self.json, "--json")
         if self.fps is not None and not 0.1 <= self.fps <= 240.0:
             raise BadInput(f"--fps is {self.fps}; 0.1 to 240 pictures a second were expected.")
         if not 0.01 <= self.speed <= 100.0:

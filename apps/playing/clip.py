@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from apps.playing.encoders import Encoder, video_encoder
-from apps.terminal.whole import whole_file, whole_folder
+from apps.terminal.whole import check_place, whole_file, whole_folder
 from capture.errors import BadInput
 
 CLIPS = (".webm", ".mp4", ".gif", ".webp", ".png")
@@ -45,6 +45,7 @@ def check_clip(path: Path) -> None:
             )
     elif path.exists() and path.suffix.lower() not in CLIPS:
         raise BadInput(f"{path} is a file; a folder for PNG frames was expected.")
+    check_place(path, "--out")
 
 
 def encoder_of(path: Path, blend: Blend | None) -> Encoder:

@@ -12,7 +12,7 @@ import numpy as np
 from apps.playing.follow import FollowingCamera
 from apps.terminal.console import Console
 from apps.terminal.interrupt import ended_by_ctrl_c
-from apps.terminal.whole import whole_folder
+from apps.terminal.whole import check_place, whole_folder
 from capture.errors import BadInput
 from export.player import Player
 from export.web.site import Clip, Look, pose_row
@@ -58,6 +58,7 @@ def check_folder(path: Path) -> None:
             )
     elif path.exists():
         raise BadInput(f"{path} is a file; --web --out takes a folder.")
+    check_place(path, "--out")
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:

@@ -72,7 +72,7 @@ def noted() -> Iterator[threading.Event]:
     """An event that is set by Ctrl-C, which raises KeyboardInterrupt as always.
 
     What is being imported may turn that into an error of its own; the event still knows. Off the
-    main thread it is never set.
+    main thread it is never set. SIGTERM, by which machines ask for an end, is taken as Ctrl-C.
     """
     came = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -84,10 +84,12 @@ def noted() -> Iterator[threading.Event]:
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, note)
+    before_term = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         yield came
     finally:
         signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGTERM, before_term)
 
 
 @contextmanager

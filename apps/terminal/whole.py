@@ -25,8 +25,21 @@ def check_place(path: Path, flag: str) -> None:
         place = place.parent
     if place.is_file() and place.absolute() != Path(os.path.abspath(path)):
         raise BadInput(f"{flag} is {path}, but {place} is a file and holds nothing.")
-    if not os.access(place, os.W_OK):
-        raise BadInput(f"{flag} is {path}, but {place} cannot be written to. Name another place.")
+    folder = place.parent if place.is_file() else place  # a file is replaced, not written into
+    if not os.access(folder, os.W_OK):
+        raise BadInput(f"{flag} is {path}, but {folder} cannot be written to. Name another place.")
+
+
+def check_file_place(path: Path, flag: str) -> None:
+    """The same for what shall be a file.
+
+    Raises:
+        BadInput: If that cannot be.
+    """
+    if path.is_dir():
+        raise BadInput(f"{flag} is {path}, which is a folder; the name of a file was expected.")
+    if not _is_stream(path):
+        check_place(path, flag)
 
 
 @contextmanager

@@ -157,6 +157,11 @@ def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check)
     assert "--fix" in said
 
 
+def test_a_sheet_that_is_no_picture_is_refused_before_anything_is_looked_at(tmp_path, capsys):
+    assert check.main([str(tmp_path / "nothing"), "--sheet", str(tmp_path / "sheet.pdf")]) == 2
+    assert ".png" in capsys.readouterr().err
+
+
 def test_what_cannot_be_read_is_said_in_the_json_too(tmp_path, call_check):
     code, said, found = call_check(tmp_path / "nothing", "--poses", tmp_path / "none.npz")
     assert code == 2

@@ -16,7 +16,8 @@ from apps.learning.run_folder import RunFolder
 from apps.playing.background import background
 from apps.terminal.console import MOST_WARNINGS, Console
 from apps.terminal.exit_codes import Stop, exit_code
-from apps.terminal.whole import check_place, whole_file, whole_folder, write_text
+from apps.terminal.interrupt import asked_to_stop
+from apps.terminal.whole import check_file_place, check_place, whole_file, whole_folder, write_text
 from capture.errors import BadInput
 from capture.images import read_image
 
@@ -76,6 +77,21 @@ def test_what_an_import_makes_of_ctrl_c_is_still_ctrl_c(capsys):
     assert exit_code("ia-test", half_imported) == 130
     assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_machine_that_asks_for_an_end_is_answered_like_ctrl_c(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    assert exit_code("ia-test", lambda: signal.raise_signal(signal.SIGTERM) or 0) == 130
+    assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+    said = Console(RichConsole(file=io.StringIO()))
+
+    def saves():
+        with asked_to_stop(said) as stop:
+            signal.raise_signal(signal.SIGTERM)
+            return 130 if stop.is_set() else 0
+
+    assert exit_code("ia-test", saves) == 130
 
 
 def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
@@ -192,6 +208,13 @@ def test_a_place_that_cannot_be_written_to_is_named_before_any_work(tmp_path):
     check_place(tmp_path / "report.json", "--json")
     with pytest.raises(BadInput, match=r"--out is .*report\.json is a file"):
         check_place(tmp_path / "report.json" / "run", "--out")
+
+
+def test_a_folder_where_a_file_should_be_is_named_before_any_work(tmp_path):
+    check_file_place(tmp_path / "new" / "report.json", "--json")
+    with pytest.raises(BadInput, match=r"--json is .* a folder"):
+        check_file_place(tmp_path, "--json")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

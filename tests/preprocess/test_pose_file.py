@@ -56,6 +56,19 @@ def test_what_is_written_is_read(tmp_path, motion):
         assert_same(read_motion(path), wanted)
 
 
+def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
+    """Also their cameras: a file with one of six would not be read."""
+    cameras = np.tile(np.eye(4), (6, 1, 1))
+    cameras[:, 0, 3] = np.arange(6)
+    whole = replace(motion, camera_from_world=cameras, bridged=np.arange(6) == 4)
+    some = whole.taken(np.array([4, 2]), np.array([10, 11]))
+    write_motion(tmp_path / "some.npz", some)
+    again = read_motion(tmp_path / "some.npz")
+    assert_same(again, some)
+    assert again.camera_from_world[:, 0, 3].tolist() == [4.0, 2.0]
+    assert some.bridged.tolist() == [True, False]
+
+
 def test_the_three_spellings_are_one(write, motion):
     poses = np.column_stack([motion.root_rotations, motion.joint_rotations.reshape(6, 69)])
     nothing = {"global_orient": None, "body_pose": None}
