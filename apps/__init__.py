@@ -11,6 +11,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 # numpy's own BLAS spins, too: a second thread doubled the cost of a frame's warp, for nothing.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Nobody is told what runs here (export/__init__.py says the same for those who import the player).
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 def _stopped(

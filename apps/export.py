@@ -79,6 +79,8 @@ def export(given: ExportArguments, console: Console) -> int:
     """
     if given.out.suffix != f".{given.to}":
         raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
+    if not given.out.resolve().parent.is_dir():
+        raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
     check_file_place(given.out, "--out")
     if given.poses is not None and given.to != "glb":
         raise BadInput(f"--poses go into a .glb; a .{given.to} holds no motion. Leave them out.")

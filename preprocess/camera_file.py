@@ -47,6 +47,12 @@ class CameraTrack:
         return self.cameras[frame_index if self.moves else 0]
 
 
+def cameras_in(path: Path) -> Path:
+    """The cameras.npz of a capture folder, where the folder was named; else what was named."""
+    own = path / "cameras.npz"
+    return own if own.is_file() else path
+
+
 def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = None) -> CameraTrack:
     """Reads cameras: an .npz of ours, or what COLMAP, nerfstudio, Record3D or Polycam wrote.
 
@@ -65,7 +71,8 @@ def read_cameras(path: Path, size_px: tuple[int, int], source: Source | None = N
         BadInput: If there is no such file, or it holds no such cameras, or their pictures had
             another aspect ratio.
     """
-    if path.is_dir() or path.suffix.lower() != ".npz":
+    path = cameras_in(path)
+    if path.suffix.lower() != ".npz":
         return _foreign(path, size_px, source)
     arrays = read_npz(path)
     if "intrinsic" not in arrays:

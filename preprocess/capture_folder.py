@@ -33,6 +33,11 @@ class CapturePaths:
     cameras: Path | None
 
 
+def poses_in(path: Path) -> Path:
+    """The pose file of a capture folder, where the folder was named; else what was named."""
+    return _first([path], POSES) or path
+
+
 def find_capture(
     video: Path,
     poses: Path | None = None,

@@ -74,6 +74,8 @@ def _folder(path: Path) -> dict[str, Any]:
 
 def _decoded(data: bytes, path: Path) -> Any:
     """What the bytes hold, whatever they are packed in."""
+    if not data:
+        raise ValueError("it is empty")
     if data.startswith(b"PK"):
         return _zip(data)
     if data.startswith(b"\x93NUMPY"):

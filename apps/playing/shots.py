@@ -140,8 +140,9 @@ def cameras_from(
     Raises:
         BadInput: If it cannot be read, or does not match poses or size.
     """
-    from preprocess.camera_file import read_cameras
+    from preprocess.camera_file import cameras_in, read_cameras
 
+    path = cameras_in(path)
     track = read_cameras(path, _picture_size(path))
     if track.moves and len(track.cameras) != poses:
         raise BadInput(

@@ -24,12 +24,16 @@ def compile_kernel(
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
     wrapper; so the function is unwrapped first. Numba recompiles when the function's own file has
     changed, but not when a kernel that it calls lies in another; so here the kept code belongs to
-    the sources of the whole folder.
+    the sources of the whole folder. Where neither the folder nor the home folder can be written
+    to, nothing is kept, and every process compiles anew.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         plain = inspect.unwrap(function)
-        kernel = numba.njit(cache=cache, **options)(plain)
+        try:
+            kernel = numba.njit(cache=cache, **options)(plain)
+        except RuntimeError:  # "no locator available": no place to keep it
+            kernel = numba.njit(**options)(plain)
         file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if file is not None:
             file._source_stamp = _sources(Path(plain.__code__.co_filename).parent)

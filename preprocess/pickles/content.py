@@ -70,7 +70,7 @@ def guarded(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
     """
     try:
         return read()
-    except BadInput:
+    except (BadInput, PermissionError):  # a command says who may not read what
         raise
     except HoldsCode as found:
         raise BadInput(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import BadInput
+from preprocess.capture_folder import poses_in
 from preprocess.content import read_content
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion
@@ -57,7 +58,7 @@ def read_poses(
     own anchor, in its own space: `preprocess.poses.place` brings them to a body and its cameras.
 
     Args:
-        path: The file or folder.
+        path: The file or folder; of a capture folder the poses in it.
         default_model: Body family of files that do not say theirs.
         person: Whose poses, by the file's own number or name.
         driving: Whether they shall move an avatar: then in the world rather than in a camera.
@@ -66,6 +67,7 @@ def read_poses(
         BadInput: If there is no such file, it holds no poses that are known, or nobody of that
             name.
     """
+    path = poses_in(path)
     if path.suffix.lower() == ".jsonl":
         return read_motion(path, default_model=default_model)
     content = read_content(path)

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from avatar.kernels.jit import compile_kernel
+
 CALLEE = """
 from avatar.kernels.jit import compile_kernel
 
@@ -37,3 +39,10 @@ def test_a_kernel_is_compiled_again_when_a_kernel_it_calls_has_changed(tmp_path)
     assert run(tmp_path) == ["6.0", "1"]
     (tmp_path / "callee.py").write_text(CALLEE.format(factor=5.0))
     assert run(tmp_path) == ["10.0", "0"]
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_all_the_same():
+    """As where neither the project's folder nor the home folder can be written to."""
+    names: dict = {}
+    exec(compile("def twice(x): return 2.0 * x", "<nowhere>", "exec"), names)
+    assert compile_kernel()(names["twice"])(3.0) == 6.0

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 import zipfile
@@ -265,3 +266,15 @@ def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player
     assert psnr(on_white(drawn), on_white(exact)) > 36.0
     assert psnr(on_white(close), on_white(exact)) > psnr(on_white(drawn), on_white(exact))
     assert set(exported.psnr_to_renderer) == {"hq", "lite"}
+
+
+@pytest.mark.parametrize("module", ["export.session", "apps.playing.bench"])
+def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
+    code = f"import {module}, onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
+    plain = {key: held for key, held in os.environ.items() if not key.startswith(("ORT_", "XDG_"))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**plain, "HOME": str(tmp_path)}, check=True,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout == "1\n"
+    assert not list(tmp_path.iterdir())

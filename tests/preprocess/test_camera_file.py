@@ -43,7 +43,9 @@ def write(tmp_path):
 
 
 def test_one_camera_serves_all_frames(write):
-    track = read_cameras(write(), SIZE)
+    path = write()
+    assert read_cameras(path.parent, SIZE).source == read_cameras(path, SIZE).source
+    track = read_cameras(path, SIZE)
     assert not track.moves
     assert track.note is None
     np.testing.assert_array_equal(track[99].intrinsic, INTRINSIC)

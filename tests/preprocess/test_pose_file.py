@@ -7,6 +7,7 @@ import pytest
 
 from capture.errors import BadInput
 from preprocess.pose_file import read_motion, write_motion
+from preprocess.poses import read_poses
 
 
 @pytest.fixture
@@ -147,3 +148,11 @@ def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
     (tmp_path / "poses.pkl").write_bytes(b"")
     with pytest.raises(BadInput, match=r"\.npz"):
         read_motion(tmp_path / "poses.pkl")
+
+
+def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
+    folder = tmp_path / "capture"
+    (folder / "truth").mkdir(parents=True)
+    for name, wanted in (("poses.npz", motion), ("dance.npz", motion.taken(np.arange(2)))):
+        write_motion(folder / name, wanted)
+    assert_same(read_poses(folder), read_poses(folder / "poses.npz"))

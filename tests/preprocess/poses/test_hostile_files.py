@@ -167,6 +167,12 @@ def test_arrays_without_rows_are_read_from_every_protocol(tmp_path, protocol):
     np.testing.assert_array_equal(found["c"], np.ones(2))
 
 
+def test_a_file_without_a_byte_is_called_empty(tmp_path):
+    (tmp_path / "poses.npz").touch()
+    with pytest.raises(BadInput, match="it is empty"):
+        read_content(tmp_path / "poses.npz")
+
+
 def test_tensors_of_every_type_and_stride_are_read(tmp_path):
     base = torch.arange(24).reshape(2, 3, 4)
     tensors = [base.to(kind) for kind in (torch.float16, torch.float64, torch.int16, torch.uint8)]
