@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.checking.examine import Examined, examine, share
+from apps.checking.examine import GOOD_EDGES, Examined, examine, share
 from apps.checking.mended import check_new_folder, write_mended
 from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames
@@ -157,7 +157,7 @@ def check(given: CheckArguments, console: Console) -> int:
 
 
 def as_json(examined: Examined) -> dict[str, Any]:
-    """What was found; agreements are null where there are no masks."""
+    """What was found; agreements are null where there are no masks, `edges` where there are."""
     diagnosis = examined.diagnosis
     cures = diagnosis.cures if diagnosis else ()
     tried = diagnosis.tried if diagnosis else ()
@@ -173,6 +173,7 @@ def as_json(examined: Examined) -> dict[str, Any]:
         "cures": [{"cause": cure.cause, "words": cure.words} for cure in cures],
         "odd": list(examined.odd),
         "refused": examined.refused,
+        "edges": share(examined.edges),
     }
 
 
@@ -181,7 +182,7 @@ def unreadable(why: str) -> dict[str, Any]:
     return {
         "format": 1, "verdict": "unusable", "cause": None,
         "iou": {"now": None, "after_fix": None}, "tried": [], "cures": [], "odd": [],
-        "refused": why,
+        "refused": why, "edges": None,
     }  # fmt: skip
 
 
@@ -193,10 +194,7 @@ def _say(examined: Examined, console: Console) -> None:
     if examined.refused is not None:
         console.say(f"ia-ingest would refuse it: {examined.refused}")
     if examined.diagnosis is None:
-        console.say(
-            "There are no masks to hold the body against (ia-ingest estimates some from the poses "
-            "themselves), so nobody can say whether the poses fit the pictures."
-        )
+        console.say(_without_masks(examined))
         return
     console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1).")
     for cure in examined.diagnosis.cures:
@@ -209,6 +207,20 @@ def _say(examined: Examined, console: Console) -> None:
         console.say("None of the usual mistakes explains it.")
     if _mends_itself(examined):
         console.say("ia-ingest turns such masks by itself: nothing needs to be done.")
+
+
+def _without_masks(examined: Examined) -> str:
+    """What can be said of a capture whose masks ia-ingest will have to estimate."""
+    if examined.edges is None:
+        return "There are no masks, and no picture could be looked at."
+    fits = examined.edges >= GOOD_EDGES
+    return (
+        f"{examined.verdict}: there are no masks (ia-ingest estimates some from poses and "
+        f"pictures); edges in the pictures are {examined.edges:.1f} times as strong across the "
+        f"body's outline as beside it, so the poses {'' if fits else 'hardly '}fit (2 to 5 times "
+        f"where they do, about 1 where nobody stands)."
+        + ("" if fits else " With --masks it could be told what is wrong.")
+    )
 
 
 def _mends_itself(examined: Examined) -> bool:

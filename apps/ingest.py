@@ -52,7 +52,8 @@ def ingest(given: IngestArguments, console: Console) -> int:
     given.check()
     run = given.run_folder()
     run.check(resume=given.resume, overwrite=given.overwrite)
-    recording = _opened(given)
+    with console.waiting("opening video and poses"):
+        recording = _opened(given)
     console.say(_described(recording))
     for note in recording.notes:
         console.warn(note)

@@ -9,6 +9,7 @@ from capture.pace import Pace
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.capture_folder import CapturePaths
+from preprocess.fit.growing import GrowingFit
 from preprocess.growing_poses import GrowingPoses
 from preprocess.masks.growing import GrowingMasks
 from preprocess.masks.segmenter import Segmenter
@@ -76,8 +77,16 @@ class LiveParts:
         cameras: CameraTrack,
         size_px: int | None,
         segment: Segmenter | None = None,
+        fit: GrowingFit | None = None,
     ) -> Callable[[Frame], Observation | Dropped]:
         """What makes an observation of a frame, waiting for its pose and its mask.
+
+        Args:
+            source: The frames.
+            cameras: One, that stands still.
+            size_px: Longer side of the observations.
+            segment: What estimates masks, where none are waited for.
+            fit: What fits the poses to another body than their tracker's, if that is needed.
 
         Raises:
             BadInput: If there are many cameras: nobody knows yet whose they are.
@@ -89,4 +98,8 @@ class LiveParts:
             )
         alpha_of = own_alpha if self.masks is None else self.masks.of
         target_px = shrunk(source.size_px, size_px)
-        return joiner(self.poses.of, alpha_of, lambda index: cameras[0], target_px, segment=segment)
+        pose_of = self.poses.of
+        if fit is not None and not fit.masked:
+            pose_of = fit.posing(pose_of, cameras[0])
+        seen = joiner(pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment)
+        return fit.observing(seen) if fit is not None and fit.masked else seen

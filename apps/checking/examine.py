@@ -13,11 +13,14 @@ from preprocess.doctor.cure import shifted
 from preprocess.doctor.diagnosis import GOOD, USABLE, Diagnosis, diagnose, mean
 from preprocess.doctor.evidence import FRAMES, Evidence, gather
 from preprocess.doctor.soundness import unsound
+from preprocess.fit.pictures import edges, glance
 from preprocess.observe import check_cameras, check_masks
 from preprocess.silhouette import SkinPoints
 
 FEW = 8
 """Frames that are looked at before a run begins."""
+GOOD_EDGES = 2.0
+"""Edges are so many times as strong across the body's outline as beside it, if poses fit."""
 NEAR = (1, 2)
 """Offsets of the poses, in frames, that are tried even where all seems well."""
 
@@ -34,6 +37,8 @@ class Examined:
         refused: Why a run would not even begin, if it would not.
         odd: Sentences about what is strange in the numbers.
         agreed: Mean agreement as a run would read the files; None without masks.
+        edges: Without masks: how many times as strong the pictures' edges are across the body's
+            outline as beside it; None with masks, or if no picture can be looked at.
     """
 
     recording: Recording
@@ -43,6 +48,7 @@ class Examined:
     refused: str | None
     odd: tuple[str, ...]
     agreed: float | None
+    edges: float | None = None
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -56,6 +62,7 @@ class Examined:
         if self.refused is not None or (self.agreed is not None and self.agreed < USABLE):
             return "unusable"
         well = self.agreed is not None and self.agreed >= GOOD and not self.causes
+        well |= self.edges is not None and self.edges >= GOOD_EDGES
         return "good" if well and not self.odd else "warn"
 
     @property
@@ -106,6 +113,7 @@ def examined(recording: Recording, undecided: str | None = None) -> Examined:
     return Examined(
         recording=recording, claim=claim, evidence=evidence, diagnosis=diagnosis,
         refused=refused, odd=tuple(odd), agreed=agreed,
+        edges=None if masked or refused else _edges(recording, claim),
     )  # fmt: skip
 
 
@@ -124,6 +132,15 @@ def looks_well(recording: Recording) -> bool:
     now = mean(evidence.scores(claim))
     shifts = [mean(evidence.scores(shifted(k).undo(claim))) for n in NEAR for k in (n, -n)]
     return now >= GOOD and now >= max(shifts)
+
+
+def _edges(recording: Recording, claim: Claim) -> float | None:
+    """How the body's outline runs along the pictures' edges; None if none can be looked at."""
+    skin = SkinPoints.of(recording.shaped)
+    try:
+        return edges(claim, skin, glance(claim, skin, recording.cameras, recording.source))
+    except BadInput:
+        return None
 
 
 def _evidence(recording: Recording, count: int = FRAMES) -> Evidence:

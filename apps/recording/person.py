@@ -9,7 +9,6 @@ from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
 from preprocess.fit.body_fit import (
-    UNFITTED,
     BodyFit,
     are_alike,
     fit_body,
@@ -24,7 +23,7 @@ from preprocess.pose import Motion
 
 SAME_CM = 1.5
 """A stated height that is so near to the avatar's own says the same."""
-FITTED_LIVE = "Distance and place are fitted to the masks as they come."
+FITTED_LIVE = "Distance and place are fitted to the {} as they come."
 
 
 def person_of(
@@ -84,8 +83,9 @@ def live_person(
     foreign = is_foreign(motion, shaped)
     if not foreign and are_alike(person, shaped):
         return BodyFit(shaped=person, motion=motion), None
-    fit = BodyFit(shaped=person, motion=motion, words=FITTED_LIVE if masked else UNFITTED)
-    return fit, GrowingFit(person, motion.model) if masked else None
+    words = FITTED_LIVE.format("masks" if masked else "pictures")
+    fit = BodyFit(shaped=person, motion=motion, words=words)
+    return fit, GrowingFit(person, motion.model, masked=masked)
 
 
 def _check_height(person: ShapedBody, height_m: float | None) -> None:

@@ -77,8 +77,9 @@ class Recording:
     def observer(self) -> Callable[[Frame], Observation | Dropped]:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
-            seen = self.live.observer(self.source, self.cameras, self.size_px, self.segment)
-            return seen if self.growing_fit is None else self.growing_fit.observing(seen)
+            return self.live.observer(
+                self.source, self.cameras, self.size_px, self.segment, self.growing_fit
+            )
         return observer(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
             segment=self.segment,

@@ -2,7 +2,7 @@
 
 Without SMPL's file, SMPL's poses move the embedded body; and poses that are added to a finished
 avatar move the person that it has, whatever their betas say. Rotations stay as they are; distance
-and place are solved anew from masks, where there are any.
+and place are solved anew from masks, or, where there are none, from the pictures themselves.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,10 @@ from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, gather
+from preprocess.fit.pictures import glance
 from preprocess.fit.refit import FRAMES, Refit, refitted
 from preprocess.fit.stature import farther, height_of
+from preprocess.fit.unmasked import fitted_to_pictures
 from preprocess.masks.files import Masks
 from preprocess.observe import check_cameras, check_masks
 from preprocess.pose import Motion
@@ -30,10 +32,6 @@ TOLD_M = 0.01
 """Differences in height, or of a joint from the pelvis, that are spoken of."""
 SOMEBODY_ELSE = 0.08
 """Difference in height, as a share, beyond which it may not be the same person."""
-UNFITTED = (
-    "Without masks their distances cannot be fitted to this body: they are those of SMPL's mean "
-    "shape. Give --masks, or your own SMPL file (--body)."
-)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,17 +72,19 @@ def fit_body(
         motion: In the cameras' world.
         shaped: The body that is used, with SMPL's mean joints (`shaped_for`).
         cameras: Of the frames' size.
-        source: The frames; few are decoded, and only if the masks are in them.
+        source: The frames; few are decoded, and none if there are masks in files.
         masks: The masks; None if the pictures have an alpha channel, or nobody knows any.
     """
     if not is_foreign(motion, shaped):
         return BodyFit(shaped=shaped, motion=motion)
+    claim = Claim.of(motion, cameras, source)
     if masks is None and not source.has_alpha:
-        return BodyFit(shaped=shaped, motion=motion, words=UNFITTED)
+        seen = seen_in_pictures(claim, shaped, cameras, source)
+        fit = BodyFit(shaped=shaped, motion=motion)
+        return fit if seen is None else _taken(seen, shaped, motion)
     evidence = evidence_of(shaped, cameras, source, masks)
     if evidence is None:
         return BodyFit(shaped=shaped, motion=motion)
-    claim = Claim.of(motion, cameras, source)
     refit = refitted(claim, evidence)
     own = shaped.body.with_shape()
     other = refitted(claim, _of(evidence, own))
@@ -120,10 +120,14 @@ def fit_to_person(
         motion = farther(claim, shaped, person)
         claim = Claim.of(motion, cameras, source)
     told = "" if foreign or same else _compared(shaped, person)
-    if evidence is None:
-        unfitted = UNFITTED if foreign and not masked else ""
-        return BodyFit(shaped=person, motion=motion, words=f"{told} {unfitted}".strip())
-    return _taken(refitted(claim, evidence), person, motion, told)
+    refit = None
+    if evidence is not None:
+        refit = refitted(claim, evidence)
+    elif foreign and not masked:
+        refit = seen_in_pictures(claim, person, cameras, source)
+    if refit is None:
+        return BodyFit(shaped=person, motion=motion, words=told)
+    return _taken(refit, person, motion, told)
 
 
 def are_alike(a: ShapedBody, b: ShapedBody) -> bool:
@@ -158,6 +162,18 @@ def _compared(shaped: ShapedBody, person: ShapedBody) -> str:
         f"{100.0 * ours:.0f} cm (joints up to {100.0 * apart:.1f} cm elsewhere): the avatar keeps "
         f"its own, and these poses follow.{doubt}"
     )
+
+
+def seen_in_pictures(
+    claim: Claim, shaped: ShapedBody, cameras: CameraTrack, source: Source
+) -> Refit | None:
+    """The body fitted to a few pictures; None where parts do not fit, which is said elsewhere."""
+    skin = SkinPoints.of(shaped)
+    try:
+        pictures = glance(claim, skin, cameras, source)
+    except BadInput:
+        return None
+    return fitted_to_pictures(claim, skin, pictures)
 
 
 def evidence_of(

@@ -1,7 +1,8 @@
-"""SMPL's poses on another body while they come: fitted to the masks seen so far, ever again.
+"""SMPL's poses on another body while they come: fitted to what was seen so far, ever again.
 
 The first picture says how far away the person is, turning says the rest. So what
-`preprocess.fit.refit` does is done with the first frame, and whenever there are twice as many.
+`preprocess.fit.refit` does is done with the first frame, and whenever there are twice as many; or,
+where no masks will come, what `preprocess.fit.unmasked` does.
 """
 
 from collections.abc import Callable
@@ -10,13 +11,16 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Shaped
 
+from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.body import ShapedBody
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness
+from preprocess.fit.pictures import Picture, small_size
 from preprocess.fit.refit import FRAMES, Refit, moved_pelvis, refitted
+from preprocess.fit.unmasked import fitted_to_pictures
 from preprocess.kinematics import rotation_matrices
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
@@ -26,10 +30,10 @@ from preprocess.silhouette import PERSON_PX, SkinPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Seen:
-    """A frame that is kept: the tracker's own pose, and the mask, small."""
+    """A frame that is kept: the tracker's own pose, and the mask or the picture, small."""
 
     pose: BodyPose
-    alpha: Float32[np.ndarray, "height width"]
+    small: Shaped[np.ndarray, "height width *_"]
 
 
 @final
@@ -39,37 +43,32 @@ class GrowingFit:
     Attributes:
         refit: What was found last; None before the first frame.
         frames: On how many frames it rests.
+        masked: Whether it looks at masks, or at pictures.
     """
 
-    def __init__(self, shaped: ShapedBody, model: str) -> None:
+    def __init__(self, shaped: ShapedBody, model: str, *, masked: bool = True) -> None:
         """Nothing was seen yet.
 
         Args:
             shaped: The body that is used.
             model: Whose poses they are.
+            masked: Whether masks come along; else pictures are looked at.
         """
         self.refit: Refit | None = None
         self.frames = 0
-        self._skin, self._model = SkinPoints.of(shaped), model
+        self._skin, self._model, self.masked = SkinPoints.of(shaped), model, masked
         self._seen: list[_Seen] = []
         self._count, self._every = 0, 1
 
     def of(self, observation: Observation) -> Observation:
         """The observation with its pose as it fits the masks, this one among them."""
-        if self._count % self._every == 0:
-            self._keep(observation)
-        self._count += 1
-        if self._count >= 2 * self.frames:
-            self.frames = self._count
-            self.refit = self._found(observation)
-        if self.refit is None or not self.refit.worth_it:
-            return observation
-        return replace(observation, pose=self._moved(observation, self.refit))
+        pose = self._fitted(observation.pose, observation.camera, observation.alpha)
+        return observation if pose is observation.pose else replace(observation, pose=pose)
 
     def observing(
         self, observed: Callable[[Frame], Observation | Dropped]
     ) -> Callable[[Frame], Observation | Dropped]:
-        """What makes observations of frames, their poses fitted."""
+        """What makes observations of frames, their poses fitted to the masks in them."""
 
         def fitted(frame: Frame) -> Observation | Dropped:
             seen = observed(frame)
@@ -77,24 +76,52 @@ class GrowingFit:
 
         return fitted
 
-    def _keep(self, observation: Observation) -> None:
+    def posing(
+        self, pose_of: Callable[[Frame], BodyPose | str], camera: Camera
+    ) -> Callable[[Frame], BodyPose | str]:
+        """What gives frames their poses, fitted to the pictures, before masks are estimated."""
+
+        def fitted(frame: Frame) -> BodyPose | str:
+            pose = pose_of(frame)
+            return pose if isinstance(pose, str) else self._fitted(pose, camera, frame.rgb)
+
+        return fitted
+
+    def _fitted(
+        self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
+    ) -> BodyPose:
+        """The pose of a new frame as it fits all masks, or pictures, that are kept."""
+        if self._count % self._every == 0:
+            self._keep(pose, camera, seen)
+        self._count += 1
+        if self._count >= 2 * self.frames:
+            self.frames = self._count
+            self.refit = self._found(camera)
+        if self.refit is None or not self.refit.worth_it:
+            return pose
+        return self._moved(pose, camera, self.refit)
+
+    def _keep(
+        self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
+    ) -> None:
         """Remembers a frame; of more than twice what a search takes, every other one goes."""
-        alpha = observation.alpha
         if self._seen:
-            height, width = self._seen[0].alpha.shape
-        else:
-            rows = np.flatnonzero((alpha > 0.5).any(axis=1))
+            height, width = self._seen[0].small.shape[:2]
+        elif self.masked:
+            rows = np.flatnonzero((seen > 0.5).any(axis=1))
             scale = min(1.0, PERSON_PX / (rows[-1] + 1 - rows[0]))
-            height, width = (max(8, round(side * scale)) for side in alpha.shape)
-        small = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
-        self._seen.append(_Seen(pose=observation.pose, alpha=small.astype(np.float32)))
+            height, width = (max(8, round(side * scale)) for side in seen.shape)
+        else:
+            width, height = small_size(self._skin, pose, camera)
+        small = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
+        self._seen.append(_Seen(pose=pose, small=small))
         if len(self._seen) >= 2 * FRAMES:
             self._every *= 2
             del self._seen[1::2]
 
-    def _found(self, observation: Observation) -> Refit:
+    def _found(self, camera: Camera) -> Refit:
         """What all that is remembered says."""
-        poses, camera = [seen.pose for seen in self._seen], observation.camera
+        poses = [seen.pose for seen in self._seen]
         count = len(poses)
         motion = Motion(
             root_rotations=np.stack([pose.root_rotation for pose in poses]),
@@ -112,17 +139,23 @@ class GrowingFit:
             size_px=camera.size_px,
             distortion=camera.distortion,
         )
+        if not self.masked:
+            pictures = [
+                Picture(index=index, camera_row=0, rgb=seen.small)
+                for index, seen in enumerate(self._seen)
+            ]
+            return fitted_to_pictures(claim, self._skin, pictures)
         witnesses = tuple(
-            Witness(index=index, camera_row=0, alpha=seen.alpha)
+            Witness(index=index, camera_row=0, alpha=seen.small.astype(np.float32))
             for index, seen in enumerate(self._seen)
         )
         return refitted(claim, Evidence(witnesses=witnesses, skin=self._skin))
 
-    def _moved(self, observation: Observation, refit: Refit) -> BodyPose:
-        pose, rest = observation.pose, self._skin.shaped.joints[0]
+    def _moved(self, pose: BodyPose, camera: Camera, refit: Refit) -> BodyPose:
+        rest = self._skin.shaped.joints[0]
         there = moved_pelvis(
             rest + pose.root_translation,
-            observation.camera.center_world,
+            camera.center_world,
             rotation_matrices(pose.root_rotation),
             refit.nearer,
             refit.shift_m,

@@ -27,6 +27,8 @@ SHY = 4.0
 was moved towards the camera, and nothing else tells."""
 LEAST, GAIN = 0.6, 0.01
 """A refit is taken if body and masks then agree by so much, and by more than before."""
+EDGES = 1.6
+"""Without masks edges must be so many times as strong across the body's outline as beside it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,6 +40,9 @@ class Refit:
         before, after: Mean agreement of body and masks, in [0, 1].
         nearer: By what distances from the camera were divided.
         shift_m: How the pelvis was moved, in the root's own axes.
+        edges: Where masks were found around the body itself (`preprocess.fit.unmasked`): how many
+            times as strong the pictures' edges are across its outline as beside it, before and
+            after; None where masks were given.
     """
 
     motion: Motion
@@ -45,36 +50,70 @@ class Refit:
     after: float
     nearer: float
     shift_m: Float[np.ndarray, "3"]
+    edges: tuple[float, float] | None = None
 
     @property
     def worth_it(self) -> bool:
         """Whether the poses fit so much better that they are to be taken."""
-        return self.after >= LEAST and self.after > self.before + GAIN
+        return self.believed and self.after > self.before + GAIN
+
+    @property
+    def believed(self) -> bool:
+        """Whether body and pictures agree, in the end, so much as no chance makes them."""
+        if self.edges is not None and self.edges[1] < EDGES:
+            return False
+        return self.after >= LEAST
 
     def in_words(self) -> str:
         """What was done, for people."""
-        if not self.worth_it and self.before >= LEAST:
-            return f"Distances fit the masks as they are (agreement {self.before:.2f})."
+        if not self.believed:
+            return self._not_found()
+        agreed = f"agreement {self.before:.2f} before, {self.after:.2f} after"
+        if self.edges is None:
+            with_what = "masks"
+        else:
+            with_what = "pictures, in which masks were estimated around it"
+            agreed += (
+                f"; edges across its outline are {self.edges[1]:.1f} times as strong as beside "
+                f"it, before {self.edges[0]:.1f} times"
+            )
         if not self.worth_it:
+            return f"Distances fit the {with_what}, as they are ({agreed})."
+        return (
+            f"Distances were divided by {self.nearer:.3f} and the pelvis moved by "
+            f"{100.0 * float(np.linalg.norm(self.shift_m)):.1f} cm to fit the {with_what}: "
+            f"{agreed}."
+        )
+
+    def _not_found(self) -> str:
+        """What is said of a search that found nothing."""
+        if self.edges is None:
             return (
                 f"Their distances could not be fitted to the masks ({self.before:.2f} before, "
                 f"{self.after:.2f} after); they stay as they are."
             )
         return (
-            f"Distances were divided by {self.nearer:.3f} and the pelvis moved by "
-            f"{100.0 * float(np.linalg.norm(self.shift_m)):.1f} cm to fit the masks: agreement "
-            f"{self.before:.2f} before, {self.after:.2f} after."
+            "There are no masks, and where the poses put the body no person was found in the "
+            f"pictures (edges across its outline are {self.edges[1]:.1f} times as strong as beside "
+            "it, 2 to 5 times is usual); distances stay as they are. Do poses and video belong "
+            "together? Give --masks, with which ia-check can tell what is wrong, or your own SMPL "
+            "file (--body)."
         )
 
     def as_json(self) -> dict[str, float | bool]:
         """The same for the report."""
-        return {
+        told: dict[str, float | bool] = {
             "taken": self.worth_it,
             "agreement_before": round(self.before, 4),
             "agreement_after": round(self.after, 4),
             "distances_divided_by": round(self.nearer, 4),
             "pelvis_moved_cm": round(100.0 * float(np.linalg.norm(self.shift_m)), 2),
         }
+        if self.edges is not None:
+            told |= {
+                "edges_before": round(self.edges[0], 2), "edges_after": round(self.edges[1], 2),
+            }  # fmt: skip
+        return told
 
 
 def refitted(claim: Claim, evidence: Evidence) -> Refit:

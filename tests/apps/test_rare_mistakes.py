@@ -125,3 +125,18 @@ def test_times_in_milliseconds_are_said_to_be(capture, diagnosed):
     assert code == 2
     assert "Milliseconds, or another clock?" in said
     assert "in milliseconds, or by another clock?" in found["refused"]
+
+
+def test_without_masks_the_pictures_edges_tell_whether_poses_fit(capture, diagnosed):
+    shutil.rmtree(capture / "masks")
+    code, said, found = diagnosed()
+    assert (code, found["verdict"], found["iou"]["now"]) == (0, "good", None)
+    assert found["edges"] > 2.0
+    assert "as strong across the body's outline" in said
+    motion = read_motion(capture / "poses.npz")
+    motion.root_translations[:, 0] += 0.5
+    write_motion(capture / "poses.npz", motion)
+    code, said, beside = diagnosed()
+    assert (code, beside["verdict"]) == (0, "warn")
+    assert beside["edges"] < 1.5
+    assert "hardly fit" in said

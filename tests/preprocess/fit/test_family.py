@@ -71,11 +71,14 @@ def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth)
         assert "taken for SMPL's" in found.note
 
 
-def test_what_a_file_says_is_never_doubted_and_without_masks_nothing_is(filmed):
-    folder = filmed(unnamed("smpl"))
+@pytest.mark.parametrize("truth", ["smpl", "body24"])
+def test_what_a_file_says_is_never_doubted_and_without_masks_pictures_tell(filmed, truth):
+    folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     said = replace(unnamed("body24"), model_said=True)
     body = load_body()
     assert with_family(said, body, CAMERAS, source, masks, cameras_given=True) is said
     read = unnamed("body24")
-    assert with_family(read, body, CAMERAS, source, None, cameras_given=True) is read
+    found = with_family(read, body, CAMERAS, source, None, cameras_given=True)
+    assert found.model == truth
+    assert (found is read) == (truth == "body24")
