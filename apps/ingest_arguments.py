@@ -101,7 +101,7 @@ class IngestArguments:
     frames: str = "::"
     """Which frames, START:STOP:STEP, counted from 0."""
     hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HOLD_EVERY
-    """Every so manieth frame is kept for scores and never learnt from; 0 learns from all."""
+    """Every Nth frame is kept for scores and never learnt from; 0 learns from all."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
     force: Flag = False

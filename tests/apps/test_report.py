@@ -1,8 +1,11 @@
 """The report: numbers that a machine can read and a page that needs nothing else."""
 
 import json
-from dataclasses import replace
+import re
+from dataclasses import is_dataclass, replace
 from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args, get_type_hints
 from xml.etree import ElementTree
 
 import numpy as np
@@ -205,3 +208,26 @@ def test_the_curve_goes_up_when_the_score_does():
 
 def test_nothing_measured_draws_nothing():
     assert curve_svg((point(2.0, None),)) == ""
+
+
+def paths_in(record, above=""):
+    """Every key of a record in dots, as in `training.steps`."""
+    for name, kind in get_type_hints(record).items():
+        yield f"{above}{name}"
+        for part in (kind, *get_args(kind)):
+            if is_dataclass(part):
+                yield from paths_in(part, f"{above}{name}.")
+
+
+def test_the_page_on_the_report_names_every_key_and_no_other():
+    page = (Path(__file__).parents[2] / "docs" / "report.md").read_text()
+    told = set(re.findall(r"`([a-z0-9_.]+)`", page))
+    free = {"command", "recipe", "cameras"}  # what is in these, no record says
+    paths = {path for path in paths_in(Report) if path.split(".")[0] not in free} | free
+    above = {path.split(".")[0] for path in told}
+    alike = {path: path.replace("held_out_refined.", "held_out.") for path in paths}
+    known = told | above
+    assert not [p for p, like in alike.items() if not {like, like.split(".")[-1]} & known]
+    dotted = {path for path in told if "." in path and path.split(".")[0] not in {"report", *free}}
+    assert len(dotted) > 20
+    assert dotted <= paths
