@@ -95,3 +95,11 @@ def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(BadInput, match="Nothing was kept"):
         runtime.install(b"something else", folder)
     assert not folder.exists()
+
+
+def test_what_changes_with_every_picture_is_not_read_aloud():
+    """An <output> is a live region, which a screen reader would speak of all the time."""
+    page = site.page_files()["index.html"].decode()
+    outputs = re.findall(r"<output[^>]*>", page)
+    assert len(outputs) == 2
+    assert all('aria-live="off"' in each for each in outputs)

@@ -79,10 +79,10 @@ function tell({ failed, fallback, row, ms, rate, playing }, player, loading) {
   const second = (value) => (value / player.fps).toFixed(1);
   $("timeline").value = row;
   $("time").textContent = `${second(row)} / ${second(player.count)} s`;
-  const pace = document.createElement("span");
-  pace.className = "ms";
-  pace.textContent = `${ms.toFixed(0)} ms`;
-  $("rate").replaceChildren(pace, ...(playing ? [` · ${rate} fps`] : []));
+  const figures = { ms: `${ms.toFixed(0)} ms`, ...(playing && { fps: `${rate} fps` }) };
+  $("rate").replaceChildren(...Object.entries(figures).map(([className, textContent]) => (
+    Object.assign(document.createElement("span"), { className, textContent })
+  )));
   return undefined;
 }
 
