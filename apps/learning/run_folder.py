@@ -102,7 +102,7 @@ class RunFolder:
             return f"Nothing was written to {self.path}."
         return (
             f"The newest checkpoint is kept in {self.checkpoint}: run the same command with "
-            "--resume to go on from it."
+            "--resume, in place of any --overwrite, to go on from it."
         )
 
     def tidy(self) -> None:

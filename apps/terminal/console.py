@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import final
 
@@ -19,6 +19,19 @@ LOG_EVERY_S = 10.0
 
 
 @final
+class Stderr(RichConsole):
+    """What people read; once nobody does (`… 2>&1 | head`), the work goes on in silence."""
+
+    def __init__(self) -> None:
+        """Lines are as long as they are."""
+        super().__init__(stderr=True, soft_wrap=True)
+
+    def on_broken_pipe(self) -> None:
+        """The reader has gone; rich would end the process."""
+        self.quiet = True
+
+
+@final
 class Console:
     """Messages on stderr, so that stdout stays free for what was made.
 
@@ -28,7 +41,7 @@ class Console:
 
     def __init__(self, console: RichConsole | None = None) -> None:
         """A console on stderr, unless another is given."""
-        self._rich = console or RichConsole(stderr=True, soft_wrap=True)
+        self._rich = console or Stderr()
         self.warnings: list[str] = []
         self._beyond = 0
 
@@ -44,7 +57,8 @@ class Console:
     def say_last(self, message: str) -> None:
         """A line, from wherever the command is; the terminal gets its cursor back."""
         self._rich.show_cursor(True)
-        os.write(2, f"\n{message}\n".encode() if self.live else f"{message}\n".encode())
+        with suppress(BrokenPipeError):
+            os.write(2, f"\n{message}\n".encode() if self.live else f"{message}\n".encode())
 
     def made(self, what: str, path: object) -> None:
         """A line that names a file that is there now."""

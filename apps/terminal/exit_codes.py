@@ -3,9 +3,9 @@
 import errno
 from collections.abc import Callable
 
-from rich.console import Console
 from rich.markup import escape
 
+from apps.terminal.console import Stderr
 from apps.terminal.interrupt import INTERRUPTED as INTERRUPTED
 from apps.terminal.interrupt import noted
 from capture.errors import BadInput
@@ -71,8 +71,7 @@ def _exit_code(program: str, work: Callable[[], int]) -> int:
 
 def complain(program: str, message: str) -> None:
     """One message on stderr."""
-    console = Console(stderr=True, soft_wrap=True)
-    console.print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
+    Stderr().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
 
 
 def is_full(error: OSError) -> bool:
@@ -85,7 +84,7 @@ def _of_the_machine(error: OSError | RuntimeError | MemoryError) -> tuple[int, s
     if isinstance(error, OSError):
         why = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
         if is_full(error):
-            return NO_ROOM, f"the disk is full ({why})."
+            return NO_ROOM, f"the disk is full ({why}). Make room, or write elsewhere."
         if error.errno == errno.EBUSY:
             return NO_ROOM, f"a device is busy ({why})."
         if error.errno in FORBIDDEN | NO_PLACE:

@@ -132,6 +132,26 @@ def test_a_reader_that_has_seen_enough_is_no_fault():
         assert process.stderr.read() == b""
 
 
+def test_work_goes_on_when_nobody_listens_any_more():
+    code = (
+        "import sys\n"
+        "from apps.terminal.console import Console\n"
+        "from apps.terminal.exit_codes import Stop, exit_code\n"
+        "def work():\n"
+        "    for _ in range(99): Console().say('x' * 999)\n"
+        "    print('done', flush=True)\n"
+        "    raise Stop('too late', 2)\n"
+        "sys.exit(exit_code('ia-test', work))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stderr.readline()
+        process.stderr.close()
+        assert process.stdout.read() == b"done\n"
+        assert process.wait(timeout=50) == 2
+
+
 def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "deep" / "report.json"
     write_text(path, "old")
