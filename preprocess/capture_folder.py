@@ -70,9 +70,12 @@ def find_capture(
     if poses is None:
         poses = _first([video], POSES)
     if poses is None:
+        beside = _first([video.parent], POSES)
+        there = "" if beside is None else f" {beside} lies beside it: is it meant?"
         raise BadInput(
             f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
-            "tracker wrote: docs/formats.md). Finding poses in the video is a tracker's work."
+            f"tracker wrote: docs/formats.md).{there} Finding poses in the video is a tracker's "
+            "work."
         )
     inside = video.is_dir() and video.name != "images"
     places = [video if inside else video.parent, poses.parent]

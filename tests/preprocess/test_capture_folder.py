@@ -76,3 +76,9 @@ def test_what_is_named_must_be_there(make, missing):
 def test_cameras_that_are_to_be_solved_are_looked_for_nowhere(make):
     root = make("video.mp4", "poses.npz", "cameras.npz")
     assert find_capture(root, cameras="solve").cameras is None
+
+
+def test_poses_beside_a_video_are_not_taken_but_spoken_of(make):
+    root = make("a/v.mp4", "a/poses.npz")
+    with pytest.raises(BadInput, match=r"give --poses FILE .*poses\.npz lies beside it"):
+        find_capture(root / "a/v.mp4")
