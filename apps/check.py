@@ -140,10 +140,10 @@ def check(given: CheckArguments, console: Console) -> int:
             examined = examine(wanted)
     except BadInput as error:
         if given.json is not None:
-            write_text(given.json, json.dumps(unreadable(str(error)), indent=1))
+            write_text(given.json, json.dumps(unreadable(str(error)), indent=1) + "\n")
         raise
     if given.json is not None:
-        write_text(given.json, json.dumps(as_json(examined), indent=1))
+        write_text(given.json, json.dumps(as_json(examined), indent=1) + "\n")
     _say(examined, console)
     if write_sheet(given.sheet_path(), examined):
         console.made("look at it", given.sheet_path())

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console as RichConsole
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apps.studio.writer import ShootConfig, shoot
 from apps.terminal.command_line import parsed
@@ -52,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _sample(config: SampleConfig, console: Console) -> int:
     try:
-        _shoot_with_bar(config)
+        _shoot_with_bar(config, console)
     except (OSError, KeyboardInterrupt) as error:
         error.add_note("Nothing was left behind.")
         raise
@@ -62,19 +60,13 @@ def _sample(config: SampleConfig, console: Console) -> int:
     return DONE
 
 
-def _shoot_with_bar(config: SampleConfig) -> None:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bar:
-        task = bar.add_task("Dressing the actor", total=None)
+def _shoot_with_bar(config: SampleConfig, console: Console) -> None:
+    with console.bar("filming", 1.0) as bar:
 
         def advance(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total, description="Filming")
+            bar.move(done / total, f"{done}/{total} pictures")
 
+        bar.move(0.0, "dressing the actor")
         shoot(config.out, config.shoot, advance, overwrite=config.overwrite)
 
 

@@ -87,7 +87,7 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
         ) from error
     except Exception as error:  # what a damaged file makes torch stumble over has many types
         raise BadInput(
-            f"The checkpoint {path} cannot be read ({error}). "
+            f"The checkpoint {path} cannot be read ({str(error).split('. ')[0]}). "
             "Expected one that ia-ingest wrote. Train again with --overwrite."
         ) from error
 

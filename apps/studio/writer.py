@@ -1,10 +1,8 @@
 """The shoot: the actor in front of the camera, written as a native capture folder."""
 
 import errno
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from os import getpid
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +17,7 @@ from apps.studio.room import Room
 from apps.studio.roughen import roughened
 from apps.studio.stage import Stage
 from apps.studio.tracker import in_cameras, tracked
+from apps.terminal.whole import check_place, whole_folder
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.quiet import silence_opencv
@@ -109,25 +108,13 @@ def shoot(
         OSError: If the disk is full.
     """
     config.check()
-    _check_place(out, overwrite=overwrite)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = out.parent / f".{out.name}.unfinished-{getpid()}"
-    unfinished.mkdir()
-    try:
+    _check_free(out, overwrite=overwrite)
+    check_place(out, "OUT")
+    with whole_folder(out) as unfinished:
         _film(unfinished, config, progress or (lambda done, total: None))
-        if out.exists():
-            old = out.parent / f".{out.name}.old-{getpid()}"
-            out.rename(old)
-            unfinished.rename(out)
-            shutil.rmtree(old)
-        else:
-            unfinished.rename(out)
-    except BaseException:
-        shutil.rmtree(unfinished, ignore_errors=True)
-        raise
 
 
-def _check_place(out: Path, *, overwrite: bool) -> None:
+def _check_free(out: Path, *, overwrite: bool) -> None:
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     if not out.is_dir():
