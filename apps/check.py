@@ -34,9 +34,10 @@ class CheckArguments:
     """Says in seconds what is wrong with a capture, and how to mend it. Nothing is trained.
 
     The body is drawn where poses and camera say, and held against the masks. Where they disagree,
-    the usual mistakes are undone one after another: poses late or early, of another frame rate,
-    OpenGL's axes, pictures turned for the tracker, world and camera mixed up, a wrong focal
-    length, left for right, EasyMocap's root, another size or unit, masks of the background.
+    the usual mistakes are undone one after another: poses late or early, of another frame rate or
+    backwards, OpenGL's axes, pictures turned for the tracker, degrees, world and camera mixed up, a
+    wrong focal length, left for right, EasyMocap's root, another size or unit, masks of the
+    background. Without masks it is told how well the body's outline meets the pictures' edges.
     The one that mends it is named, with the agreement it would bring (intersection over union,
     0 to 1; 0.75 to 0.9 is what good poses reach, as clothes are wider than bodies).
 

@@ -1,14 +1,21 @@
 """Cameras of pictures that a rotation flag turns: made for them as stored, or as shown?"""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from capture.camera import Camera
 from capture.errors import BadInput
+from capture.images import list_images, orientation
 from capture.source import Source
 from preprocess.camera_file import CameraTrack, read_cameras
 from preprocess.cameras.colmap import find_model
+
+MIRRORED = {2: 0, 4: 2, 5: 1, 7: 3}
+"""EXIF's orientations of photographs that are mirrored: how many turns by 90° against the clock
+make them upright, once left and right were exchanged."""
 
 
 def upright_cameras(path: Path, source: Source) -> CameraTrack:
@@ -20,6 +27,9 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
     be those of the stored ones, as COLMAP leaves tags alone, and others are left as they are (so
     are those of videos, as what takes videos apart turns their pictures).
 
+    Photographs that a tag mirrors are shown as the eye saw them. Cameras that were made for them as
+    stored stand in a mirror's world, and are mirrored back with it.
+
     Args:
         path: See `read_cameras`.
         source: The frames; see `read_cameras`.
@@ -27,9 +37,11 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
     Raises:
         BadInput: As `read_cameras`.
     """
+    of_colmap = find_model(path) if path.is_dir() else path.suffix in (".bin", ".txt")
+    if (tag := _mirroring(source)) is not None:
+        return _of_mirrored(path, source, tag, of_colmap=bool(of_colmap))
     if source.quarter_turns % 2 == 0:
         track = read_cameras(path, source.size_px, None if source.live else source)
-        of_colmap = find_model(path) if path.is_dir() else path.suffix in (".bin", ".txt")
         hang = source.quarter_turns == 2 and source.path.is_dir()
         return _turned(track, path, source) if hang and of_colmap else track
     width, height = source.size_px
@@ -44,13 +56,47 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
     return _turned(stored, path, source)
 
 
+def _mirroring(source: Source) -> int | None:
+    """EXIF's orientation of photographs that it mirrors; None of all others."""
+    if source.live or not source.path.is_dir():
+        return None
+    for path in list_images(source.path):
+        data = path.read_bytes()
+        if data:
+            tag = orientation(data)
+            return tag if tag in MIRRORED else None
+    return None
+
+
+def _of_mirrored(path: Path, source: Source, tag: int, *, of_colmap: bool) -> CameraTrack:
+    """Cameras of photographs that a tag mirrors, of them as shown or as stored."""
+    width, height = source.size_px
+    stored_px = (height, width) if MIRRORED[tag] % 2 else (width, height)
+    shown, stored = _tried(path, (width, height), source), _tried(path, stored_px, source)
+    if isinstance(stored, CameraTrack) and (of_colmap or isinstance(shown, BadInput)):
+        said = f"The cameras in {path.name} were mirrored with the pictures, by their EXIF tag."
+        return _with(stored, said, lambda camera: camera.mirrored().turned(MIRRORED[tag]))
+    if isinstance(shown, BadInput):
+        raise shown
+    said = (
+        f"The photographs are mirrored by their EXIF tag (orientation {tag}); the cameras in "
+        f"{path.name} are taken for those of the pictures as shown."
+    )
+    return _with(shown, said, lambda camera: camera)
+
+
 def _turned(stored: CameraTrack, path: Path, source: Source) -> CameraTrack:
     """Cameras of stored pictures, turned with them."""
     said = f"The cameras in {path.name} were turned with the pictures, by their rotation flag."
+    return _with(stored, said, lambda camera: camera.turned(source.quarter_turns))
+
+
+def _with(track: CameraTrack, said: str, change: Callable[[Camera], Camera]) -> CameraTrack:
+    """All cameras changed, and that it is said."""
     return replace(
-        stored,
-        cameras=tuple(camera.turned(source.quarter_turns) for camera in stored.cameras),
-        note=said if stored.note is None else f"{stored.note} {said}",
+        track,
+        cameras=tuple(change(camera) for camera in track.cameras),
+        note=said if track.note is None else f"{track.note} {said}",
     )
 
 

@@ -47,6 +47,7 @@ def cures(claim: Claim, pelvis: Float[np.ndarray, "3"], frames: int) -> Iterator
     )
     yield from _wrong_world(claim)
     yield from _wrong_axes(claim)
+    yield from _wrong_angles(claim)
     yield from _wrong_rotation()
     yield from (shifted(k) for near in OFFSETS if near < frames // 2 for k in (near, -near))
     yield from _wrong_rate(claim, frames)
@@ -66,6 +67,34 @@ def _wrong_units() -> Iterator[Cure]:
                 motion=replace(c.motion, root_translations=c.motion.root_translations * factor),
             ),
         )
+
+
+def _wrong_angles(claim: Claim) -> Iterator[Cure]:
+    """Rotations that are not in radians, of which no joint needs so many."""
+    motion = claim.motion
+    roots, joints = motion.root_rotations[motion.valid], motion.joint_rotations[motion.valid]
+    of_root, of_joints = (_beyond_a_turn(vectors) for vectors in (roots, joints))
+    if of_root or of_joints:
+        yield Cure(
+            cause="root_rotation",
+            words="the rotations are in degrees, not in radians",
+            undo=lambda c: replace(c, motion=_in_radians(c.motion, of_root, of_joints)),
+        )
+
+
+def _beyond_a_turn(vectors: Float[np.ndarray, "*rows 3"]) -> bool:
+    """Whether one of the axis-angles turns by more than a whole turn."""
+    return bool((np.linalg.norm(vectors, axis=-1) > 2.0 * np.pi).any())
+
+
+def _in_radians(motion: Motion, of_root: bool, of_joints: bool) -> Motion:
+    """The motion with the root's angles, the joints', or both taken for degrees."""
+    roots, joints = motion.root_rotations, motion.joint_rotations
+    return replace(
+        motion,
+        root_rotations=np.deg2rad(roots) if of_root else roots,
+        joint_rotations=np.deg2rad(joints) if of_joints else joints,
+    )
 
 
 def _wrong_world(claim: Claim) -> Iterator[Cure]:
@@ -152,7 +181,15 @@ def _wrong_rotation() -> Iterator[Cure]:
 
 
 def _wrong_rate(claim: Claim, frames: int) -> Iterator[Cure]:
-    """Poses of a copy of the video with another number of frames a second."""
+    """Poses of a copy of the video with another number of frames a second, or played backwards."""
+    known = claim.places[np.isfinite(claim.places)]
+    if len(known) > 1:
+        ends = known.min() + known.max()
+        yield Cure(
+            cause="frame_rate",
+            words="the film runs backwards against its poses",
+            undo=lambda c: replace(c, places=ends - c.places),
+        )
     factors = {a / b for a in RATES for b in RATES if a != b}
     rows = len(claim.places)
     if rows != frames:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -140,3 +141,36 @@ def test_without_masks_the_pictures_edges_tell_whether_poses_fit(capture, diagno
     assert (code, beside["verdict"]) == (0, "warn")
     assert beside["edges"] < 1.5
     assert "hardly fit" in said
+
+
+def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
+    capture, diagnosed, tmp_path
+):
+    true = read_motion(capture / "poses.npz")
+    back = true.taken(np.arange(FRAMES)[::-1], np.arange(FRAMES))
+    write_motion(capture / "poses.npz", back)
+    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    assert (code, found["cause"], len(found["cures"])) == (0, "frame_rate", 1)
+    assert "the film runs backwards against its poses" in said
+    assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
+    mended = read_motion(tmp_path / "mended" / "poses.npz")
+    np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
+    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-9)
+    np.testing.assert_allclose(mended.root_translations, true.root_translations, atol=1e-9)
+
+
+def test_degrees_are_told_from_radians_and_mended(capture, diagnosed, tmp_path):
+    true = read_motion(capture / "poses.npz")
+    degrees = replace(
+        true,
+        root_rotations=np.rad2deg(true.root_rotations),
+        joint_rotations=np.rad2deg(true.joint_rotations),
+    )
+    write_motion(capture / "poses.npz", degrees)
+    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    assert (code, found["cause"], len(found["cures"])) == (0, "root_rotation", 1)
+    assert "the rotations are in degrees, not in radians" in said
+    assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
+    mended = read_motion(tmp_path / "mended" / "poses.npz")
+    np.testing.assert_allclose(mended.root_rotations, true.root_rotations, atol=1e-12)
+    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-12)

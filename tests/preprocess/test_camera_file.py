@@ -207,3 +207,39 @@ def test_cameras_of_another_shape_are_refused_as_the_user_sees_the_pictures(turn
     np.savez(tmp_path / "c.npz", intrinsic=LYING, width=100, height=100)
     with pytest.raises(BadInput, match="the video has 72x128"):
         upright_cameras(tmp_path / "c.npz", turned)
+
+
+@pytest.mark.parametrize("program", ["colmap", "stored", "shown"])
+@pytest.mark.parametrize("orientation", [2, 4, 5, 7])
+def test_cameras_of_mirrored_photographs_are_mirrored_back_with_their_world(
+    tmp_path, program, orientation
+):
+    """A point of the mirror's world is where its own camera has it, once pixels are upright."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    (tmp_path / "images").mkdir()
+    place = np.zeros((*STORED_PX[::-1], 3), np.uint8)
+    place[50, 100] = 255  # row 50, column 100
+    Image.fromarray(place).save(tmp_path / "images" / "0.png", exif=exif)
+    source = open_source(tmp_path / "images")
+    (frame,) = source.frames()
+    (y, *_), (x, *_) = np.nonzero(frame.rgb[..., 0])
+    stands = program == "shown" and orientation > 4
+    width, height = STORED_PX[::-1] if stands else STORED_PX
+    np.savez(tmp_path / "c.npz", intrinsic=LYING, width=width, height=height)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 128 72 90 91 63 35\n")
+    (tmp_path / "images.txt").write_text("1 0.5 -0.5 0.5 0.5 0.1 0.2 0.3 1 0.png\n\n")
+    track = upright_cameras(tmp_path if program == "colmap" else tmp_path / "c.npz", source)
+    camera = track.cameras[0]
+    assert np.linalg.det(camera.camera_from_world) == pytest.approx(1.0)
+    assert camera.size_px == source.size_px
+    if program == "shown" or (program == "stored" and orientation < 5):
+        np.testing.assert_array_equal(camera.intrinsic, LYING)
+        assert "taken for those of the pictures as shown" in track.note
+        return
+    named = tmp_path if program == "colmap" else tmp_path / "c.npz"
+    stored = read_cameras(named, STORED_PX, source if program == "colmap" else None).cameras[0]
+    there = stored.center_world + 3.0 * stored.directions(np.array([100.5, 50.5]))
+    mirrored_back = there * np.array([-1.0, 1.0, 1.0])
+    np.testing.assert_allclose(camera.project(mirrored_back), [x + 0.5, y + 0.5], atol=1e-6)
+    assert "mirrored with the pictures" in track.note
