@@ -15,12 +15,17 @@ from preprocess.growing_poses import LOOK_EVERY_S, PATIENCE_S
 from preprocess.masks.files import Masks, read_mask
 
 
+class _OtherWay(BadInput):
+    """A mask that is the other way round than those before it: waiting does not help."""
+
+
 @final
 class GrowingMasks:
     """The masks of a live source: a folder of pictures, written one after the other.
 
     A mask belongs to the picture of the same name; of a camera, whose pictures have none, to the
-    one whose number is the last in the mask's name.
+    one whose number is the last in the mask's name. Which side is the person, if nobody has said
+    it, is what most of them show so far, and the first if they are even; the others are refused.
     """
 
     def __init__(
@@ -31,18 +36,20 @@ class GrowingMasks:
         Args:
             path: The folder.
             pace: Its clock; ending it ends every wait.
-            invert: Whether the person is dark; None finds out from the first mask.
+            invert: Whether the person is dark; None finds out from the masks.
             patience_s: How long after it was filmed a frame waits for its mask.
         """
         self._path, self._pace, self._invert, self._patience_s = path, pace, invert, patience_s
         self._by_name: dict[str, Path] = {}
         self._by_number: dict[int, Path] = {}
+        self._ways: list[bool] = []
 
     def of(self, frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         """The mask of a frame, scaled to a picture's size; waits for it.
 
         Raises:
-            BadInput: If it did not come in time, cannot be read, or is of another shape.
+            BadInput: If it did not come in time, cannot be read, is of another shape, or the other
+                way round than most.
         """
         deadline = (self._pace.now() if frame.due_s is None else frame.due_s) + self._patience_s
         while True:
@@ -51,6 +58,8 @@ class GrowingMasks:
                 if path is not None:
                     return self._read(path, size_px)
                 trouble = BadInput(f"no mask within {self._patience_s:g} s")
+            except _OtherWay:
+                raise
             except BadInput as cause:  # perhaps it is half written
                 trouble = cause
             if self._pace.now() >= deadline or self._pace.ended:
@@ -59,11 +68,29 @@ class GrowingMasks:
 
     def _read(self, path: Path, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         stored = read_mask(path)
-        if not stored.any() and self._invert is None:  # it tells nothing of the others either
+        if self._invert is not None:
+            return Masks(path, 1, lambda row: stored, invert=self._invert).alpha(0, size_px)
+        if not stored.any():  # it tells nothing of the others either
             return np.zeros(size_px[::-1], dtype=np.float32)
-        masks = Masks(path, 1, lambda row: stored, invert=self._invert)
-        self._invert = masks.inverted
-        return masks.alpha(0, size_px)
+        before = self._most()
+        try:
+            turned = Masks(path, 1, lambda row: stored, invert=None).inverted
+        except BadInput:  # full, or undecidable, or no mask at all, which is said below
+            if before is None:
+                raise
+            return Masks(path, 1, lambda row: stored, invert=before).alpha(0, size_px)
+        alpha = Masks(path, 1, lambda row: stored, invert=turned).alpha(0, size_px)
+        self._ways.append(turned)
+        if turned != self._most():
+            raise _OtherWay(f"{path.name} is the other way round than most masks so far")
+        return alpha
+
+    def _most(self) -> bool | None:
+        """Whether the person is dark in most masks so far; None if there was none."""
+        if not self._ways:
+            return None
+        dark = 2 * sum(self._ways) - len(self._ways)
+        return dark > 0 if dark else self._ways[0]
 
     def _find(self, frame: Frame) -> Path | None:
         found = self._known(frame)

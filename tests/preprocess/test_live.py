@@ -175,13 +175,20 @@ def test_a_mask_that_comes_later_and_half_at_first_is_waited_for(tmp_path):
     thread.join()
 
 
-def test_which_side_is_the_person_is_found_out_once_and_kept(tmp_path):
-    write_mask(tmp_path, "0", inverted=True)
-    write_mask(tmp_path, "1")
-    growing = masks(tmp_path)
+def test_which_side_is_the_person_is_what_most_masks_show_so_far(tmp_path):
+    """One that was written the other way round is refused at once, also if it came first."""
+    for number, inverted in enumerate([True, False, False, False, True]):
+        write_mask(tmp_path, str(number), inverted=inverted)
+    growing = masks(tmp_path, patience_s=60.0)
     assert growing.of(frame(0, name="0"), (4, 6))[0, 0] == 0.0
-    assert growing.of(frame(1, name="1"), (4, 6))[0, 0] == 1.0  # turned, like the first
-    assert masks(tmp_path, invert=False).of(frame(1, name="1"), (4, 6))[0, 0] == 0.0
+    with pytest.raises(BadInput, match=r"1\.png is the other way round"):  # one against one
+        growing.of(frame(1, name="1"), (4, 6))
+    for number in (2, 3):
+        assert growing.of(frame(number, name=str(number)), (4, 6))[0, 0] == 0.0
+    with pytest.raises(BadInput, match=r"4\.png is the other way round"):
+        growing.of(frame(4, name="4"), (4, 6))
+    said = masks(tmp_path, invert=True)
+    assert said.of(frame(1, name="1"), (4, 6))[0, 0] == 1.0  # as was said, whatever it shows
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
