@@ -55,6 +55,7 @@ class Decoder(Protocol):
 def refusal(path: Path) -> BadInput:
     """What is said of a file that no decoder opens."""
     return BadInput(
-        f"{path} is no video that can be opened. A recording that was cut off before "
+        f"{path} is no video that can be opened; does it hold pictures, or sound "
+        "alone? A recording that was cut off before "
         "it was finished has no index and cannot be read: copy it again from the camera."
     )
