@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from apps.checking.examine import GOOD_EDGES, Examined, examine, share
 from apps.checking.mended import check_new_folder, write_mended
 from apps.checking.sheet import write_sheet
-from apps.ingest_arguments import parsed_frames
+from apps.ingest_arguments import parsed_frames, polarity
 from apps.recording.wanted import RecordingPaths
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
@@ -86,9 +86,6 @@ class CheckArguments:
         """
         if camera_address(self.video) is not None:
             raise BadInput(f"{self.video} is a camera; a recording was expected.")
-        if self.mask_invert and self.no_mask_invert:
-            raise BadInput("--mask-invert and --no-mask-invert contradict each other; drop one.")
-        invert = True if self.mask_invert else False if self.no_mask_invert else None
         return RecordingPaths(
             video=self.video,
             poses=self.poses,
@@ -96,7 +93,7 @@ class CheckArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parsed_frames(self.frames),
-            mask_invert=invert,
+            mask_invert=polarity(dark=self.mask_invert, bright=self.no_mask_invert),
             person=self.person,
         )
 

@@ -147,9 +147,7 @@ class IngestArguments:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.json is not None:
             check_file_place(self.json, "--json")
-        if self.mask_invert and self.no_mask_invert:
-            raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
-
+        polarity(dark=self.mask_invert, bright=self.no_mask_invert)
         if self.view is not None and not 0 <= self.view < 1 << 16:
             raise BadInput(f"--view is {self.view}; a port from 0 to 65535 was expected.")
         if self.view is not None and importlib.util.find_spec("viser") is None:
@@ -169,7 +167,6 @@ class IngestArguments:
 
     def wanted(self) -> RecordingPaths:
         """What is to be opened."""
-        invert = True if self.mask_invert else False if self.no_mask_invert else None
         return RecordingPaths(
             video=self.video,
             poses=self.poses,
@@ -177,7 +174,7 @@ class IngestArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parsed_frames(self.frames),
-            mask_invert=invert,
+            mask_invert=polarity(dark=self.mask_invert, bright=self.no_mask_invert),
             live=self.live,
             person=self.person,
             idle_s=self.idle_seconds,
@@ -231,6 +228,21 @@ def parsed_frames(text: str) -> slice | None:
         )
     parts = [int(part) if part else None for part in text.split(":")]
     return None if not any(part is not None for part in parts) else slice(*parts)
+
+
+def polarity(*, dark: bool, bright: bool) -> bool | None:
+    """Whether masks are to be turned; None if that is to be found out.
+
+    Args:
+        dark: Whether --mask-invert was given: the person is dark.
+        bright: Whether --no-mask-invert was given.
+
+    Raises:
+        BadInput: If both were.
+    """
+    if dark and bright:
+        raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
+    return dark if dark or bright else None
 
 
 def learnable_px(seconds: float) -> int:
