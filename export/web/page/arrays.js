@@ -12,7 +12,9 @@ export async function load(entry, arrived = () => {}) {
     transform(chunk, out) { arrived(chunk.length); out.enqueue(chunk); },
   });
   const unpacked = answer.body.pipeThrough(counted).pipeThrough(new DecompressionStream("deflate"));
-  const planes = new Uint8Array(await new Response(unpacked).arrayBuffer());
+  const planes = new Uint8Array(await new Response(unpacked).arrayBuffer().catch(() => {
+    throw new Error(`${entry.file} came damaged or in part. Load the page again; if that changes nothing, write its folder anew.`);
+  }));
   const Kind = KINDS[entry.dtype];
   const count = entry.shape.reduce((product, size) => product * size, 1);
   if (planes.length !== count * Kind.BYTES_PER_ELEMENT) {

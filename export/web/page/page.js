@@ -50,6 +50,7 @@ class Loading {
   }
 
   hear({ arrived, preparing }) {
+    if ($("status").classList.contains("failed")) return; // other files may still be coming
     this.bytes += arrived || 0;
     const [done, all] = [this.bytes, this.total].map((bytes) => (bytes / 1e6).toFixed(1));
     $("status-bar").value = preparing ? 1 : Math.min(1, this.bytes / this.total);
