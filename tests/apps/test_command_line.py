@@ -54,3 +54,11 @@ def test_words_that_make_no_sense_are_bad_input(capsys):
         importlib.import_module("apps.fetch_runtime").main(["--bogus"])
     assert end.value.code == 2
     assert "--bogus" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", ["ia-check", "ia-ingest"])
+def test_masks_cannot_be_dark_and_bright(program, capsys):
+    module, function = COMMANDS[program].split(":")
+    words = ["capture", "--mask-invert", "--no-mask-invert"]
+    assert getattr(importlib.import_module(module), function)(words) == 2
+    assert "contradict" in capsys.readouterr().err
