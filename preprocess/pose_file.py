@@ -21,6 +21,9 @@ LAYOUTS = (
 
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 
+LARGEST = 1e9
+"""Angles and places beyond this are damage, and nothing can be computed with them."""
+
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
@@ -169,8 +172,8 @@ def _valid(
     times: Float[np.ndarray, "poses"] | None,
     path: Path,
 ) -> Bool[np.ndarray, "poses"]:
-    """Rows that are finite and not marked as lost."""
-    valid = np.asarray(np.isfinite(numbers).all(axis=1))
+    """Rows that are finite, of a size that angles and places have, and not marked as lost."""
+    valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < LARGEST).all(axis=1))
     marked = _per_row(arrays, "valid", len(valid), path)
     if marked is not None:
         valid &= marked > 0

@@ -108,7 +108,8 @@ def small_size(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple[int, i
     points = skin.posed(pose).astype(np.float64)
     depth = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
     tall = float(np.ptp(camera.project(points)[:, 1])) if depth.min() > NEAR_M else float(height)
-    scale = min(1.0, PERSON_PX / max(min(tall, 2.0 * height), 1.0))
+    tall = float(np.clip(tall, 1.0, 2.0 * height)) if np.isfinite(tall) else float(height)
+    scale = min(1.0, PERSON_PX / tall)
     return max(8, round(width * scale)), max(8, round(height * scale))
 
 
