@@ -10,6 +10,7 @@ import torch
 from avatar.cells import WarpCells
 from avatar.events import Score
 from avatar.hold import HeldOut, score
+from avatar.pose_prior import guessed
 from avatar.prepare import prepare
 from avatar.refine import PoseTable
 from avatar.replay import Replay
@@ -30,7 +31,8 @@ def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
 def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Score]]:
     """Held-out frames in poses that have been fitted to them, each with its score.
 
-    The avatar stays as it is: nothing of these frames is learnt but where the body was. A few
+    The avatar stays as it is: nothing of these frames is learnt but where the body was, from where
+    the frames around were found to be. A few
     hundred rays at a time say where to go, so an exact pose comes out a millimetre off; where the
     given pose shows the frame better, it stays.
 
@@ -46,7 +48,11 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Sco
     poses = PoseTable(avatar.rig, len(held), device, frozen=True)
     for frame in held:
         prepared = prepare(frame.observation, avatar.rig)
-        poses.put(replay.add(prepared), prepared.pose)
+        slot = replay.add(prepared)
+        poses.put(slot, prepared.pose, correction=guessed(prepared.index, trainer.corrections))
+        cells = WarpCells.of(avatar.rig, poses.pose(slot).joint_rotations, device=device)
+        replay.put_cells(slot, cells)
+        replay.move_root(slot, poses.root(slot))
     config = dataclasses.replace(
         trainer.config, empty_weight=0.0, solid_weight=0.0, rays=2 * RAYS_A_CORRECTION
     )

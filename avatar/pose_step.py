@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
+from avatar.pose_prior import UNKNOWN, PosePrior
+
 SPREAD_RAD = 0.05
 """How far a tracker's rotations are off, give or take: what no picture determines stays there."""
 SPREAD_M = 0.025
@@ -32,10 +34,12 @@ class PoseStep(NamedTuple):
         change: Of the correction: radians, and metres in the last row.
         evidence: Mean of (Σ g)² / Σ g² over the directions that the rays determine: about 1 if
             their gradients g are chance, about their number if all say the same.
+        alone: The correction that the rays would end at without neighbours, in units of its spread.
     """
 
     change: Float[np.ndarray, "25 3"]
     evidence: float
+    alone: Float[np.ndarray, "25 3"]
 
 
 def pose_step(
@@ -44,6 +48,7 @@ def pose_step(
     correction: Float[np.ndarray, "25 3"],
     common: float,
     *,
+    prior: PosePrior = UNKNOWN,
     overstep: float = OVERSTEP,
 ) -> PoseStep:
     """The step that brings a pose to where its rays fit, as far as they determine it.
@@ -51,9 +56,10 @@ def pose_step(
     Args:
         gradients: Of each ray's loss for the correction.
         loss: Of each ray.
-        correction: As it is; directions that the rays leave open go back to zero.
+        correction: As it is; directions that the rays leave open go back to what is expected.
         common: Mean evidence of all frames: they were tracked alike. Infinite where a pose is to
             move in any case.
+        prior: What is believed of the correction before these rays are asked.
         overstep: Length of the step, in Gauss-Newton's.
     """
     scale = np.full((25, 3), SPREAD_RAD, dtype=np.float32)
@@ -65,12 +71,17 @@ def pose_step(
     along = scaled @ axes
     chance, wish = (along**2).sum(axis=0), along.sum(axis=0)
     # what one unit of curvature is worth beside one spread of the prior: the rays' mean 2ℓ
-    prior = chance.sum() / (determined.sum() + 1e-12) + 1e-12
-    told = determined > prior
+    given = chance.sum() / (determined.sum() + 1e-12) + 1e-12
+    told = determined > given
     evidence = float(np.mean(wish[told] ** 2 / (chance[told] + 1e-12))) if told.any() else 0.0
     share = min(max((0.5 * (evidence + common) - CHANCE) / (CERTAIN - CHANCE), 0.0), 1.0)
-    back = prior * (axes.T @ (correction / scale).reshape(75))
-    asked = axes @ ((overstep * wish + back) / (determined + prior))
-    change = -share * scale * asked.reshape(25, 3).astype(np.float64)
+
+    def asked(length: float, believed: PosePrior) -> Float[np.ndarray, "25 3"]:
+        stiff = believed.precision * given
+        back = stiff * (axes.T @ ((correction - believed.mean) / scale).reshape(75))
+        found = axes @ ((length * wish + back) / (determined + stiff))
+        return found.reshape(25, 3).astype(np.float64)
+
+    change = -share * scale * asked(overstep, prior)
     shortened = LONGEST / max(float(np.abs(change).max()), LONGEST)
-    return PoseStep(shortened * change, evidence)
+    return PoseStep(shortened * change, evidence, correction / scale - asked(1.0, UNKNOWN))

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend import Skin
+from avatar.pose_prior import Neighbours
 from avatar.pose_step import CHANCE, OVERSTEP, pose_step
 from avatar.replay import RootCorrection
 from avatar.rig import Rig
@@ -106,6 +107,7 @@ class PoseTable:
         self._since = np.zeros(capacity, dtype=np.int64)
         self._judged, self._settled = np.zeros((2, capacity), dtype=bool)
         self._asked, self._told = np.zeros((2, capacity))
+        self._neighbours = Neighbours(capacity)
         self._open = torch.ones(capacity, dtype=torch.bool, device=device)
 
     def put(
@@ -114,13 +116,23 @@ class PoseTable:
         pose: BodyPose,
         correction: Float[np.ndarray, "25 3"] | None = None,
         *,
+        frame: int | None = None,
         step: int = 0,
     ) -> None:
-        """Takes in a frame's given pose, its correction if one is known, and since which step."""
+        """Takes in a frame's given pose.
+
+        Args:
+            slot: Its place.
+            pose: As the tracker has it.
+            correction: If one is known.
+            frame: Its number: poses of frames in a row err alike. None if nothing is in a row.
+            step: Since when it is learnt from.
+        """
         self._given[slot] = pose
         self._since[slot] = step
         self._open[slot] = True
         self._settled[slot] = False
+        self._neighbours.put(slot, frame)
         self._asked[slot] = self._told[slot] = 0.0
         self.corrections[slot] = 0.0
         if correction is not None:
@@ -194,9 +206,10 @@ class PoseTable:
         loss = self._losses[slot, :rows].cpu().numpy()
         step = pose_step(
             self.gradients(slot), loss, self.corrections[slot], self._evidence,
-            overstep=self._overstep,
+            prior=self._neighbours.expected(slot, self.corrections), overstep=self._overstep,
         )  # fmt: skip
         self._rays[slot] = 0
+        self._neighbours.tell(slot, step.alone)
         self._evidence = MEMORY * self._evidence + (1.0 - MEMORY) * step.evidence
         if self._judged[slot]:
             self._asked[slot] += 1.0

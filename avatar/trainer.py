@@ -96,7 +96,7 @@ class Trainer:
         slot = self.replay.add(frame)
         known = self.corrections.get(frame.index)
         step = 0 if again else self.steps
-        self.poses.put(slot, frame.pose, correction=known, step=step)
+        self.poses.put(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
             joints = self.poses.pose(slot).joint_rotations
             cells = WarpCells.of(self.avatar.rig, joints, device=self.replay.device)

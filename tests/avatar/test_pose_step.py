@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from avatar.pose_prior import PosePrior
 from avatar.pose_step import CERTAIN, CHANCE, OVERSTEP, SPREAD_M, SPREAD_RAD, pose_step
 
 NONE = np.zeros((25, 3))
@@ -45,6 +46,28 @@ def test_what_no_ray_feels_goes_back_to_where_it_was_given(slopes, rng):
     correction[7] = 0.02
     step = pose_step(*rays_of(slopes, off), correction, 1.0)
     np.testing.assert_allclose(step.change[7], -correction[7], rtol=1e-3)
+
+
+def test_what_no_ray_feels_goes_to_where_it_is_expected(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    slopes[:, 7] = 0.0
+    off[7] = 0.0
+    mean = np.zeros((25, 3))
+    mean[7] = 0.02
+    told = PosePrior(mean, 5.0)
+    step = pose_step(*rays_of(slopes, off), NONE, 1.0, prior=told)
+    np.testing.assert_allclose(step.change[7], 0.02, rtol=1e-3)
+    assert np.linalg.norm(np.delete(step.change, 7, axis=0)) > 0.1
+
+
+def test_what_rays_alone_ask_for_is_where_they_end_whatever_is_expected(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    correction = rng.normal(size=(25, 3)) * SCALE * 0.1
+    told = PosePrior(rng.normal(size=(25, 3)) * SCALE, 13.0)
+    one = pose_step(*rays_of(slopes, off + correction), correction, 1.0)
+    other = pose_step(*rays_of(slopes, off + correction), correction, 1.0, prior=told)
+    np.testing.assert_array_equal(one.alone, other.alone)
+    np.testing.assert_allclose(one.alone, -off / SCALE, atol=0.05)
 
 
 def test_rays_that_feel_nothing_ask_for_nothing():

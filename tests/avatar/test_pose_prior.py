@@ -1,0 +1,76 @@
+"""Neighbours tell of a pose's error what a wandering tracker lets them, and else nothing."""
+
+import numpy as np
+import pytest
+
+from avatar.pose_prior import (
+    FARTHEST_APART,
+    FEWEST_PAIRS,
+    UNKNOWN,
+    WORTH,
+    Neighbours,
+    correlation,
+    expected,
+    guessed,
+)
+
+
+def errors_of(rng, frames, *, alike):
+    """An autoregressive process of unit variance, of this correlation from frame to frame."""
+    errors = [rng.normal(size=(25, 3))]
+    for _ in range(frames - 1):
+        errors.append(alike * errors[-1] + np.sqrt(1.0 - alike**2) * rng.normal(size=(25, 3)))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.5, 0.9])
+def test_the_correlation_of_a_process_is_found_in_any_order_of_its_frames(rng, alike):
+    errors, order = errors_of(rng, 100, alike=alike), rng.permutation(100)
+    assert correlation(order, errors[order]) == pytest.approx(alike, abs=0.06)
+
+
+def test_too_few_neighbours_tell_nothing(rng):
+    errors = errors_of(rng, FEWEST_PAIRS + 1, alike=0.99)
+    numbers = np.arange(FEWEST_PAIRS + 1)
+    assert correlation(numbers, errors) > 0.8
+    assert correlation(numbers[1:], errors[1:]) == 0.0
+    assert correlation((FARTHEST_APART + 1) * numbers, errors) == 0.0
+
+
+def test_a_frame_is_expected_to_err_as_those_around_it_do_the_nearest_most(rng):
+    errors = errors_of(rng, 40, alike=0.95)
+    frames = np.delete(np.arange(41), 20)
+    told = expected(20, frames, errors, 0.95)
+    distances = np.abs(frames - 20)
+    weights = np.where(distances <= FARTHEST_APART, 1.0 / distances, 0.0)
+    mean = WORTH / (1.0 + WORTH) * np.average(errors, axis=0, weights=weights)
+    assert told.precision == 1.0 + WORTH
+    np.testing.assert_allclose(told.mean, mean)
+    np.testing.assert_allclose(guessed(20, dict(zip(frames.tolist(), errors, strict=True))), mean)
+
+
+def test_the_error_of_a_frame_in_between_is_guessed_where_errors_wander(rng):
+    errors = errors_of(rng, 60, alike=0.97)
+    known = {frame: error for frame, error in enumerate(errors) if frame % 10}
+    missed = [errors[frame] - guessed(frame, known) for frame in range(10, 60, 10)]
+    assert np.mean(np.square(missed)) < 0.3 * np.mean(np.square(errors[10::10]))
+
+
+def test_a_slot_is_asked_of_by_its_neighbours_and_does_not_tell_of_itself(rng):
+    errors, neighbours = errors_of(rng, 40, alike=0.95), Neighbours(40)
+    for slot in range(40):
+        neighbours.put(slot, slot)
+        neighbours.tell(slot, errors[slot])
+    before = neighbours.expected(20, errors)
+    assert before.precision == 1.0 + WORTH
+    errors[20] += 100.0
+    np.testing.assert_array_equal(neighbours.expected(20, errors).mean, before.mean)
+    neighbours.put(20, None)
+    assert neighbours.expected(20, errors) is UNKNOWN
+
+
+def test_neighbours_say_nothing_where_errors_flicker_or_nobody_is_near(rng):
+    flickering, wandering = (errors_of(rng, 40, alike=alike) for alike in (0.0, 0.95))
+    assert not guessed(20, dict(enumerate(flickering))).any()
+    assert not guessed(60, dict(enumerate(wandering))).any()
+    assert not guessed(20, {}).any()
