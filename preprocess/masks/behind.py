@@ -2,6 +2,7 @@
 
 from typing import final
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
@@ -22,9 +23,16 @@ REMEMBERED = 20.0
 MOVED_PX = 0.5
 """A camera that moved more than this in the picture sees another background."""
 
+GRAIN = 5.0
+"""The background is never known better than this, in levels."""
+LIT_PX = 3.0
+"""How far around the brightness of the background is the same (a Gaussian's σ)."""
+
 OTHER, MOST_OTHER = 12.0, 0.25
 """Where more of the background than this differs by so much from before, the camera has moved even
 if nobody says so."""
+SPARSE = 2
+"""Every so manieth row and column is asked about that."""
 
 Pixels = Bool[np.ndarray, "height width"]
 
@@ -36,6 +44,7 @@ class Behind:
     def __init__(self) -> None:
         """Nothing is known yet."""
         self._mean: Float32[np.ndarray, "height width 3"] | None = None
+        self._variance: Float32[np.ndarray, "height width"] | None = None
         self._times: Float32[np.ndarray, "height width"] | None = None
         self._camera: Camera | None = None
 
@@ -85,17 +94,48 @@ class Behind:
             far = camera.center_world + 5.0 * camera.directions(corners)
             same = bool((np.abs(before.project(far) - corners) < MOVED_PX).all())
         if same:
-            known = free & (self._times > 0.0)
-            off = np.abs(rgb[known] - self._mean[known]).max(axis=-1, initial=0.0)
+            some = np.s_[::SPARSE, ::SPARSE]
+            known = free[some] & (self._times[some] > 0.0)
+            off = np.abs(rgb[some][known] - self._mean[some][known]).max(axis=-1, initial=0.0)
             same = not len(off) or float((off > OTHER).mean()) < MOST_OTHER
         if not same:
-            self._mean = self._times = None
+            self._mean = self._variance = self._times = None
+
+    def shown(
+        self, rgb: UInt8[np.ndarray, "height width 3"], free: Pixels
+    ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]] | None:
+        """What lies behind the person, as bright as it is beside, and its standard deviation.
+
+        Args:
+            rgb: The picture.
+            free: Where the person surely is not.
+
+        Returns:
+            None if nothing is known yet; where not enough is, the deviation is infinite.
+        """
+        if self._mean is None or self._variance is None or self._times is None:
+            return None
+        known, mean = self._times >= TRUSTED, self._mean
+        if not known.any():
+            return None
+        beside = (known & free).astype(np.float32)
+        seen = np.einsum("hwc,hwc->hw", rgb, mean, dtype=np.float32) * beside
+        before = np.einsum("hwc,hwc->hw", mean, mean) * beside
+        seen, before = (cv2.GaussianBlur(each, (0, 0), LIT_PX) for each in (seen, before))
+        gain = np.clip((seen + 1.0) / (before + 1.0), DARKEST, BRIGHTEST).astype(np.float32)
+        spread = np.sqrt(np.maximum(self._variance, np.float32(GRAIN**2)))
+        return mean * gain[..., None], np.where(known, spread, np.float32(np.inf))
 
     def learn(self, rgb: UInt8[np.ndarray, "height width 3"], free: Pixels) -> None:
         """Takes in the pixels of a picture where the person surely is not."""
-        if self._mean is None or self._times is None:
+        if self._mean is None or self._variance is None or self._times is None:
             self._mean = np.zeros(rgb.shape, np.float32)
+            self._variance = np.zeros(free.shape, np.float32)
             self._times = np.zeros(free.shape, np.float32)
-        self._times[free] += 1.0
-        share = 1.0 / np.minimum(self._times[free], REMEMBERED)
-        self._mean[free] += (rgb[free] - self._mean[free]) * share[:, None]
+        self._times += free
+        share = free / np.clip(self._times, np.float32(1.0), np.float32(REMEMBERED))
+        off = rgb - self._mean
+        self._mean += off * share[..., None]
+        # Welford 1962: of what is new, its part across the new mean is the variance's
+        squared = np.einsum("hwc,hwc->hw", off, off) / np.float32(3.0)
+        self._variance += share * ((np.float32(1.0) - share) * squared - self._variance)

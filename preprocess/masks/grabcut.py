@@ -5,7 +5,8 @@ Alone it leaks into backgrounds of the person's colours; so the posed body, with
 earlier frames have shown on it (`Shell`), says where to look: only a narrow band around that shape
 is in doubt. If the camera stands still, pixels that were background in earlier frames also say what
 lies behind the person (`Behind`). The mask is the mean of cut and shape, weighted by how far they
-were found to be off; where they are far apart though the poses are good, the cut has leaked.
+were found to be off; where they are far apart though the poses are good, the cut has leaked. Last,
+where it is known what lies behind, border pixels are split by colours (`unmixed`).
 """
 
 from typing import NamedTuple, final
@@ -19,25 +20,14 @@ from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess.body import ShapedBody
 from preprocess.masks.behind import Behind
+from preprocess.masks.colours import Colours, Sight
 from preprocess.masks.hair import HAIR_M, HEAD, knots, near_head
 from preprocess.masks.matte import softened
-from preprocess.masks.shell import Around, Shell
+from preprocess.masks.mixture import outside_px, unmixed
+from preprocess.masks.outline import away_px
+from preprocess.masks.scale import Scale
+from preprocess.masks.shell import FOLLOWED, Around, Shell
 from preprocess.pose import BodyPose
-
-WORK_PX = 220
-"""Masks are found in pictures in which the person is about so large, or smaller."""
-
-SMALL_PX = 150
-"""Pictures of smaller persons are enlarged twice: masks then know parts of a pixel."""
-
-NEARLY = 1.1
-"""A person who is little larger is not worth a smaller picture."""
-
-JOINTS_SHARE = 0.87
-"""Of a standing person's height, how much lies between head joint and toes."""
-
-OTHER_SIZE = 1.4
-"""The scale is chosen anew when the person has become so many times larger or smaller."""
 
 UNKNOWN_M, KNOWN_M, LEAST_OUTSIDE_M = 0.02, 0.008, 0.012
 """How far inside and outside the shell pixels are in doubt, where nothing is known of it and where
@@ -53,10 +43,11 @@ OUTSIDE_WIDER = 1.5
 AROUND_M = 0.25
 """How much of the background is looked at."""
 
-MARGIN_M = 0.04
-"""Background is what is at least so far from the person."""
+MARGIN_M, MARGIN_PX = 0.015, 2.0
+"""Background is what is at least so far from the person, by both measures."""
 
-ROUNDS = 2
+ROUNDS, FEWER_ROUNDS = 2, 1
+"""Rounds of GrabCut; the fewer where the shell, and what lies behind it, are known."""
 
 CUT_OFF_M = 0.006
 """How far the cut's border is off, for whatever reason, where it has not leaked."""
@@ -114,9 +105,10 @@ class GrabCut:
 
     def __init__(self, shaped: ShapedBody) -> None:
         """Nothing is known about clothes and background yet."""
-        self._shaped, self._shell, self._behind = shaped, Shell(shaped), Behind()
+        self._shell, self._behind = Shell(shaped), Behind()
+        self._colours = Colours(len(shaped.vertices))
         self._head = shaped.body.weights.argmax(axis=1) == HEAD
-        self._tall_px: float | None = None
+        self._scale = Scale(shaped)
         self._wider_m = 0.0
         self._off_m = 0.012
         self.found, self.agreement = 0, 0.0
@@ -129,7 +121,7 @@ class GrabCut:
         Raises:
             BadInput: If the body is not in the picture, or nothing that agrees with it is found.
         """
-        scale = self._scale_for(pose, camera)
+        scale = self._scale.of(pose, camera)
         size_px = (max(1, round(frame.size_px[0] * scale)), max(1, round(frame.size_px[1] * scale)))
         small, rgb = camera.resized(size_px), frame.rgb
         if size_px != frame.size_px:
@@ -145,24 +137,32 @@ class GrabCut:
             raise BadInput(f"the estimated mask agrees by {agreement:.0%} only with the posed body")
         alpha = softened(rgb, cut.person)
         self._learn(rgb, cut, alpha, small, around, shape)
+        weight = self._weight_of_shell(cut, shape, around)
+        mixed = _mixed(alpha, weight, shape, size_px)
+        found = self._unmixed(rgb, mixed, around, small)
         self.found += 1
         self.agreement += (agreement - self.agreement) / self.found
-        weight = self._weight_of_shell(cut, shape, around)
-        return _mixed(alpha, weight, shape, frame.size_px)
+        if size_px == frame.size_px:
+            return found
+        change = cv2.resize(found - mixed, frame.size_px, interpolation=cv2.INTER_LINEAR)
+        return np.clip(_mixed(alpha, weight, shape, frame.size_px) + change, 0.0, 1.0)
 
-    def _scale_for(self, pose: BodyPose, camera: Camera) -> float:
-        """How many times larger than the frame the picture is in which its mask is found."""
-        joints = self._shaped.with_pose(pose).joints()
-        depth = joints @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-        if depth.min() > 0.0:
-            tall = float(np.ptp(camera.project(joints), axis=0).max()) / JOINTS_SHARE
-            before = self._tall_px
-            if before is None or not 1.0 / OTHER_SIZE < tall / before < OTHER_SIZE:
-                self._tall_px = tall
-        tall = max(self._tall_px or 0.0, 1.0)
-        if tall < SMALL_PX:
-            return 2.0
-        return 1.0 if tall < NEARLY * WORK_PX else WORK_PX / tall
+    def _unmixed(
+        self,
+        rgb: UInt8[np.ndarray, "height width 3"],
+        alpha: Float32[np.ndarray, "height width"],
+        around: Around,
+        camera: Camera,
+    ) -> Float32[np.ndarray, "height width"]:
+        """The mask with its border where colours put it, if it is known what lies behind."""
+        outside = outside_px(alpha)
+        behind = self._behind.shown(rgb, outside > MARGIN_PX)
+        if behind is None:
+            return alpha
+        sight = Sight.of(around, camera)
+        self._colours.learn(sight, rgb, -outside)
+        person = self._colours.along(sight, camera.size_px)
+        return unmixed(rgb, alpha, behind, person)
 
     def _expected(self, pose: BodyPose, camera: Camera) -> tuple[Around, _Shape]:
         around = self._shell.around(pose, camera)
@@ -171,7 +171,7 @@ class GrabCut:
         fine = self._shell.drawn(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
         hair = near_head(around.skin[self._head], camera, around.px_per_m)
-        shape = _Shape(fine=fine, covered=covered, away=_away(covered > 0.5), hair=hair)
+        shape = _Shape(fine=fine, covered=covered, away=away_px(covered > 0.5), hair=hair)
         if (shape.away < 0.0).sum() < 16:
             raise BadInput("the posed body is not in the picture")
         return around, shape
@@ -188,6 +188,8 @@ class GrabCut:
         like, unlike = self._behind.compared(rgb, doubtful)
         labels[like], labels[unlike] = cv2.GC_PR_BGD, cv2.GC_PR_FGD
         labels[away <= -inwards] = cv2.GC_FGD
+        settled = self._behind.known and around.known > FOLLOWED
+        rounds = FEWER_ROUNDS if settled else ROUNDS
         margin = int(AROUND_M * around.px_per_m) + 1
         rows, columns = np.nonzero(near)
         box = (
@@ -199,13 +201,13 @@ class GrabCut:
         if (part & 1).any() and not (part & 1).all():
             cv2.setRNGSeed(0)
             bgr = np.ascontiguousarray(rgb[box][..., ::-1])
-            cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+            cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
         person = np.zeros(away.shape, dtype=bool)
         person[box] = (part & 1) > 0
         person = (person & ~like) | unlike
         return _Cut(
             person=person,
-            away=_away(person),
+            away=away_px(person),
             sure=(like | unlike).astype(np.float32),
             doubt_m=(float(inwards), float(outwards)),
         )
@@ -232,7 +234,7 @@ class GrabCut:
             off = 1.25 * float(np.abs(shape.away[near]).mean()) / per_m
             self._off_m += 0.2 * (off - self._off_m)
         self._shell.vote(around, camera, rgb, alpha, shape.away, cut.doubt_m)
-        margin = max(2.0, MARGIN_M * per_m)
+        margin = max(MARGIN_PX, MARGIN_M * per_m)
         self._behind.learn(rgb, (from_cut > margin) & (shape.away > margin))
 
     def _weight_of_shell(
@@ -273,11 +275,3 @@ def _mixed(
         way = cv2.INTER_AREA if finer else cv2.INTER_LINEAR
         covered = cv2.resize(shape.fine, size_px, interpolation=way)
     return weight * covered + (np.float32(1.0) - weight) * alpha
-
-
-def _away(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
-    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
-    hard = shape.astype(np.uint8)
-    outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
-    inside = cv2.distanceTransform(hard, cv2.DIST_L2, 5)
-    return np.asarray(outside - inside + np.where(shape, 0.5, -0.5), dtype=np.float32)

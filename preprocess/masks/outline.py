@@ -1,10 +1,10 @@
-"""The outline of a posed body in a picture, triangle by triangle."""
+"""The outline of a posed body in a picture, and how far pixels are from one."""
 
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from capture.camera import Camera
 from preprocess.body import ShapedBody
@@ -30,7 +30,8 @@ class Outline:
         self._shaped = shaped
         faces = shaped.body.faces
         limb = shaped.body.weights[faces].sum(axis=1).argmax(axis=1)
-        self._limbs = [faces[limb == joint] for joint in range(24) if (limb == joint).any()]
+        limbs = [faces[limb == joint] for joint in range(24) if (limb == joint).any()]
+        self._limbs = [(each, np.unique(each)) for each in limbs]
 
     def drawn(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
         """The pixels that the body covers; none if it comes too near or behind the camera."""
@@ -52,12 +53,13 @@ class Outline:
             return picture
         pixels = (camera.project(vertices) - 0.5) * (1 << FRACTION_BITS)
         corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
-        for faces in self._limbs:
+        for faces, used in self._limbs:
             triangles = corners[faces].astype(np.int64)
             a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
             towards = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
-            low = np.clip((triangles.min(axis=(0, 1)) >> FRACTION_BITS) - 1, 0, (width, height))
-            high = np.clip((triangles.max(axis=(0, 1)) >> FRACTION_BITS) + 3, 0, (width, height))
+            points = corners[used]
+            low = np.clip((points.min(axis=0) >> FRACTION_BITS) - 1, 0, (width, height))
+            high = np.clip((points.max(axis=0) >> FRACTION_BITS) + 3, 0, (width, height))
             part = picture[low[1] : high[1], low[0] : high[0]]
             triangles -= low << FRACTION_BITS
             for side in (towards, ~towards):
@@ -68,3 +70,11 @@ class Outline:
                 part |= filled
         closed = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         return np.asarray(closed, dtype=np.uint8)
+
+
+def away_px(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
+    hard = shape.astype(np.uint8)
+    outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
+    inside = cv2.distanceTransform(hard, cv2.DIST_L2, 5)
+    return np.asarray(outside - inside + np.where(shape, 0.5, -0.5), dtype=np.float32)

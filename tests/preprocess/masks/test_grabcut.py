@@ -11,10 +11,10 @@ from capture.errors import BadInput
 from capture.frame import Frame
 from preprocess.kinematics import rotation_matrices
 from preprocess.masks import segmenter
-from preprocess.masks.behind import BRIGHTEST, DARKEST, UNLIKE, Behind
-from preprocess.masks.grabcut import GrabCut, _away, _Cut, _Shape
+from preprocess.masks.behind import BRIGHTEST, DARKEST, GRAIN, UNLIKE, Behind
+from preprocess.masks.grabcut import GrabCut, _Cut, _Shape
 from preprocess.masks.hair import knots
-from preprocess.masks.outline import Outline
+from preprocess.masks.outline import Outline, away_px
 from preprocess.masks.segmenter import make_segmenter, segmenter_name
 from preprocess.masks.shell import FEET, Around, Shell
 from preprocess.pose import BodyPose
@@ -165,7 +165,33 @@ def test_a_shadow_on_what_lay_behind_is_no_person_but_a_red_sole_in_it_is(camera
     np.testing.assert_array_equal(np.flatnonzero(unlike.any(axis=1)), np.arange(120, 124))
 
 
-@pytest.mark.parametrize("thick_m", [0.0, 0.02, 0.04])
+def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_was(camera, rng):
+    """A wall of which every picture is a little different, seen with a shadow on it."""
+    wall = rng.integers(60, 200, (*SIZE[::-1], 3)).astype(float)
+    person = np.zeros(SIZE[::-1], dtype=bool)
+    person[50:90, 40:60] = True
+    behind, steady, pictures = Behind(), Behind(), []
+    assert behind.shown(wall.astype(np.uint8), ~person) is None
+    never = np.zeros_like(person)
+    never[150:] = True
+    for _ in range(12):
+        pictures.append(np.clip(wall + rng.normal(0.0, 12.0, wall.shape), 0, 255).astype(np.uint8))
+        behind.learn(pictures[-1], ~never)
+        steady.learn(wall.astype(np.uint8), ~never)
+    shadow = np.where(person[..., None], 255.0, 0.7 * wall).astype(np.uint8)
+    shown = behind.shown(shadow, ~person)
+    assert shown is not None
+    assert np.isinf(shown[1][never]).all()
+    expected = np.sqrt(np.var(pictures, axis=0).mean(axis=-1))
+    np.testing.assert_allclose(shown[1][~never], np.maximum(expected, GRAIN)[~never], rtol=1e-3)
+    rim = person & ~cv2.erode(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    np.testing.assert_allclose(shown[0][rim], 0.7 * np.mean(pictures, axis=0)[rim], rtol=0.03)
+    sure = steady.shown(shadow, ~person)
+    assert sure is not None
+    assert (sure[1][~never] == GRAIN).all()
+
+
+@pytest.mark.parametrize("thick_m", [0.0, 0.04])
 def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
     """Masks of a body that is thicker by so much all over; the person turns once."""
     large = camera.resized((480, 600))
@@ -177,7 +203,7 @@ def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
         true = outline.filled(around.skin + thick_m * around.normals, large).astype(np.float32)
         expected = shell.drawn(around, large)
         covered = cv2.resize(expected, large.size_px, interpolation=cv2.INTER_AREA) > 0.5
-        away = _away(covered)
+        away = away_px(covered)
         rgb = np.where(true[..., None] > 0.0, np.uint8(200), np.uint8(20))
         shell.vote(around, large, np.repeat(rgb, 3, axis=2), true, away, (0.1, 0.1))
     around = shell.around(standing(shaped), large)
@@ -202,7 +228,7 @@ def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, came
         now = around._replace(thickness=thickness, known=known)
         fine = shell.drawn(now, large)
         covered = cv2.resize(fine, large.size_px, interpolation=cv2.INTER_AREA)
-        return shell._beyond(now, large, _away(covered > 0.5))[head]
+        return shell._beyond(now, large, away_px(covered > 0.5))[head]
 
     even = np.full(len(shaped.vertices), 0.01)
     thicker = rng.random(len(even)) < 0.5
@@ -230,7 +256,7 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
                 shell.drawn(around, camera), camera.size_px, interpolation=cv2.INTER_AREA
             )
             rgb = np.repeat(leaked[..., None] * np.uint8(200), 3, axis=2)
-            away = _away(covered > 0.5)
+            away = away_px(covered > 0.5)
             shell.vote(around, camera, rgb, leaked.astype(np.float32), away, (limit, limit))
         thickness.append(float(np.median(shell._thickness()[0][around.rim])))
     assert thickness[0] < thickness[1] - 0.005
@@ -247,7 +273,7 @@ def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
             shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA
         )
         rgb = np.repeat(mask[..., None] * np.uint8(200), 3, axis=2)
-        shell.vote(around, large, rgb, mask.astype(np.float32), _away(covered > 0.5), (0.2, 0.2))
+        shell.vote(around, large, rgb, mask.astype(np.float32), away_px(covered > 0.5), (0.2, 0.2))
     thickness, known = shell._thickness()
     feet, legs = np.isin(shell._limb, FEET), np.isin(shell._limb, (1, 2, 4, 5))
     assert np.median(thickness[feet & (known == 1.0)]) > 0.02
@@ -277,7 +303,7 @@ def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
 def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m):
     find, shape = GrabCut(shaped), np.zeros((40, 60), dtype=bool)
     shape[:, :30] = True
-    away = _away(shape)
+    away = away_px(shape)
     around = Around(
         skin=np.zeros((0, 3)), normals=np.zeros((0, 3)), thickness=np.zeros(0),
         rim=np.zeros(0, dtype=int), known=1.0, px_per_m=100.0,
@@ -287,7 +313,7 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
     cut = np.zeros_like(shape)
     cut[:20, :30] = True
     cut[20:, :34] = True  # four centimetres too far
-    found_cut = _Cut(person=cut, away=_away(cut), sure=0.0 * covered, doubt_m=(0.05, 0.05))
+    found_cut = _Cut(person=cut, away=away_px(cut), sure=0.0 * covered, doubt_m=(0.05, 0.05))
     expected = _Shape(fine=covered, covered=covered, away=away, hair=np.zeros_like(shape))
     weight = find._weight_of_shell(found_cut, expected, around)
     hairy = find._weight_of_shell(found_cut, expected._replace(hair=~expected.hair), around)
