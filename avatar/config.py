@@ -15,7 +15,8 @@ FEWEST, SCANTEST = 4.0, 1.5
 """Both count no further than to a quarter, and to two thirds."""
 FIRM_WEIGHT, SOLID_WEIGHT = 1.5, 0.15
 SOFT_WEIGHT, EVEN_WEIGHT, THIN_DENSITY = 0.15, 0.3, 180.0
-"""Of all five, times the share by which frames are fewer than `SCANT_FRAMES`."""
+GAP_WEIGHT = 0.018
+"""Of all six, times the share by which frames are fewer than `SCANT_FRAMES`."""
 STEEPEST = 4.0
 """Logarithm of the density may change by so much along a finest cell, where that is asked."""
 Skipping = Literal["canonical", "union", "frame", "none"]
@@ -79,6 +80,10 @@ class TrainConfig:
     """Pairs of close points at which both are measured in each step."""
     thin_density: float = 0.0
     """Cells less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
+    gap_weight: float = 0.0
+    """Of log density off the skin between the legs, where no ray may tell; 0 turns it off."""
+    gap_points: int = 128
+    """Points at which that is measured in each step."""
     solid_points: int = 128
     """Points at which that opacity is measured in each step."""
     variation_pairs: int = 128
@@ -146,7 +151,8 @@ class TrainConfig:
                 be noise, in which no pose can be refined. So detail is coarser; surfaces are asked
                 to be smoother. Of fewer than a dozen they are, most of all at first, while poses
                 are found; the body is solid inside; and what poses do not agree upon is no fog in
-                the end, but firm; no edge is sharper than the finest cells, and haze is gone.
+                the end, but firm; no edge is sharper than the finest cells; haze and webs between
+                the legs are gone.
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
@@ -171,6 +177,7 @@ class TrainConfig:
             soft_weight=SOFT_WEIGHT * (1.0 - 1.0 / scant),
             even_weight=EVEN_WEIGHT * (1.0 - 1.0 / scant),
             thin_density=THIN_DENSITY * (1.0 - 1.0 / scant),
+            gap_weight=GAP_WEIGHT * (1.0 - 1.0 / scant),
             seed=seed,
             hold_every=hold_every,
         )

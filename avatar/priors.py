@@ -53,6 +53,14 @@ def solidity(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor,
     return _of_density(raw, -weight / max(len(raw), 1) * slope)
 
 
+def needlessness(raw: Float32[Tensor, "points 4"], weight: float) -> Float32[Tensor, "points 4"]:
+    """Of the mean log density where that is above 0: what is solid is pulled at, too.
+
+    What a ray needs it holds against a weak pull; under Adam what none needs goes, however weak.
+    """
+    return _of_density(raw, weight / max(len(raw), 1) * (raw[:, 3] > 0.0))
+
+
 def pairs(
     points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:

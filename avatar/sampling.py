@@ -30,6 +30,10 @@ class Sampler(Protocol):
         """Canonical points where the body is solid, at most `count`."""
         ...
 
+    def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Canonical points between the legs that hold something, at most `count`."""
+        ...
+
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Learns that a slot holds another frame from now on.
 
@@ -72,6 +76,10 @@ class CanonicalSampler:
     def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points deep under the skin."""
         return self._occupancy.solid_points(count, generator)
+
+    def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Random points of occupied cells between the legs."""
+        return self._occupancy.gap_points(count, generator)
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Nothing to learn: canonical occupancy is every pose's."""

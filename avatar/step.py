@@ -84,7 +84,7 @@ def _asked(
     config: TrainConfig,
     generator: torch.Generator,
 ) -> list[Float32[Tensor, "_ 3"]]:
-    """Points that are asked besides the rays': empty ones, pairs, solid ones, close pairs."""
+    """Points that are asked besides the rays': empty, pairs, solid, close pairs, gaps."""
     none = points[:0]
     return [
         sampler.empty_points(config.empty_points, generator).to(points)
@@ -95,6 +95,7 @@ def _asked(
         if config.solid_weight
         else none,
         priors.close_pairs(points, config, generator),
+        sampler.gap_points(config.gap_points, generator).to(points) if config.gap_weight else none,
     ]
 
 
@@ -105,7 +106,7 @@ def _grads_asked(
     firm_share: float,
 ) -> list[Float32[Tensor, "_ 4"]]:
     """The gradients of what `_asked` asks, in its order."""
-    empty, pairs, solid, close = raw
+    empty, pairs, solid, close, gaps = raw
     grad_pairs = priors.variation(pairs, config.variation_at(firm_share))
     if config.firm_weight:
         grad_pairs += priors.double_well(pairs, config.firm_weight * firm_share)
@@ -118,6 +119,7 @@ def _grads_asked(
         grad_pairs,
         priors.solidity(solid, config.solid_weight),
         grad_close,
+        priors.needlessness(gaps, config.gap_weight),
     ]
 
 

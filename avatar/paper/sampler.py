@@ -50,6 +50,10 @@ class PosedSampler:
         """None: the paper asks nothing of them."""
         return torch.zeros(0, 3, device=generator.device)
 
+    def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """None, likewise."""
+        return torch.zeros(0, 3, device=generator.device)
+
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """Both parts learn of the frame."""
         self._warp.admit(slot, bones)
@@ -86,6 +90,10 @@ class GloballySparse:
     def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """The other's."""
         return self._sampler.solid_points(count, generator)
+
+    def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """The other's."""
+        return self._sampler.gap_points(count, generator)
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
         """The other learns of it."""

@@ -75,7 +75,7 @@ def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
     for frames in (24, 25, 1000):
         assert TrainConfig.within(60.0, footprint_m=0.004, frames=frames) == usual
     dozen = TrainConfig.within(60.0, footprint_m=0.004, frames=12)
-    assert dozen.firm_weight == dozen.solid_weight == 0.0
+    assert dozen.firm_weight == dozen.solid_weight == dozen.gap_weight == 0.0
     assert dozen.soft_weight == dozen.even_weight == dozen.thin_density == 0.0
     assert dozen.first_variation == 1.0
     assert usual.firm_weight == usual.solid_weight == 0.0

@@ -22,7 +22,7 @@ CONFIG = TrainConfig(
     rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
     empty_weight=0.3, hard_weight=0.1, variation_weight=0.2, variation_pairs=16,
     first_variation=3.0, firm_weight=0.4, solid_weight=0.1, solid_points=24, most_samples=256,
-    soft_weight=0.2, even_weight=0.3, soft_pairs=40,
+    soft_weight=0.2, even_weight=0.3, soft_pairs=40, gap_weight=0.5, gap_points=20,
 )  # fmt: skip
 
 
@@ -36,10 +36,10 @@ def trainer(rig, clip):
     return trainer
 
 
-def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, batch, background):
+def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, batch, background):
     """The whole loss of a step, differentiable, in whatever precision the parameters have."""
     table, first, first_bias, second, second_bias = parameters
-    points = torch.cat([samples.points, empty, pairs, solid, close]).to(table.dtype)
+    points = torch.cat([samples.points, empty, pairs, solid, close, gaps]).to(table.dtype)
     features = reference.encode(points, table, trainer.avatar.field.levels)
     hidden = torch.relu(features @ first + first_bias)
     raw = hidden @ second + second_bias
@@ -49,12 +49,14 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, batch, b
         rendered, batch.target.to(table.dtype), background.to(table.dtype),
         CONFIG.alpha_weight, CONFIG.hard_weight,
     ).mean()  # fmt: skip
-    loss = loss + FIRM_SHARE * of_close_pairs(raw[len(raw) - len(close) :], close)
-    raw = raw[: len(raw) - len(close)]
+    parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
+    loss = loss + FIRM_SHARE * of_close_pairs(raw[count:].split(parts)[3], close)
     density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
     opacity = 1.0 - torch.exp(-density * priors.OPACITY_M)
-    of_empty, of_pairs, of_solid = opacity.split([len(empty), len(pairs), len(solid)])
+    of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
     loss = loss + CONFIG.empty_weight * of_empty.mean()
+    if len(gaps):
+        loss = loss + CONFIG.gap_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
     loss = loss - CONFIG.solid_weight * of_solid.log().mean()
     if len(pairs) == 0:
         return loss
@@ -95,9 +97,10 @@ def one_step(trainer, backend):
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
     solid = occupancy.solid_points(CONFIG.solid_points, generator)
     close = priors.close_pairs(samples.points, CONFIG, generator)
+    gaps = occupancy.gap_points(CONFIG.gap_points, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
-    return grads, (samples, empty, pairs, solid, close, batch, background)
+    return grads, (samples, empty, pairs, solid, close, gaps, batch, background)
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
@@ -131,9 +134,8 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
     trainer.avatar.occupancy.grid.occupied.zero_()
-    (_, first, *_), (samples, empty, pairs, _, close, batch, background) = one_step(
-        trainer, NumbaBackend()
-    )
+    (_, first, *_), drawn = one_step(trainer, NumbaBackend())
+    samples, empty, pairs, _, close, _, batch, background = drawn
     assert isinstance(samples, Samples)
     assert len(samples.points) == 0
     assert torch.isfinite(first).all()
