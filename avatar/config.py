@@ -15,7 +15,7 @@ FEWEST, SCANTEST = 4.0, 1.5
 """Both count no further than to a quarter, and to two thirds."""
 FIRM_WEIGHT, SOLID_WEIGHT = 1.5, 0.15
 SOFT_WEIGHT, EVEN_WEIGHT, THIN_DENSITY = 0.15, 0.3, 180.0
-GAP_WEIGHT = 0.018
+GAP_WEIGHT = 0.1
 """Of all six, times the share by which frames are fewer than `SCANT_FRAMES`."""
 STEEPEST = 4.0
 """Logarithm of the density may change by so much along a finest cell, where that is asked."""

@@ -63,7 +63,7 @@ class Occupancy:
         self._solid = self._solid.flatten().nonzero()[:, 0]
         self._near_skin = rig.distance <= SKIN_M
         self._rig = rig
-        self._known: dict[bool, tuple[int, Tensor]] = {}
+        self._known_empty: tuple[int, Tensor] | None = None
 
     @torch.no_grad()
     def update(
@@ -118,13 +118,11 @@ class Occupancy:
 
     def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
-        cells = self._now(self.band, held=False)
-        return self._somewhere_in(self._draw(cells, count, generator), generator)
+        return self._somewhere_in(self._draw(self._empty(), count, generator), generator)
 
     def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Random points of cells between the legs that hold something, at most `count`."""
-        cells = self._now(self._between, held=True)
-        return self._somewhere_in(self._draw(cells, count, generator), generator)
+        """Random points off the skin between the legs, at most `count`."""
+        return self._somewhere_in(self._draw(self._between, count, generator), generator)
 
     def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points deep under the skin, at most `count`."""
@@ -136,13 +134,13 @@ class Occupancy:
         between = between_legs(self._rig, self.band.cpu().numpy())
         return self.band[torch.from_numpy(between).to(self.band.device)]
 
-    def _now(self, cells: Int64[Tensor, "cells"], *, held: bool) -> Int64[Tensor, "chosen"]:
-        """Those of some cells that hold something, or nothing: looked up when that has changed."""
+    def _empty(self) -> Int64[Tensor, "cells"]:
+        """Cells of the band that hold nothing: looked up when the occupancy has changed."""
         version = self.grid.occupied._version
-        if held not in self._known or self._known[held][0] != version:
-            chosen = cells[(self.grid.occupied.view(-1)[cells] != 0) == held]
-            self._known[held] = version, chosen
-        return self._known[held][1]
+        if self._known_empty is None or self._known_empty[0] != version:
+            cells = self.band[self.grid.occupied.view(-1)[self.band] == 0]
+            self._known_empty = version, cells
+        return self._known_empty[1]
 
     def _draw(
         self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator

@@ -31,7 +31,7 @@ class Sampler(Protocol):
         ...
 
     def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Canonical points between the legs that hold something, at most `count`."""
+        """Canonical points off the skin between the legs, at most `count`."""
         ...
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
@@ -78,7 +78,7 @@ class CanonicalSampler:
         return self._occupancy.solid_points(count, generator)
 
     def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Random points of occupied cells between the legs."""
+        """Random points off the skin between the legs."""
         return self._occupancy.gap_points(count, generator)
 
     def admit(self, slot: int, cells: CellTables, bones: Float32[Tensor, "24 12"]) -> None:
