@@ -54,7 +54,11 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Sco
         replay.put_cells(slot, cells)
         replay.move_root(slot, poses.root(slot))
     config = dataclasses.replace(
-        trainer.config, empty_weight=0.0, solid_weight=0.0, rays=2 * RAYS_A_CORRECTION
+        trainer.config,
+        empty_weight=0.0,
+        solid_weight=0.0,
+        gap_weight=0.0,
+        rays=2 * RAYS_A_CORRECTION,
     )
     sampler = CanonicalSampler(field.backend, avatar.occupancy, config)
     generator = torch.Generator(device=device).manual_seed(config.seed)
