@@ -89,7 +89,7 @@ def export(given: ExportArguments, console: Console) -> int:
     elif given.run.is_dir():
         with tempfile.TemporaryDirectory() as folder:
             package = Path(folder) / "avatar.iavatar"
-            _package(given.run, package, console)
+            _package(given.run, package, console, for_player=False)
             _mesh(given, package, console)
     else:
         _mesh(given, given.run, console)
@@ -105,7 +105,8 @@ def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
     )
 
 
-def _package(folder: Path, out: Path, console: Console) -> None:
+def _package(folder: Path, out: Path, console: Console, *, for_player: bool = True) -> None:
+    """A package of a run's checkpoint; one that nobody will play is not fine-tuned for players."""
     if folder.is_file():
         raise BadInput(
             f"{folder} is a file; a package is made from the folder that ia-ingest wrote. From a "
@@ -125,7 +126,8 @@ def _package(folder: Path, out: Path, console: Console) -> None:
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
     with console.waiting("baking the avatar and checking its player") as tell:
-        taken = snapshot(trainer, out, views(trainer.avatar.rig), mark=None, tell=tell)
+        shots = views(trainer.avatar.rig)
+        taken = snapshot(trainer, out, shots, mark=None, fine_tuned=for_player, tell=tell)
     if taken.exported is None:
         raise Stop(taken.refused or "nothing was written.", NO_PACKAGE)
     for warning in taken.exported.warnings:

@@ -38,10 +38,10 @@ TILTED = 0.2
 """Deviation of the cameras' height, radians about the pelvis."""
 NOVEL = 2
 """New poses that judge, besides the views that were given."""
-WANTED_DB = 40.0
+WANTED_DB = 39.0
 """Where the player is farther from the renderer than this in poses as filmed, voxels are finer, and
 more of what lies behind the first depth layer is drawn, if new poses win by it."""
-NEAR = 4
+NEAR = 6
 """Pictures that say how much it shows, of poses near the given ones."""
 DEEPER = {"layers": 3, "sheet_gap_m": -0.015}
 """6 % of a picture's time. Where limbs touch it wins a decibel and more."""

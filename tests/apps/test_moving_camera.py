@@ -65,13 +65,15 @@ def test_each_frame_is_seen_by_its_own_camera(walk):
         np.testing.assert_allclose(joints[0], joints[1], atol=1e-6)
 
 
-def test_an_avatar_is_learnt_and_scored_through_a_moving_camera(walk, call_ingest, tmp_path):
+def test_an_avatar_is_learnt_and_scored_through_a_moving_camera(
+    walk, call_ingest, without_baking, tmp_path
+):
     folder, _ = walk
     outcome = call_ingest(folder, "--out", tmp_path / "run", seconds=3.0)
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert [drop["index"] for drop in report["frames"]["dropped"]] == [22, 23]
     assert report["held_out"]["psnr"] > 14.0
-    assert outcome.code in (0, 1)
+    assert outcome.code == 0
 
 
 def test_a_moving_camera_is_checked_and_mended(walk, tmp_path):

@@ -77,7 +77,7 @@ def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig,
 @pytest.mark.parametrize(
     "scheme",
     [
-        {"skipping": "union"}, {"skipping": "frame", "roots": "broyden"},
+        {"skipping": "union", "roots": "broyden"}, {"skipping": "frame"},
         {"skipping": "none", "empty_term": "global"},
     ],
     ids=["union", "frame", "none"],

@@ -31,6 +31,8 @@ VARIANTS = {
     "no alpha": {"alpha_weight": 0.0},
     "no hard surface": {"hard_weight": 0.0},
 }
+SCHEMES = {name: choices for name, choices in VARIANTS.items() if not name.startswith("no ")}
+"""Where samples lie, what warps them, where density is asked; losses are our own, tested there."""
 
 
 def trainer_of(rig, clip, **choices):
@@ -51,8 +53,8 @@ def test_every_variant_learns(rig, clip, choices):
     assert np.mean(color[-5:]) < 0.5 * np.mean(color[:5])
 
 
-@pytest.mark.parametrize("choices", VARIANTS.values(), ids=VARIANTS.keys())
-def test_every_variant_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
+@pytest.mark.parametrize("choices", SCHEMES.values(), ids=SCHEMES.keys())
+def test_every_scheme_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
     """The reference path, on any device that torch knows."""
     samples, losses = [], []
     for backend in ("numba", "torch"):
