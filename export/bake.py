@@ -35,8 +35,8 @@ VOXEL_SHARE = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 FINEST_M, COARSEST_M = 0.0038, 0.006
 FINER = 0.62
-"""So much finer are voxels where the player is too far from the renderer: 1 to 1.5 dB, and twice the
-bytes. An avatar learnt from few photographs weighs less than others."""
+"""So much finer are voxels where the player is too far from the renderer: 1 to 1.5 dB, and twice
+the bytes. An avatar learnt from few photographs weighs less than others."""
 HASTY = 1.5
 """How much coarser a package is that cannot wait."""
 POSITION_STEP, NORMAL_STEP = 32, 7
