@@ -76,10 +76,10 @@ def _log_density(lattice: Lattice, level: float) -> Float32[np.ndarray, "x y z"]
 
 
 def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
-    """Linear interpolation at every `step`-th node along each axis."""
+    """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
     for axis in range(3):
         places = np.arange(0.0, values.shape[axis] - 1, step)
-        below = places.astype(int)
+        below = np.minimum(places.astype(int), values.shape[axis] - 2)  # a last place by rounding
         shape = [1, 1, 1]
         shape[axis] = -1
         part = (places - below).astype(np.float32).reshape(shape)

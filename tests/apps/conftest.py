@@ -16,6 +16,7 @@ from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
 from avatar.train import train
+from export import bake
 from export.build import ExportReport
 
 
@@ -44,6 +45,14 @@ Command = Callable[..., Outcome]
 
 ENOUGH_STEPS = 150
 """So many make of this film an avatar that is firm enough for a package."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def briefly_tuned():
+    """Bricks are fine-tuned on fewer pictures: what that is worth is seen in tests of `export`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bake, "TUNED", 4)
+        yield
 
 
 @pytest.fixture(scope="session")

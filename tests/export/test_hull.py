@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from export.compiled import spread_colors
-from export.hull import MARGIN_M, OPAQUE, find_hull
+from export.hull import MARGIN_M, OPAQUE, find_hull, resampled
 from export.lattice import Lattice
 
 VOXEL_M = 0.004
@@ -24,6 +24,17 @@ def ball_lattice(density_of_radius, size=65, extra=None) -> Lattice:
 def soft_ball(radius):
     """The density is 20/m exactly at RADIUS_M, and falls by e every 2 cm."""
     return 20.0 * np.exp((RADIUS_M - radius) / 0.02)
+
+
+def test_a_ramp_is_read_at_any_step_also_where_the_last_one_is_rounded_to_the_end():
+    ramp = np.broadcast_to(np.arange(402.0, dtype=np.float32)[:, None, None], (402, 2, 2))
+    ends = 0
+    for count in range(1, 1000):
+        step = 401.0 / count
+        places = np.arange(0.0, 401.0, step)
+        ends += int(places[-1]) == 401
+        np.testing.assert_allclose(resampled(ramp, step)[:, 0, 0], places, rtol=1e-5)
+    assert ends  # a length over a step that divides it is at times a step too many
 
 
 def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
