@@ -16,7 +16,7 @@ from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
-from avatar.trainer import Trainer, let_follow
+from avatar.trainer import Trainer, let_follow, solve_anew
 
 CORRECTIONS = 32
 """Corrections that each frame's pose gets."""
@@ -48,11 +48,10 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Sco
     poses = PoseTable(avatar.rig, len(held), device, frozen=True)
     for frame in held:
         prepared = prepare(frame.observation, avatar.rig)
-        slot = replay.add(prepared)
-        poses.put(slot, prepared.pose, correction=guessed(prepared.index, trainer.corrections))
-        cells = WarpCells.of(avatar.rig, poses.pose(slot).joint_rotations, device=device)
-        replay.put_cells(slot, cells)
-        replay.move_root(slot, poses.root(slot))
+        slot, begin = replay.add(prepared), guessed(prepared.index, trainer.corrections)
+        poses.put(slot, prepared.pose, correction=begin)
+        if begin.any():
+            solve_anew(avatar.rig, replay, poses, slot)
     config = dataclasses.replace(
         trainer.config,
         empty_weight=0.0,

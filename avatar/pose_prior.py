@@ -72,7 +72,7 @@ def correlation(
 
     Args:
         frames: Their numbers, in any order.
-        alone: The correction that each one's rays alone ask for, in units of its spread.
+        alone: The correction that each one's rays alone ask for, or that was found, in any units.
     """
     order = np.argsort(frames, kind="stable")
     apart = np.diff(frames[order])

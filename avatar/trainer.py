@@ -98,10 +98,7 @@ class Trainer:
         step = 0 if again else self.steps
         self.poses.put(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
-            joints = self.poses.pose(slot).joint_rotations
-            cells = WarpCells.of(self.avatar.rig, joints, device=self.replay.device)
-            self.replay.put_cells(slot, cells)
-            self.replay.move_root(slot, self.poses.root(slot))
+            solve_anew(self.avatar.rig, self.replay, self.poses, slot)
         self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
         if not again:
@@ -182,6 +179,13 @@ class Trainer:
         )
 
 
+def solve_anew(rig: Rig, replay: Replay, poses: PoseTable, slot: int) -> None:
+    """Lets a frame's warp and rays stand where its corrected pose is, from scratch."""
+    joints = poses.pose(slot).joint_rotations
+    replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
+    replay.move_root(slot, poses.root(slot))
+
+
 def let_follow(
     rig: Rig, backend: Backend, replay: Replay, poses: PoseTable, *, rate: float
 ) -> int | None:
@@ -201,9 +205,8 @@ def let_follow(
     if slot is None:
         return None
     if poses.strayed(slot):
-        joints = poses.pose(slot).joint_rotations
-        replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
+        solve_anew(rig, replay, poses, slot)
     else:
         backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
-    replay.move_root(slot, poses.root(slot))
+        replay.move_root(slot, poses.root(slot))
     return slot

@@ -193,6 +193,6 @@ def paper_step(
     loss = reference.loss_per_ray(
         rendered, batch.target, background, config.alpha_weight, config.hard_weight
     ).mean()
-    total = loss + config.empty_weight * opacity_of(raw[asked:])
+    total = loss + config.empty_weight * opacity_of(raw[asked:]).mean()
     torch.autograd.grad(total, field.parameters)
     return len(points), asked

@@ -9,6 +9,7 @@ from torch import Tensor
 from avatar.kernels import reference
 from avatar.kernels.backend import Marching
 from avatar.kernels.torch_backend import TorchBackend
+from avatar.priors import pairs
 from avatar.replay import Batch, Replay
 from avatar.step import gradients
 from benchmarks.marks import Mark
@@ -33,6 +34,7 @@ def step_marks(seen: Class, device: torch.device) -> list[Mark]:
     samples = field.backend.march(batch.rays, replay.cells, grid, how)
     chance = _seeded(device)
     empty = avatar.occupancy.empty_points(config.empty_points, chance)
+    near = pairs(samples.points, config, chance)
     background = torch.rand(config.rays, 3, generator=chance, device=device)
     plain, scene = TorchField(field), PaperScene.of(avatar.rig, frame, seen.frames, grid)
     counts: list[tuple[int, int]] = []
@@ -46,7 +48,7 @@ def step_marks(seen: Class, device: torch.device) -> list[Mark]:
 
     alternatives: dict[str, Callable[[], object]] = {
         "ours": ours,
-        "torch": lambda: torch_step(plain, samples, empty, batch, background, config),
+        "torch": lambda: torch_step(plain, samples, empty, near, batch, background, config),
         "march": lambda: TorchBackend().march(batch.rays, replay.cells, grid, how),
         "paper": lambda: counts.append(
             paper_step(scene, plain, batch, empty, background, config)
@@ -84,8 +86,8 @@ def _step_marks(
 def _strays(parameters: list[torch.nn.Parameter], plain: object) -> float:
     """Largest difference between gradients, each relative to its parameter's largest."""
     assert isinstance(plain, tuple)
-    pairs = zip(parameters, plain, strict=True)
-    return max(float((p.grad - g).abs().max() / g.abs().max()) for p, g in pairs)
+    both = zip(parameters, plain, strict=True)
+    return max(float((p.grad - g).abs().max() / g.abs().max()) for p, g in both)
 
 
 def encode_marks(seen: Class, device: torch.device) -> list[Mark]:

@@ -9,8 +9,8 @@ from avatar.field import Field
 from avatar.kernels import reference
 from avatar.kernels.backend import Samples
 from avatar.levels import HashLevels
+from avatar.priors import OPACITY_M
 from avatar.replay import Batch
-from avatar.step import OPACITY_M
 
 
 class TorchField:
@@ -26,26 +26,29 @@ class TorchField:
         return torch.relu(features @ first + first_bias) @ second + second_bias
 
 
-def opacity_of(raw: Float32[Tensor, "points 4"]) -> Tensor:
-    """Mean opacity of one centimetre at points that should be empty."""
+def opacity_of(raw: Float32[Tensor, "points 4"]) -> Float32[Tensor, "points"]:
+    """Opacity of one centimetre."""
     density = torch.exp(raw[:, 3].clamp(max=reference.MAX_LOG_DENSITY))
-    return (1.0 - torch.exp(-density * OPACITY_M)).mean()
+    return 1.0 - torch.exp(-density * OPACITY_M)
 
 
 def torch_step(
     field: TorchField,
     samples: Samples,
     empty: Float32[Tensor, "empty 3"],
+    pairs: Float32[Tensor, "pairs 3"],
     batch: Batch,
     background: Float32[Tensor, "rays 3"],
     config: TrainConfig,
 ) -> tuple[Tensor, ...]:
-    """Gradients of the loss with respect to the field's parameters."""
-    raw = field.raw_at(torch.cat([samples.points, empty]))
-    count = len(samples.points)
-    rendered = reference.composite(raw[:count], samples.first, samples.count, config.step_m)
+    """Gradients of the loss with respect to the field's parameters, by what the recipe asks."""
+    asked = [samples.points, empty, pairs]
+    raw, raw_empty, raw_pairs = field.raw_at(torch.cat(asked)).split([len(some) for some in asked])
+    rendered = reference.composite(raw, samples.first, samples.count, config.step_m)
     loss = reference.loss_per_ray(
         rendered, batch.target, background, config.alpha_weight, config.hard_weight
     ).mean()
-    total = loss + config.empty_weight * opacity_of(raw[count:])
+    one, other = opacity_of(raw_pairs).chunk(2)
+    total = loss + config.empty_weight * opacity_of(raw_empty).mean()
+    total = total + config.variation_weight * (one - other).abs().mean()
     return torch.autograd.grad(total, field.parameters)

@@ -14,33 +14,33 @@ import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from avatar.metrics import psnr
 from avatar.model import Avatar
 from avatar.render import render
 from avatar.rig import Rig
 from capture.camera import Camera
 from capture.errors import BadInput
 from export.bake import BakeConfig, read, tables_of
+from export.checks import (
+    CHECKED_PX,
+    GOOD_PSNR,
+    check_graph,
+    check_pictures,
+    fitted,
+    shown_on_white,
+)
 from export.codec import Layout
-from export.errors import ExportRefused
 from export.graph import build_graph
 from export.lattice import FieldAt
 from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
 from export.package import AvatarPackage, PackageDraft
-from export.player import ALIKE, Likeness, Player, premultiplied
+from export.player import Player
 from export.rules import DrawingRules
 from export.seen import Picture, Renderer, View
 from export.tables import Tables
 from export.tiers import TIERS
 from export.tuning import Progress, Tuned, far_off, tuned
-from export.twin import Shot, draw
 from preprocess.pose import BodyPose
 
-LOWEST_PSNR, GOOD_PSNR = 30.0, 38.0
-"""Player against volume renderer, dB: below the first nothing is written, below the second the
-report says so."""
-CHECKED_PX = 256
-"""Longer side of the pictures that are compared with the volume renderer."""
 PROVEN = {"hq": 2, "lite": 1}
 """Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
 the arithmetic of this machine's onnxruntime, and further poses would prove it again."""
@@ -159,7 +159,7 @@ def export_field(
     lattice = read(field_at, rig, occupied=occupied, config=config)
     with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
         baked = beside.submit(tables_of, lattice, rig, config)
-        exact = [_on_white(renderer(pose, _fitted(c, CHECKED_PX))) for pose, c in views]
+        exact = [shown_on_white(renderer(pose, fitted(c, CHECKED_PX))) for pose, c in views]
 
         def finer() -> Tables:
             better = config.finer()
@@ -177,8 +177,8 @@ def export_field(
             player = hq if tier == "hq" else others[tier].result()
             looks = slice(None) if tier == "hq" else slice(1)
             proofs = package.manifest.golden[: PROVEN[tier]]
-            worst = _check_graph(player, package, tier, proofs)
-            score = _check_pictures(player, views[looks], exact[looks], tier)
+            worst = check_graph(player, package, tier, proofs)
+            score = check_pictures(player, views[looks], exact[looks], tier)
             if tier == "hq" and score < GOOD_PSNR:
                 warnings.append(SIMPLIFIED.format(score=score, good=GOOD_PSNR))
             note = package.manifest.tiers[tier]
@@ -244,7 +244,7 @@ def _package(
         for tier, rule in rules.items()
     }
     golden = [
-        GoldenFrame(pose=pose, camera=_fitted(camera, GOLDEN_PX))
+        GoldenFrame(pose=pose, camera=fitted(camera, GOLDEN_PX))
         for pose, camera in views[:MOST_GOLDEN]
     ]
     return AvatarPackage(
@@ -264,64 +264,6 @@ def _package(
         golden=(),
         preview=b"",
     )
-
-
-def _fitted(camera: Camera, longest_px: int) -> Camera:
-    """The camera for a picture whose longer side is at most so long."""
-    return camera.fitted(min(longest_px, max(camera.size_px)))
-
-
-def _check_graph(
-    player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
-) -> float:
-    """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
-    tables, rules = package.tables[tier], package.manifest.tiers[tier].rules
-    worst = 0.0
-    for number, frame in enumerate(frames):
-        camera = frame.camera
-        shot = Shot(
-            bones=player.bones(frame.pose, camera),
-            focal=np.array(camera.focal_px, dtype=np.float32),
-            center=np.array(camera.center_px, dtype=np.float32),
-            size_px=camera.size_px,
-            samples=rules.samples,
-        )
-        drawn = premultiplied(player.render(frame.pose, camera))
-        likeness = Likeness.of(drawn, draw(tables, rules, shot))
-        worst = max(worst, likeness.largest)
-        if not likeness.alike:
-            raise ExportRefused(
-                f"In view {number} the player's graph ({tier}) is within 2/255 of its meaning on "
-                f"only {likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
-                "written; the checkpoint is kept. This is a fault of the program: please report "
-                "it with the version of onnxruntime."
-            )
-    return worst
-
-
-def _check_pictures(
-    player: Player,
-    views: Sequence[View],
-    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
-    tier: str,
-) -> float:
-    """Compares the player with the exact renderer's pictures on white; the mean PSNR, dB."""
-    scores = []
-    for (pose, camera), truth in zip(views, exact, strict=True):
-        drawn = _on_white(premultiplied(player.render(pose, _fitted(camera, CHECKED_PX))))
-        scores.append(min(psnr(drawn, truth), 99.0))
-    score = float(np.mean(scores))
-    if tier == "hq" and score < LOWEST_PSNR:
-        raise ExportRefused(
-            f"The player draws the avatar at {score:.1f} dB to the volume renderer; at least "
-            f"{LOWEST_PSNR:.0f} are wanted. No package was written; the checkpoint is kept. Train "
-            "longer (--resume), so that the avatar has a firm surface."
-        )
-    return score
-
-
-def _on_white(picture: Picture) -> Float32[np.ndarray, "height width 3"]:
-    return np.clip(picture[..., :3] + (1.0 - picture[..., 3:]), 0.0, 1.0)
 
 
 def _png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:

@@ -1,0 +1,81 @@
+"""Whether a package's player draws what it should: its graph's meaning, the renderer's pictures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32
+
+from avatar.hold import on_white
+from avatar.metrics import psnr
+from capture.camera import Camera
+from export.errors import ExportRefused
+from export.manifest import GoldenFrame
+from export.package import AvatarPackage
+from export.player import ALIKE, Likeness, Player, premultiplied
+from export.seen import Picture, View
+from export.twin import Shot, draw
+
+LOWEST_PSNR, GOOD_PSNR = 30.0, 38.0
+"""Player against volume renderer, dB: below the first nothing is written, below the second the
+report says so."""
+CHECKED_PX = 256
+"""Longer side of the pictures that are compared with the volume renderer."""
+
+
+def fitted(camera: Camera, longest_px: int) -> Camera:
+    """The camera for a picture whose longer side is at most so long."""
+    return camera.fitted(min(longest_px, max(camera.size_px)))
+
+
+def shown_on_white(picture: Picture) -> Float32[np.ndarray, "height width 3"]:
+    """A picture on white, in [0, 1]."""
+    return np.clip(on_white(picture), 0.0, 1.0)
+
+
+def check_graph(
+    player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
+) -> float:
+    """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
+    tables, rules = package.tables[tier], package.manifest.tiers[tier].rules
+    worst = 0.0
+    for number, frame in enumerate(frames):
+        camera = frame.camera
+        shot = Shot(
+            bones=player.bones(frame.pose, camera),
+            focal=np.array(camera.focal_px, dtype=np.float32),
+            center=np.array(camera.center_px, dtype=np.float32),
+            size_px=camera.size_px,
+            samples=rules.samples,
+        )
+        drawn = premultiplied(player.render(frame.pose, camera))
+        likeness = Likeness.of(drawn, draw(tables, rules, shot))
+        worst = max(worst, likeness.largest)
+        if not likeness.alike:
+            raise ExportRefused(
+                f"In view {number} the player's graph ({tier}) is within 2/255 of its meaning on "
+                f"only {likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
+                "written; the checkpoint is kept. This is a fault of the program: please report "
+                "it with the version of onnxruntime."
+            )
+    return worst
+
+
+def check_pictures(
+    player: Player,
+    views: Sequence[View],
+    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
+    tier: str,
+) -> float:
+    """Compares the player with the exact renderer's pictures on white; the mean PSNR, dB."""
+    scores = []
+    for (pose, camera), truth in zip(views, exact, strict=True):
+        drawn = shown_on_white(premultiplied(player.render(pose, fitted(camera, CHECKED_PX))))
+        scores.append(min(psnr(drawn, truth), 99.0))
+    score = float(np.mean(scores))
+    if tier == "hq" and score < LOWEST_PSNR:
+        raise ExportRefused(
+            f"The player draws the avatar at {score:.1f} dB to the volume renderer; at least "
+            f"{LOWEST_PSNR:.0f} are wanted. No package was written; the checkpoint is kept. Train "
+            "longer (--resume), so that the avatar has a firm surface."
+        )
+    return score
