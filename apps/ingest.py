@@ -157,29 +157,35 @@ def _trainer(
         console.say(f"There is no checkpoint in {run.path}: starting afresh.")
     if not (given.resume and run.has_checkpoint()):
         trainer = new_trainer(
-            recording, seconds=seconds, seed=given.seed, refine_poses=given.refine_poses,
-            hold_every=given.hold_out, device=device,
+            recording, seconds=seconds, steps=given.steps, seed=given.seed,
+            refine_poses=given.refine_poses, hold_every=given.hold_out, device=device,
         )  # fmt: skip
         return trainer, 0, {"video": video}
     trainer, notes = checkpoint.load(run.checkpoint, device)
     _check_person(trainer, recording, run)
-    had, extension = trainer.wall_seconds, Extension(run, notes)
+    unit, budget = ("seconds", seconds) if given.steps is None else ("steps", given.steps)
+    had = trainer.wall_seconds if given.steps is None else trainer.steps
+    extension = Extension(run, notes)
     if notes.get("video") == video:
-        before = notes.get("before", {"frames": 0, "seconds": 0.0})
-        had, seen = had - before["seconds"], trainer.frames_seen - before["frames"]
-        console.say(f"Going on after {had:.0f} seconds of training.")
-        if had >= seconds:
+        before = notes.get("before", {"frames": 0, "seconds": 0.0, "steps": 0})
+        earlier, seen = before[unit], trainer.frames_seen - before["frames"]
+        console.say(f"Going on after {had - earlier:.0f} {unit} of training.")
+        if had - earlier >= budget:
             console.warn(
-                f"The run has had {had:.0f} of {seconds:.0f} seconds; only its package and "
-                "report are written again. Give more --seconds to go on learning."
+                f"The run has had {had - earlier:.0f} of {budget:.0f} {unit}; only its package "
+                f"and report are written again. Give more --{unit} to go on learning."
             )
         extension.recall(trainer, console)
-        seconds += before["seconds"]
     else:
-        console.say(f"Adding another video to an avatar that has learnt for {had:.0f} seconds.")
+        console.say(f"Adding another video to an avatar that has learnt for {had:.0f} {unit}.")
         extension.begin(trainer, console)
-        seconds, seen, notes["video"] = had + seconds, 0, video
-    trainer.config = replace(trainer.config, seconds=seconds, refine_poses=given.refine_poses)
+        earlier, seen, notes["video"] = had, 0, video
+    trainer.config = replace(
+        trainer.config,
+        seconds=seconds + earlier,
+        steps=None if given.steps is None else given.steps + int(earlier),
+        refine_poses=given.refine_poses,
+    )
     return trainer, seen, notes
 
 

@@ -15,7 +15,7 @@ from apps.recording.recording import Recording
 from apps.recording.wanted import RecordingPaths
 from apps.solving.job import SolveJob
 from apps.terminal.whole import check_file_place
-from avatar.config import HOLD_EVERY
+from avatar.config import HOLD_EVERY, NOMINAL_STEPS_PER_S
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from capture.growing import IDLE_S
@@ -85,6 +85,9 @@ class IngestArguments:
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """How long you will wait: seconds of training, after start-up. Without it 60; with --realtime
     as long as the clip lasts."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of training steps instead of --seconds: the result then does not depend on how fast
+    the machine is. Two cores make about 50 a second. Every frame takes at least one step."""
     realtime: Flag = False
     """Play the video as if it were being filmed now: each frame comes at its own time, and the
     avatar is ready when the video ends. More --seconds polish it after the last frame."""
@@ -127,6 +130,10 @@ class IngestArguments:
         """
         if self.seconds is not None and not 0.0 < self.seconds < float("inf"):
             raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+        if self.steps is not None and self.steps < 1:
+            raise BadInput(f"--steps is {self.steps}; at least 1 was expected.")
+        if self.steps is not None and self.seconds is not None:
+            raise BadInput("--steps and --seconds both say when training ends: give one of them.")
         if self.size is not None and self.size < 16:
             raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
         if self.threads is not None and self.threads < 1:
@@ -202,7 +209,12 @@ class IngestArguments:
         return recording.played() if self.realtime else recording
 
     def training_seconds(self, recording: Recording) -> float:
-        """How long training goes on: as was said, else as the clip lasts, else a minute."""
+        """Seconds of training: as given, else as long as the clip lasts, else a minute.
+
+        With --steps they are nominal: they decide the detail, not when training ends.
+        """
+        if self.steps is not None:
+            return self.steps / NOMINAL_STEPS_PER_S
         if self.seconds is not None:
             return self.seconds
         duration_s = recording.source.duration_s

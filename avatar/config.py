@@ -19,6 +19,8 @@ GAP_WEIGHT = 0.1
 """Of all six, times the share by which frames are fewer than `SCANT_FRAMES`."""
 STEEPEST = 4.0
 """Logarithm of the density may change by so much along a finest cell, where that is asked."""
+NOMINAL_STEPS_PER_S = 50.0
+"""Training steps that count as one second where steps are counted instead: what two cores make."""
 Skipping = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
@@ -37,7 +39,8 @@ class TrainConfig:
     seconds: float = 60.0
     """Wall time from the first frame to the last step."""
     steps: int | None = None
-    """Stops after this many steps instead (tests)."""
+    """Number of steps that training takes instead, at least one a frame: the same result on any
+    machine. `seconds` is then `steps / NOMINAL_STEPS_PER_S`."""
     rays: int = 1024
     """Rays per step."""
     step_m: float = 0.01
@@ -106,11 +109,13 @@ class TrainConfig:
     """Where emptiness is asked for; "global" is the prior that the paper argues against."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot be combined.
+        """Derives the seconds of the schedule from the steps; refuses what cannot be combined.
 
         Raises:
             ValueError: If two of the choices contradict each other.
         """
+        if self.steps:
+            object.__setattr__(self, "seconds", self.steps / NOMINAL_STEPS_PER_S)
         if self.roots == "broyden" and self.refine_poses:
             raise ValueError(
                 "roots='broyden' warps samples without cells, and it is the cells that carry a "

@@ -30,12 +30,16 @@ and the mean of smaller swings is closer to what lies between them."""
 SCORING_SHARE = 0.015
 """Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
 MARKS_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
-"""When the curve is measured, in seconds of training; then every 30 s."""
+"""When the curve is measured, in seconds of the schedule; then every 30 s."""
 
 
 @final
 class Clock:
-    """Training time, wall and CPU, on top of what earlier runs have used; pauses do not count."""
+    """Training time, wall and CPU, on top of what earlier runs have used; pauses do not count.
+
+    The schedule (learning rates, marks, the end) follows wall time, or, where the recipe gives a
+    number of steps, the steps made: then it is the same on every machine.
+    """
 
     def __init__(self, trainer: Trainer) -> None:
         """Starts now."""
@@ -44,20 +48,21 @@ class Clock:
         self._cpu = time.process_time() - trainer.cpu_seconds - trainer.held_up_cpu
 
     def read(self) -> float:
-        """Wall seconds; the trainer's own counts are set to now."""
+        """Seconds of the schedule; the trainer's own wall and CPU seconds are set to now."""
         trainer = self._trainer
         trainer.wall_seconds = time.perf_counter() - self._wall - trainer.held_up_wall
         trainer.cpu_seconds = time.process_time() - self._cpu - trainer.held_up_cpu
-        return trainer.wall_seconds
+        return trainer.scheduled_seconds
 
 
 def train(trainer: Trainer, inbox: Inbox[Ready], held: list[HeldOut]) -> Iterator[TrainEvent]:
-    """Trains until the time is up, on whatever has arrived.
+    """Trains until the time is up, or the steps are made, on whatever has arrived.
 
     The learning rate is constant while frames arrive and falls as a cosine after the last. Of a
     recording no frame is lost: where the time is too short to read them all beside training,
     reading comes first, and ends after the time if it must. Frames that come at times of their own
-    are never waited for, except for the first. A live source is left when the time is up.
+    are never waited for, except for the first. A live source is left when the time is up. Where
+    steps are counted, each step of a recording is preceded by one more frame until all are read.
 
     Args:
         trainer: Goes on from where it stands.
@@ -83,7 +88,7 @@ def train(trainer: Trainer, inbox: Inbox[Ready], held: list[HeldOut]) -> Iterato
         if marks.due(now):
             yield marks.score(held, stream.clock)
             continue
-        if stream.is_behind(now):
+        if stream.is_behind(now) or stream.needs_frame():
             continue
         yield _stepped(trainer, stream, now)
     yield from _farewell(trainer, paced=inbox.paced)
@@ -96,9 +101,10 @@ def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
         pose_rate=falling,
         hard_share=min(1.0, 4.0 * now / trainer.config.seconds),
     )
+    stream.clock.read()
     return Stepped(
         step=trainer.steps,
-        wall_seconds=stream.clock.read(),
+        wall_seconds=trainer.wall_seconds,
         loss=float(result.loss.mean()),
         samples_per_ray=result.samples / trainer.config.rays,
         frames_seen=trainer.frames_seen,
@@ -133,9 +139,9 @@ class _Stream:
         held: list[HeldOut],
     ) -> None:
         self._trainer, self._inbox, self._held = trainer, inbox, held
-        self._began = trainer.wall_seconds
+        self._began = trainer.scheduled_seconds
         self._ended_at: float | None = None
-        self._last_steps = 0
+        self._admitted_at: int | None = None
         self.clock = Clock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
 
@@ -151,41 +157,60 @@ class _Stream:
 
     def take_in(self, now: float) -> Iterator[Arrived | Warned]:
         """Hands what has arrived to the trainer; the clock starts with the first frame."""
-        if self.ended:
+        if self.ended or (self._one_a_step and self._admitted_at == self._trainer.steps):
             return
         # without a frame, or where reading comes first, the reader has the machine for a moment
-        wait_s = 0.1 if self.is_behind(now) or len(self._trainer.replay) == 0 else 0.0
-        for item in self._inbox.take(wait_s=wait_s):
-            if isinstance(item, Dropped):
-                yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
-                continue
-            if isinstance(item, PassedOver):
-                continue
-            if not self._started:
-                self.clock, self._started = Clock(self._trainer), True
-            if isinstance(item, HeldOut):
-                keep(self._held, item)
-                yield Arrived(index=item.observation.frame.index, held_out=True)
-            else:
-                self._trainer.add(item)
-                self._last_steps = self._trainer.steps + FAREWELL_STEPS
-                yield Arrived(index=item.index, held_out=False)
+        waits = self._one_a_step or self.is_behind(now) or len(self._trainer.replay) == 0
+        most = 1 if self._one_a_step else None
+        taken = self._inbox.take(wait_s=0.1 if waits else 0.0, most=most)
+        for item in taken:
+            yield from self._admit(item)
+        if taken and self._one_a_step:  # whether that was the last item depends on threads
+            return
         too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
         if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
 
+    def _admit(self, item: Ready) -> Iterator[Arrived | Warned]:
+        if isinstance(item, Dropped):
+            yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+            return
+        if isinstance(item, PassedOver):
+            return
+        if not self._started:
+            self.clock, self._started = Clock(self._trainer), True
+        if isinstance(item, HeldOut):
+            keep(self._held, item)
+            yield Arrived(index=item.observation.frame.index, held_out=True)
+            return
+        self._trainer.add(item)
+        self._admitted_at = self._trainer.steps
+        yield Arrived(index=item.index, held_out=False)
+
+    @property
+    def _one_a_step(self) -> bool:
+        """Whether frames are read in step with training, so that a run can be repeated."""
+        return bool(self._trainer.config.steps) and not self._inbox.paced
+
+    def needs_frame(self) -> bool:
+        """Whether the next step waits for one more frame, because steps are counted."""
+        return self._one_a_step and not self.ended and self._admitted_at != self._trainer.steps
+
     def is_behind(self, now: float) -> bool:
         """Whether reading must come first for a while; a video's own pace cannot be hurried."""
+        if self._one_a_step:
+            return False
         began, end = self._began, self._trainer.config.seconds
         late = now > began + READING_SHARE * (end - began)
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:
-        """Whether the time, or the number of steps asked for, is up and nothing is left over."""
-        config, steps = self._trainer.config, self._trainer.steps
-        if config.steps and steps >= config.steps:
-            return True
-        return now >= config.seconds and self.ended and steps >= self._last_steps
+        """Whether the schedule is over and every frame has been learnt from."""
+        config, admitted_at = self._trainer.config, self._admitted_at
+        if not (self.ended and now >= config.seconds):
+            return False
+        farewell = 0 if config.steps or admitted_at is None else FAREWELL_STEPS
+        return self._trainer.steps >= (admitted_at or 0) + farewell
 
     def progress(self, now: float) -> float:
         """How much of the time after the last frame has gone by, in [0, 1]; 0 before it."""
@@ -201,7 +226,7 @@ class _Marks:
 
     def __init__(self, trainer: Trainer) -> None:
         self._trainer = trainer
-        self._times = _mark_times(after=trainer.wall_seconds)
+        self._times = _mark_times(after=trainer.scheduled_seconds)
         self._next = next(self._times)
 
     def due(self, now: float) -> bool:
@@ -212,7 +237,7 @@ class _Marks:
         """Scores held-out frames, evenly over the stream, until the time for it is spent."""
         trainer, scores = self._trainer, list[Score]()
         at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
-        enough = at + SCORING_SHARE * trainer.config.seconds
+        enough = clock.read() + SCORING_SHARE * trainer.config.seconds
         for frame in interleaved(spread(held, SCORED_AT_A_MARK)):
             if scores and clock.read() > enough:
                 break

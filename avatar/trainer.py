@@ -13,7 +13,7 @@ from jaxtyping import Float
 from avatar.adam import Adam
 from avatar.average import follow
 from avatar.cells import WarpCells
-from avatar.config import COARSEST_M, TrainConfig
+from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.field import Field
 from avatar.kernels.backend import Backend
 from avatar.kernels.choice import backend_for
@@ -85,6 +85,13 @@ class Trainer:
             betas=(0.9, 0.99),
             fused=True,
         )
+
+    @property
+    def scheduled_seconds(self) -> float:
+        """Position in the schedule: wall seconds, or steps at their nominal rate."""
+        if self.config.steps:
+            return self.steps / NOMINAL_STEPS_PER_S
+        return self.wall_seconds
 
     def add(self, frame: PreparedFrame, *, again: bool = False) -> None:
         """Takes in a frame to learn from.

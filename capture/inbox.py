@@ -58,12 +58,17 @@ class Inbox(Generic[Item]):
         """How many items have arrived and nobody has taken."""
         return self._queue.qsize()
 
-    def take(self, *, wait_s: float = 0.0) -> list[Item]:
-        """Everything that has arrived; waits up to `wait_s` seconds for a first item."""
+    def take(self, *, wait_s: float = 0.0, most: int | None = None) -> list[Item]:
+        """Takes what has arrived, in order.
+
+        Args:
+            wait_s: Seconds to wait for a first item.
+            most: Number of items taken at most; None for all.
+        """
         taken: list[Item] = []
         try:
             taken.append(self._queue.get(timeout=wait_s) if wait_s else self._queue.get_nowait())
-            while True:
+            while most is None or len(taken) < most:
                 taken.append(self._queue.get_nowait())
         except queue.Empty:
             pass

@@ -56,6 +56,7 @@ class Extension:
         self._notes["before"] = {
             "frames": trainer.frames_seen,
             "seconds": trainer.wall_seconds,
+            "steps": trainer.steps,
             "scores": [vars(each) for each in scores],
         }
 

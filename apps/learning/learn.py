@@ -44,6 +44,7 @@ def new_trainer(
     recording: Recording,
     *,
     seconds: float,
+    steps: int | None = None,
     seed: int,
     refine_poses: bool,
     hold_every: int = HOLD_EVERY,
@@ -57,7 +58,7 @@ def new_trainer(
         hold_every=hold_every,
         seed=seed,
     )
-    config = replace(config, refine_poses=refine_poses)
+    config = replace(config, steps=steps, refine_poses=refine_poses)
     return Trainer(Rig.of(recording.shaped), config, device)
 
 
@@ -223,7 +224,7 @@ class Lesson:
                 self.meter.arrived(index, held_out=held_out)
             case Stepped():
                 self.meter.depth.add(float(self._inbox.waiting))
-                bar.move(event.wall_seconds, self._progress(event))
+                bar.move(self.trainer.scheduled_seconds, self._progress(event))
                 if time.perf_counter() - self._saved_at > CHECKPOINT_EVERY_S:
                     self._save()
             case Evaluated():
@@ -238,9 +239,9 @@ class Lesson:
         psnr = self.curve[-1].psnr if self.curve else None
         rays = self.trainer.rays / max(event.wall_seconds, 1e-6)
         parts = [
-            f"{event.wall_seconds:.0f}/{config.seconds:.0f} s",
+            f"{event.wall_seconds:.0f}" + ("" if config.steps else f"/{config.seconds:.0f}") + " s",
             f"{event.frames_seen} frames",
-            f"step {event.step}",
+            f"step {event.step}" + (f"/{config.steps}" if config.steps else ""),
             f"{rays / 1000.0:.0f}k rays/s",
             f"{event.samples_per_ray:.1f} samples/ray",
             f"{self._inbox.waiting} waiting",

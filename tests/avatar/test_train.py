@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from avatar import train as train_module
-from avatar.config import TrainConfig
+from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.events import Arrived, Evaluated, Finished, Idle, Stepped, Warned
 from avatar.hold import HeldOut, prepared
 from avatar.prepare import prepare
@@ -311,3 +311,53 @@ def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
         trainer.corrections[index] = np.full((25, 3), float(index))
     assert len(trainer.corrections) <= 2 * config.key_frames + 1
     assert set(trainer.replay.indices) <= set(trainer.corrections)
+
+
+# --- steps instead of seconds -----------------------------------------------------------------
+
+
+def taught_at_a_pace(rig, ready, config, *, pause_s):
+    """What training makes of frames that each take so long to prepare."""
+
+    def arriving():
+        for item in ready:
+            time.sleep(pause_s)
+            yield item
+
+    trainer = Trainer(rig, config, CPU)
+    events = train(trainer, Inbox(arriving()), [])
+    frames_seen = [event.frames_seen for event in events if isinstance(event, Stepped)]
+    return frames_seen, trainer.avatar.field.parameters()
+
+
+def test_counted_steps_give_one_avatar_however_fast_frames_come(rig, ready):
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    try:
+        config = dataclasses.replace(QUICK, steps=12)
+        at_once, slowly = (taught_at_a_pace(rig, ready, config, pause_s=s) for s in (0.0, 0.03))
+    finally:
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    assert at_once[0] == slowly[0] == [1, 2, 3, 4] + [5] * 8
+    for a, b in zip(at_once[1], slowly[1], strict=True):
+        assert torch.equal(a, b)
+
+
+def test_each_frame_is_learnt_from_even_if_there_are_fewer_steps(rig, ready):
+    trainer, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=2))
+    assert trainer.frames_seen == trainer.steps == 5
+    assert isinstance(events[-1], Finished)
+
+
+def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
+    config = dataclasses.replace(QUICK, steps=25)
+    assert config.seconds == 25 / NOMINAL_STEPS_PER_S
+    trainer = Trainer(rig, config, CPU)
+    events = train(trainer, Inbox(ready), [])
+    group = trainer.optimizer.param_groups[0]
+    rates = [group["lr"] for event in events if isinstance(event, Stepped)]
+    assert rates[:5] == [config.learning_rate] * 5
+    assert (np.diff(rates[5:]) <= 0.0).all()
+    assert rates[-1] < 0.1 * config.learning_rate
