@@ -25,6 +25,15 @@ def open_decoder(path: Path) -> Decoder:
     return CvDecoder(path)
 
 
+def has_alpha_plane(tag: int) -> bool:
+    """Whether pictures of a format, by FFmpeg's tag for it, have an alpha channel; -1: no format.
+
+    OpenCV cannot read it. BGRA does not count: it is what OpenCV itself writes, always opaque.
+    """
+    name = (tag & 0xFFFFFFFF).to_bytes(4, "little")
+    return name[:2] in (b"Y4", b"G4") or name in (b"RGBA", b"ARGB", b"ABGR")
+
+
 @final
 class CvDecoder:
     """OpenCV's FFmpeg. It applies rotation flags, and does not tell which pictures are damaged."""
@@ -45,6 +54,7 @@ class CvDecoder:
         self.quarter_turns = -clockwise % 4
         kind = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
         self.deep = (kind & 0xFFFF) == int.from_bytes(b"Y3", "little") and kind >> 24 in (10, 12)
+        self.leaves_alpha = has_alpha_plane(kind)
         capture.release()
 
     def shots(self) -> Iterator[Shot]:

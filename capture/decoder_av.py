@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.hdr import CURVES, sdr_from_hdr
+from capture.images import cuts_out
 from capture.shot import PATIENCE, Shot, refusal
 
 
@@ -39,6 +40,7 @@ class AvDecoder:
                 self.claimed = int(stream.frames) or round(lasts_s * self.rate)
                 self.deep = stream.codec_context.pix_fmt in DEEP
                 first = next(self._frames(container, stream), None)
+                self.leaves_alpha = first is not None and _cut_out(first[0])
         except (av.FFmpegError, IndexError, ValueError, OSError) as cause:
             raise refusal(path) from cause
         self.quarter_turns = 0 if first is None else int(first[0].rotation) // 90 % 4
@@ -82,6 +84,13 @@ DEEP = frozenset(
     {"yuv420p10le", "yuv422p10le", "yuv444p10le", "p010le", "yuv420p12le", "yuv422p12le"}
 )
 """FFmpeg's names of pictures of more than 8 bits, as phones and cameras write them."""
+
+
+def _cut_out(frame: Any) -> bool:
+    """Whether a frame has an alpha channel that is not opaque."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return False
+    return cuts_out(frame.to_ndarray(format="rgba")[..., 3])
 
 
 def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"] | None:

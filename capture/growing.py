@@ -10,7 +10,14 @@ from jaxtyping import UInt8
 
 from capture.errors import BadInput
 from capture.frame import Frame
-from capture.images import QUARTER_TURNS, list_images, natural_key, orientation, read_image
+from capture.images import (
+    QUARTER_TURNS,
+    any_cuts_out,
+    list_images,
+    natural_key,
+    orientation,
+    read_image,
+)
 from capture.pace import Pace
 from capture.selection import Selection
 
@@ -65,10 +72,11 @@ class GrowingFolder:
         self.dropped = 0
         self._pace, self._idle_s = pace, idle_s
         self._there_before: set[Path] = set()
-        first, (rgb, alpha) = self._first()
+        first, (rgb, _) = self._first()
         self.quarter_turns = QUARTER_TURNS.get(orientation(first.read_bytes()), 0)
-        self.started_at = min(map(_written_at, list_images(path)), default=time.time())
-        self.size_px, self.has_alpha = (rgb.shape[1], rgb.shape[0]), alpha is not None
+        there = list_images(path)
+        self.started_at = min(map(_written_at, there), default=time.time())
+        self.size_px, self.has_alpha = (rgb.shape[1], rgb.shape[0]), any_cuts_out(there)
 
     @property
     def waited_s(self) -> float:

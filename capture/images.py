@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -33,6 +33,13 @@ UPRIGHT = {
 
 TIFF = (b"II*\x00", b"MM\x00*")
 """How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
+
+LOOKED_AT = 5
+"""Pictures, evenly spread, that are asked whether an alpha channel cuts the person out."""
+WITH_ALPHA = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
+"""Kinds of pictures that can have an alpha channel."""
+TRANSPARENT = 0.01
+"""Share of the pixels that an alpha channel must clear to be a mask: rounded corners clear less."""
 
 RATE = 30.0
 """Pictures a second, where nobody has said when each was taken."""
@@ -78,6 +85,28 @@ def read_image(
     if alpha is not None and alpha.shape != rgb.shape[:2]:
         raise BadInput(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
     return rgb, alpha
+
+
+def cuts_out(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
+    """Whether an alpha channel says where the person is: an opaque one says nothing."""
+    return alpha is not None and float((alpha < 128).mean()) >= TRANSPARENT
+
+
+def any_cuts_out(images: Sequence[Path]) -> bool:
+    """Whether the alpha channel of any of a few pictures, spread over all, cuts the person out.
+
+    One picture is no evidence: matting tools write the first ones opaque, or where they see nobody.
+    """
+    able = [path for path in images if path.suffix.lower() in WITH_ALPHA]
+    places = np.linspace(0, len(able) - 1, min(LOOKED_AT, len(able))).round().astype(int)
+    for path in (able[place] for place in places):
+        try:
+            alpha = read_image(path)[1]
+        except (BadInput, OSError):  # damaged or half written; another one says it
+            continue
+        if cuts_out(alpha):
+            return True
+    return False
 
 
 def orientation(data: bytes) -> int:
@@ -145,7 +174,8 @@ class ImageFolder:
                 f"; at least one was expected from number {selection.start} on."
             )
         self.duration_s: float | None = selection.span(self.frames_in_file) / RATE
-        self.size_px, self.has_alpha, self.quarter_turns = self._look()
+        self.size_px, self.quarter_turns = self._look()
+        self.has_alpha = any_cuts_out([p for i, p in enumerate(self._images) if selection.wants(i)])
 
     def frames(self) -> Iterator[Frame]:
         """The wanted pictures in order; every call starts anew."""
@@ -176,20 +206,15 @@ class ImageFolder:
     def close(self) -> None:
         """Nothing is held open."""
 
-    def _look(self) -> tuple[tuple[int, int], bool, int]:
-        """What is told by the first picture that can be read.
-
-        Returns:
-            Its size, whether its alpha channel cuts it out, and by how many quarters it is turned.
-        """
+    def _look(self) -> tuple[tuple[int, int], int]:
+        """Size of the first picture that can be read, and by how many quarters it is turned."""
         for path in self._images:
             try:
-                rgb, alpha = read_image(path)
+                rgb, _ = read_image(path)
             except BadInput:
                 continue
-            cut_out = alpha is not None and bool(alpha.min() < 255)  # opaque ones say nothing
             turns = QUARTER_TURNS.get(orientation(path.read_bytes()), 0)
-            return (rgb.shape[1], rgb.shape[0]), cut_out, turns
+            return (rgb.shape[1], rgb.shape[0]), turns
         raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
 
     def _warn(self, message: str) -> None:

@@ -39,6 +39,8 @@ class Decoder(Protocol):
         quarter_turns: How often its pictures are turned by 90° against the clock to stand upright.
         deep: Whether its pictures have more than 8 bits.
         knows_hdr: Whether HDR's highlights are kept.
+        leaves_alpha: Whether its pictures have an alpha channel, as far as is known one that is not
+            opaque; it is not read.
     """
 
     rate: float
@@ -46,6 +48,7 @@ class Decoder(Protocol):
     quarter_turns: int
     deep: bool
     knows_hdr: bool
+    leaves_alpha: bool
 
     def shots(self) -> Iterator[Shot]:
         """The pictures in order; every call starts anew."""

@@ -21,7 +21,8 @@ class Source(Protocol):
         frame_count: How many of them are wanted; fewer may come, see `warnings`. None if nobody
             knows, of a live source.
         duration_s: How long the wanted frames last, as the container claims; None if nobody knows.
-        has_alpha: Whether the frames have an alpha channel of their own.
+        has_alpha: Whether the frames' own alpha channel is their mask: it cuts the person out of
+            one of the pictures that were looked at, and no segmenter was asked for instead.
         quarter_turns: How often stored pictures are turned by 90° against the clock to be upright.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.

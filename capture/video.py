@@ -29,6 +29,7 @@ class VideoFile:
 
     Attributes:
         quarter_turns: How often its stored pictures are turned by 90° against the clock.
+        leaves_alpha: Whether it has an alpha channel; it is not read (pictures' are).
     """
 
     has_alpha = False
@@ -49,6 +50,7 @@ class VideoFile:
         self.warnings: list[str] = []
         self._decoder = open_decoder(path)
         self.quarter_turns = self._decoder.quarter_turns
+        self.leaves_alpha = self._decoder.leaves_alpha
         self._rate = self._decoder.rate
         picture = next((shot.rgb() for shot in self._decoder.shots()), None)
         if picture is None:

@@ -10,6 +10,7 @@ from jaxtyping import Float32
 from capture.camera import Camera, same_shape
 from capture.errors import BadInput
 from capture.frame import Frame
+from capture.images import cuts_out
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.masks.files import Masks
@@ -62,16 +63,16 @@ def observer(
     Args:
         source: Where the frames come from.
         motion: Poses; matched by their frame numbers, by their times, or by order.
-        masks: One mask a frame; None if the pictures have an alpha channel, or `segment` finds it.
+        masks: One mask a frame; None if `segment` finds it, or else the alpha channel is the mask.
         cameras: Cameras of the frames' size.
         size_px: Longer side of the observations; pictures are never enlarged.
-        segment: What finds the person where there is neither a mask nor an alpha channel.
+        segment: What estimates the mask where there are no `masks`, whatever the alpha channel.
 
     Raises:
         BadInput: At once, if the parts do not fit together.
     """
     row_of = check_motion(motion, source)
-    made = masks is None and segment is not None and not source.has_alpha
+    made = masks is None and segment is not None
     mask_row = (lambda index: index) if made else check_masks(masks, source)
     camera_row = check_cameras(cameras, source)
 
@@ -230,10 +231,12 @@ def own_alpha(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "he
     """The picture's own alpha channel, scaled.
 
     Raises:
-        BadInput: If it has none.
+        BadInput: If it has none, or an opaque one, which does not say where the person is.
     """
     if frame.alpha is None:
         raise BadInput("the picture has no alpha channel")
+    if not cuts_out(frame.alpha):
+        raise BadInput("the picture's alpha channel is opaque, unlike that of others")
     alpha = frame.alpha.astype(np.float32) / np.float32(255.0)
     if frame.size_px == size_px:
         return alpha

@@ -12,14 +12,17 @@ from capture.errors import BadInput
 from capture.opening import open_live, open_source
 from capture.pace import Pace
 from capture.source import Source
+from capture.video import VideoFile
+from preprocess.body import ShapedBody
 from preprocess.body_file import load_body
 from preprocess.camera_file import CameraTrack, default_cameras
 from preprocess.capture_folder import CapturePaths, find_capture, find_live_capture
 from preprocess.fit.family import with_family
 from preprocess.focal import focal_from_masks
 from preprocess.live import LiveParts
+from preprocess.masks.choice import MaskChoice, choose_masks
 from preprocess.masks.files import Masks, masks_in_poses, open_masks
-from preprocess.masks.segmenter import OURS, make_segmenter, segmenter_name
+from preprocess.masks.segmenter import Segmenter, make_segmenter, segmenter_name
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
@@ -55,16 +58,11 @@ def open_recording(
 
 
 def _recorded(wanted: RecordingPaths, size_px: int | None, avatars: Path | None) -> Recording:
-    segmenter = segmenter_name(wanted.masks)
-    given_masks = wanted.masks if segmenter is None else None
-    paths = find_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
-    if segmenter is not None:
-        paths = replace(paths, masks=None)
+    paths = find_capture(wanted.video, wanted.poses, _file(wanted.masks), wanted.cameras)
     source, body = open_source(paths.video, frames=wanted.frames), load_body(wanted.body)
     motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
-    masks = None if segmenter is not None else _masks(paths, source, wanted)
-    if segmenter is None and masks is None and not source.has_alpha:
-        segmenter = OURS
+    choice, masks = _masks(paths, source, wanted)
+    paths = replace(paths, masks=choice.path)
     cameras, given = _cameras(paths, motion, source), paths.cameras is not None
     motion = with_family(motion, body, cameras, source, masks, cameras_given=given)
     shaped = shaped_for(body, motion)
@@ -82,8 +80,8 @@ def _recorded(wanted: RecordingPaths, size_px: int | None, avatars: Path | None)
         cameras=cameras,
         shaped=fit.shaped,
         size_px=size_px,
-        notes=tuple(notes_of(fit, masks, cameras, segment=segmenter)),
-        segment=None if segmenter is None else make_segmenter(segmenter, fit.shaped),
+        notes=tuple(notes_of(fit, masks, cameras, choice, unread=_unread_alpha(source))),
+        segment=_segmenter(choice, fit.shaped),
         refit=fit.refit,
     )
 
@@ -96,21 +94,22 @@ def _live(
             "--cameras solve and --height-cm need a recording; of a live source the camera "
             "stands still (--cameras static), and nobody knows its poses yet."
         )
-    segmenter = segmenter_name(wanted.masks)
-    given_masks = wanted.masks if segmenter is None else None
-    paths = find_live_capture(wanted.video, wanted.poses, given_masks, wanted.cameras)
+    paths = find_live_capture(wanted.video, wanted.poses, _file(wanted.masks), wanted.cameras)
     body, pace = load_body(wanted.body), Pace()
     source = open_live(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
     live = LiveParts.open(
         paths, source, pace, family=body.family, invert=wanted.mask_invert,
-        first_within_s=wanted.idle_s, estimated=segmenter is not None,
+        first_within_s=wanted.idle_s, given_masks=wanted.masks,
     )  # fmt: skip
+    choice, looked_for = live.choice, paths.masks
+    paths = replace(paths, masks=choice.path)
+    source.has_alpha = choice.alpha
     motion = live.poses.motion
     cameras, given = _cameras(paths, motion, source), paths.cameras is not None
     shaped = shaped_for(body, motion)
     live.poses.place(lambda read: placed(read, shaped, cameras, cameras_given=given))
     fit, growing_fit = live_person(
-        live.poses.motion, shaped, avatars=avatars, masked=segmenter is None
+        live.poses.motion, shaped, avatars=avatars, masked=choice.segmenter is None
     )
     recording = Recording(
         paths=paths,
@@ -120,22 +119,41 @@ def _live(
         cameras=cameras,
         shaped=fit.shaped,
         size_px=size_px,
-        notes=tuple(notes_of(fit, None, cameras, segment=segmenter)),
+        notes=tuple(notes_of(fit, None, cameras, choice, looked_for=looked_for)),
         live=live,
-        segment=None if segmenter is None else make_segmenter(segmenter, fit.shaped),
+        segment=_segmenter(choice, fit.shaped),
         growing_fit=growing_fit,
     )
     recording.check()
     return recording
 
 
-def _masks(paths: CapturePaths, source: Source, wanted: RecordingPaths) -> Masks | None:
-    """Masks of their own file, or beside the poses; None if there are none, or the pictures'."""
-    if paths.masks is not None:
-        return open_masks(paths.masks, invert=wanted.mask_invert, person=wanted.person)
-    if source.has_alpha:
-        return None
-    return masks_in_poses(paths.poses, source, person=wanted.person)
+def _file(masks: Path | None) -> Path | None:
+    """What --masks names, unless it is a segmenter."""
+    return masks if segmenter_name(masks) is None else None
+
+
+def _segmenter(choice: MaskChoice, shaped: ShapedBody) -> Segmenter | None:
+    return None if choice.segmenter is None else make_segmenter(choice.segmenter, shaped)
+
+
+def _unread_alpha(source: Source) -> Path | None:
+    """The video, if it has an alpha channel, which is not read."""
+    return source.path if isinstance(source, VideoFile) and source.leaves_alpha else None
+
+
+def _masks(
+    paths: CapturePaths, source: Source, wanted: RecordingPaths
+) -> tuple[MaskChoice, Masks | None]:
+    """Which masks are used; and those, if a file holds them, which may be that of the poses."""
+    choice = choose_masks(wanted.masks, paths.masks, has_alpha=source.has_alpha)
+    source.has_alpha = choice.alpha
+    if choice.fallback:
+        masks = masks_in_poses(paths.poses, source, person=wanted.person)
+        return (choice, None) if masks is None else (MaskChoice(path=masks.path), masks)
+    if choice.path is None:
+        return choice, None
+    return choice, open_masks(choice.path, invert=wanted.mask_invert, person=wanted.person)
 
 
 def _cameras(paths: CapturePaths, motion: Motion, source: Source) -> CameraTrack:

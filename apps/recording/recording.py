@@ -34,7 +34,8 @@ class Recording:
         paths: Where its parts lie.
         source: The frames.
         motion: The poses.
-        masks: The masks; None if the pictures have an alpha channel, or `segment` finds them.
+        masks: The masks; None if the pictures' alpha channel is the mask, `segment` estimates them,
+            or they come with a live source.
         cameras: The cameras, of the frames' size.
         shaped: The person's body.
         size_px: Longer side that training sees; None for the frames' own.
@@ -91,7 +92,7 @@ class Recording:
             agreement = getattr(self.segment, "agreement", None)
             name = getattr(self.segment, "name", type(self.segment).__name__)
             return {"masks": f"estimated by {name}", "mask_agreement": agreement}
-        source = "alpha channel" if self.masks is None else self.masks.path.name
+        source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
         return {"masks": source, "mask_agreement": None}
 
     def told_at_the_end(self) -> Iterator[str]:

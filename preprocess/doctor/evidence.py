@@ -179,11 +179,11 @@ def _from_pictures(
     for index in frames:
         try:
             rgb, alpha = read_image(pictures[index])
+            if rgb.shape[1::-1] == source.size_px:
+                frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
+                found.append((index, own_alpha(frame, size_px)))
         except (BadInput, OSError):  # one of many; that it is damaged is said elsewhere
             continue
-        if rgb.shape[1::-1] == source.size_px:
-            frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
-            found.append((index, own_alpha(frame, size_px)))
     return found
 
 

@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 
 from capture.camera import same_shape
 from capture.errors import BadInput
-from capture.images import IMAGE_SUFFIXES, natural_key
+from capture.images import IMAGE_SUFFIXES, cuts_out, natural_key
 from capture.source import Source
 from capture.video import VIDEO_SUFFIXES
 from preprocess.content import read_content
@@ -239,7 +239,7 @@ def _channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
         picture = picture.convert("L")
     if picture.mode in ("LA", "RGBA"):
         alpha = np.asarray(picture)[..., -1]
-        if alpha.min() < 255:
+        if cuts_out(alpha):
             return alpha
     if picture.mode in ("LA", "RGBA", "RGB", "CMYK", "YCbCr"):
         picture = picture.convert("L")

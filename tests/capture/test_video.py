@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from capture.decoder import CvDecoder, has_alpha_plane
+from capture.decoder_av import AvDecoder
 from capture.errors import BadInput
 from capture.opening import open_source
 
@@ -162,3 +164,30 @@ def test_a_turned_video_says_by_how_much(write_video, turned_clockwise):
     assert open_source(path).quarter_turns == 0
     path.write_bytes(turned_clockwise(path.read_bytes()))
     assert open_source(path).quarter_turns == 3
+
+
+@pytest.mark.parametrize(
+    ("tag", "expected"),
+    [(b"Y4\x00\x0c", True), (b"Y4\x0b\x08", True), (b"ARGB", True), (b"RGBA", True),
+     (b"G4\x00\x08", True), (b"BGRA", False), (b"I420", False), (b"Y3\x0b\x0a", False)],
+)  # fmt: skip
+def test_formats_with_an_alpha_channel_are_known_by_their_tags(tag, expected):
+    assert has_alpha_plane(int.from_bytes(tag, "little", signed=True)) == expected
+    assert not has_alpha_plane(-1)
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+@pytest.mark.parametrize("decoder", [AvDecoder, CvDecoder])
+def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaque):
+    """PyAV looks whether it is opaque; OpenCV cannot."""
+    av = pytest.importorskip("av", reason="PyAV (extra [video]) writes the test's video")
+    rgba = np.full((32, 32, 4), 255, np.uint8)
+    rgba[8:24, :, 3] = 255 if opaque else 0
+    with av.open(str(tmp_path / "cut.mov"), "w") as container:
+        stream = container.add_stream("qtrle", rate=10)
+        stream.width = stream.height = 32
+        stream.pix_fmt = "argb"
+        frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format="argb")
+        container.mux([*stream.encode(frame), *stream.encode(None)])
+    found = decoder(tmp_path / "cut.mov").leaves_alpha
+    assert found == (decoder is CvDecoder or not opaque)

@@ -1,0 +1,157 @@
+"""Which masks are used, recorded and live: one table for both."""
+
+import shutil
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from apps.recording.opening import open_recording
+from apps.recording.wanted import RecordingPaths
+from capture.decoder import CvDecoder
+from capture.opening import open_source
+from preprocess.live import ALPHA_CAME_LATE
+from preprocess.observation import Observation
+
+FRAMES = 4
+ESTIMATED, ALPHA = "estimated by GrabCut", "alpha channel"
+
+
+@pytest.fixture(scope="module")
+def shots(film) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A few pictures of the film, and who is in them."""
+    pictures = [frame.rgb for frame in open_source(film).frames()][:FRAMES]
+    masks = sorted((film / "masks").iterdir())
+    return [
+        (rgb, np.asarray(Image.open(mask).convert("L")))
+        for rgb, mask in zip(pictures, masks, strict=False)
+    ]
+
+
+@pytest.fixture
+def folder(film, shots, tmp_path):
+    """Writes a capture folder of pictures; each kind of mask shows another part of the person."""
+
+    def write(kinds: list[str], *, beside: bool) -> Path:
+        """A folder whose pictures have an alpha channel of these kinds, one a picture."""
+        (tmp_path / "images").mkdir()
+        (tmp_path / "mine").mkdir()
+        if beside:
+            (tmp_path / "masks").mkdir()
+        for name in ("poses.npz", "cameras.npz"):
+            shutil.copy(film / name, tmp_path)
+        for index, ((rgb, mask), kind) in enumerate(zip(shots, kinds, strict=True)):
+            alpha = upper(mask) if kind == "informative" else np.full_like(mask, 255)
+            picture = rgb if kind == "none" else np.dstack([rgb, alpha])
+            name = f"{index:04d}.png"
+            Image.fromarray(picture).save(tmp_path / "images" / name)
+            Image.fromarray(lower(mask)).save(tmp_path / "mine" / name)
+            if beside:
+                Image.fromarray(mask).save(tmp_path / "masks" / name)
+        (tmp_path / "images" / "DONE").touch()
+        return tmp_path
+
+    return write
+
+
+def upper(mask):
+    """The upper half of what it shows."""
+    half = mask.copy()
+    half[32:] = 0
+    return half
+
+
+def lower(mask):
+    """The lower half of it."""
+    half = mask.copy()
+    half[:32] = 0
+    return half
+
+
+def wanted(folder, given, *, live):
+    masks = {"given": folder / "mine", "segmenter": Path("segmenter:grabcut")}.get(given)
+    return RecordingPaths(video=folder, masks=masks, live=live, idle_s=1.0)
+
+
+def parts_shown(recording):
+    """Which halves of the person the masks show, frame by frame; None of frames left out."""
+    return [
+        (bool((item.alpha[:32] > 0.5).any()), bool((item.alpha[32:] > 0.5).any()))
+        if isinstance(item, Observation)
+        else None
+        for item in recording.observations()
+    ]
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["recorded", "live"])
+@pytest.mark.parametrize("masks", ["none", "beside", "given", "given, beside", "segmenter"])
+@pytest.mark.parametrize("alpha", ["none", "opaque", "informative"])
+def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live):
+    expected, shown = {
+        "none": (ALPHA, (True, False)) if alpha == "informative" else (ESTIMATED, (True, True)),
+        "beside": ("masks", (True, True)),
+        "given": ("mine", (False, True)),
+        "given, beside": ("mine", (False, True)),
+        "segmenter": (ESTIMATED, (True, True)),
+    }[masks]
+    there = folder([alpha] * FRAMES, beside="beside" in masks)
+    recording = open_recording(
+        wanted(there, masks.split(",", maxsplit=1)[0], live=live), doubtful=True
+    )
+    found = parts_shown(recording)
+    assert found == [shown] * FRAMES
+    assert recording.told_of_masks()["masks"] == expected  # after the frames, as the report does
+    assert any("estimated" in note for note in recording.notes) == (expected == ESTIMATED)
+    assert any("alpha channel" in note for note in recording.notes) == (expected == ALPHA)
+    assert not recording.source.warnings
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["recorded", "live"])
+def test_one_opaque_picture_at_the_start_does_not_decide(folder, live):
+    there = folder(["opaque", "informative", "none", "informative"], beside=False)
+    recording = open_recording(wanted(there, "none", live=live))
+    assert parts_shown(recording) == [None, (True, False), None, (True, False)]
+    assert recording.told_of_masks()["masks"] == ALPHA
+
+
+def test_an_alpha_channel_that_comes_later_is_told(folder, shots):
+    """What was there at the start decided; the finished folder is read otherwise."""
+    there = folder(["opaque"] * FRAMES, beside=False)
+    recording = open_recording(wanted(there, "none", live=True))
+    rgb, mask = shots[2]
+    Image.fromarray(np.dstack([rgb, mask])).save(there / "images" / "0002.png")
+    assert parts_shown(recording) == [(True, True)] * FRAMES
+    assert recording.source.warnings == [ALPHA_CAME_LATE]
+    assert recording.told_of_masks()["masks"] == ESTIMATED
+    finished = open_recording(wanted(there, "none", live=False))
+    assert finished.told_of_masks()["masks"] == ALPHA
+
+
+def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folder, film):
+    there = folder(["none"] * FRAMES, beside=False)
+    (there / "poses.npz").unlink()
+
+    def begin():
+        shutil.copytree(film / "masks", there / "masks")
+        shutil.copy(film / "poses.npz", there / "coming.npz")
+        (there / "coming.npz").rename(there / "poses.npz")
+
+    thread = threading.Timer(0.2, begin)
+    thread.start()
+    paths = replace(wanted(there, "none", live=True), idle_s=60.0)
+    assert open_recording(paths).told_of_masks()["masks"] == "masks"
+    thread.join()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_videos_alpha_channel_is_told_where_masks_are_estimated(capture, monkeypatch, masked):
+    monkeypatch.setattr("capture.decoder.has_alpha_plane", lambda tag: True)
+    monkeypatch.setattr("capture.video.open_decoder", CvDecoder)
+    if not masked:
+        shutil.rmtree(capture / "masks")
+    said = [n for n in open_recording(RecordingPaths(video=capture)).notes if "alpha" in n]
+    assert bool(said) != masked
+    assert all(f"ffmpeg -i {capture / 'video.mp4'}" in note for note in said)
