@@ -11,7 +11,7 @@ from apps.evaluating.arguments import EvaluateArguments
 from apps.learning.run_folder import RunFolder
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
+from apps.terminal.exit_codes import DONE, INTERRUPTED, NO_AVATAR, Stop, exit_code
 from capture.errors import BadInput
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
@@ -180,10 +180,10 @@ def _learn(
     try:
         return ingest(words, console) != INTERRUPTED
     except Stop as end:
-        if end.code not in (NO_PACKAGE, INTERRUPTED):
+        if end.code not in (NO_AVATAR, INTERRUPTED):
             raise
-        console.warn(str(end))  # without a package the renderer can be scored all the same
-        return end.code == NO_PACKAGE
+        console.warn(str(end))  # a poor avatar is scored like any other
+        return end.code == NO_AVATAR
 
 
 def _both(

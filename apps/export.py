@@ -14,7 +14,7 @@ from apps.learning.run_folder import RunFolder
 from apps.playing.novel import novel_motion
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, NO_PACKAGE, Stop, exit_code
+from apps.terminal.exit_codes import DONE, NO_AVATAR, Stop, exit_code
 from apps.terminal.whole import check_file_place
 from capture.camera import Camera
 from capture.errors import BadInput
@@ -48,7 +48,7 @@ class ExportArguments:
     The run goes on undisturbed; nothing in its folder is touched unless --out names it. A mesh is
     opaque and its silhouette hard: ia-play shows more of the avatar than any other program can.
 
-    Exit codes: 0 done; 1 too blurred for a package so far; 2 bad input; 3 disk full; 130 Ctrl-C.
+    Exit codes: 0 done; 1 nothing to draw so far; 2 bad input; 3 disk full; 130 Ctrl-C.
     """
 
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
@@ -75,7 +75,7 @@ def export(given: ExportArguments, console: Console) -> int:
     Raises:
         BadInput: If there is no checkpoint that can be read, or no folder to write to.
         OSError: If the disk is full.
-        Stop: If the avatar is too blurred for a package.
+        Stop: If there is nothing to draw.
     """
     if given.out.suffix != f".{given.to}":
         raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
@@ -129,7 +129,7 @@ def _package(folder: Path, out: Path, console: Console, *, for_player: bool = Tr
         shots = views(trainer.avatar.rig)
         taken = snapshot(trainer, out, shots, mark=None, fine_tuned=for_player, tell=tell)
     if taken.exported is None:
-        raise Stop(taken.refused or "nothing was written.", NO_PACKAGE)
+        raise Stop(taken.refused or "nothing was written.", NO_AVATAR)
     for warning in taken.exported.warnings:
         console.warn(warning)
     console.say(f"As learnt from {trainer.frames_seen} frames in {trainer.wall_seconds:.1f} s.")

@@ -14,7 +14,7 @@ from apps.recording.recording import Recording
 from apps.solving.attempt import Attempt, attempted
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_PACKAGE, Stop, exit_code
+from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_AVATAR, Stop, exit_code
 from apps.terminal.interrupt import asked_to_stop, nothing_to_save
 from apps.terminal.port import with_port
 from apps.terminal.whole import write_text
@@ -272,12 +272,19 @@ def _check_learnt(learnt: "Learnt", recording: Recording) -> None:
 def _conclude(
     delivered: "Delivered", run: RunFolder, console: Console, *, interrupted: bool
 ) -> int:
-    """Names what was made."""
-    held = delivered.report.held_out
-    score = "nothing was held out" if held.psnr is None else f"held out {held.psnr:.2f} dB"
+    """Names what was made, and what it is worth.
+
+    Raises:
+        Stop: If there is no package, or it holds no usable avatar.
+    """
+    from apps.reporting.report import decibels
+
+    held, score = delivered.report.held_out, "no frame was held out to score it"
+    if held.psnr is not None:
+        score = f"held out {decibels(held.psnr, held.verdict)}"
     fitted = delivered.report.held_out_refined
     if fitted is not None and fitted.psnr is not None:
-        score += f" ({fitted.psnr:.2f} dB in poses fitted to those frames)"
+        score += f", in poses fitted to those frames {decibels(fitted.psnr, fitted.verdict)}"
     seconds = delivered.report.training.wall_seconds
     console.say(f"Learnt for {seconds:.1f} s, {delivered.report.training.steps} steps; {score}.")
     if delivered.refused is None:
@@ -285,8 +292,9 @@ def _conclude(
     console.made("report", run.report)
     console.made("look at it", run.page)
     console.made("checkpoint", run.checkpoint)
-    if delivered.refused is not None:
-        raise Stop(delivered.refused, INTERRUPTED if interrupted else NO_PACKAGE)
+    unusable = delivered.refused or delivered.failure
+    if unusable is not None:
+        raise Stop(unusable, INTERRUPTED if interrupted else NO_AVATAR)
     return INTERRUPTED if interrupted else DONE
 
 

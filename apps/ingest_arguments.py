@@ -45,8 +45,10 @@ class IngestArguments:
     checkpoint/. Masks and cameras are looked for beside the video, then beside the poses, as
     masks/ and cameras.npz; of a capture folder everything is found inside.
 
-    Exit codes: 0 done; 1 learnt, but too blurred for a package; 2 bad input; 3 full disk or busy
-    device, the checkpoint is kept; 130 Ctrl-C, after checkpoint and package were written.
+    Exit codes: 0 done; 1 learnt, but the result is no usable avatar (verdict "failed"
+    in the report; the package is written all the same if there is anything to draw); 2 bad input;
+    3 full disk or busy device, the checkpoint is kept; 130 Ctrl-C, after checkpoint and package
+    were written.
     """
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]

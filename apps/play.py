@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, exit_code
 from apps.terminal.port import with_port, with_value
 from capture.errors import BadInput
+
+if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
+    from export.player import Player
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,6 +55,7 @@ def _clip(given: PlayArguments, console: Console) -> int:
     blend = None if clear else background(given.background or "white")
     encoder = encoder_of(out, blend)
     player = Player.load(given.avatar, tier=given.tier, provider=given.provider)
+    _warn(player, console)
     shots = shots_of(given, player, console, most_fps=GIF_FPS if suffix == ".gif" else np.inf)
     if given.fps is not None and shots.fps < given.fps:
         console.say(f"note: a GIF shows {GIF_FPS:g} pictures a second at most.")
@@ -77,6 +82,13 @@ def _clip(given: PlayArguments, console: Console) -> int:
     console.say(f"Drew {what}{cut} of {width}x{height} px{pace}; {encoder.said}:")
     print(out)  # noqa: T201 - what was made goes to stdout, for scripts
     return DONE if count == total else INTERRUPTED
+
+
+def _warn(player: "Player", console: Console) -> None:
+    from apps.playing.verdict import package_notes
+
+    for note in package_notes(player.manifest):
+        console.warn(note)
 
 
 def _bench(given: PlayArguments, console: Console) -> int:
@@ -127,6 +139,7 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
     if given.out is not None:
         check_folder(given.out)
     player = Player.load(given.avatar)
+    _warn(player, console)
     joints, motion = player.manifest.rest_joints, novel_motion()
     if given.poses is not None:
         motion = driving_motion(given.poses, joints, console, person=given.person)

@@ -1,5 +1,6 @@
 """What training says while it goes on. Bars, pages, reports and checkpoints listen."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -49,12 +50,17 @@ class Score:
         psnr: Of the whole frame, dB.
         psnr_mask: Where alpha > 0.5, dB.
         ssim: In [-1, 1].
+        blur: Equivalent blur, as a share of the person's height (`avatar.sharpness`); NaN if it
+            was not measured.
+        overlap: Of the rendered alpha with the mask, in [0, 1]; NaN if it was not measured.
     """
 
     frame: int
     psnr: float
     psnr_mask: float
     ssim: float
+    blur: float = math.nan
+    overlap: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)

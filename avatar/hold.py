@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
@@ -11,11 +12,12 @@ from jaxtyping import Float32
 from avatar.cells import WarpCells
 from avatar.events import Score
 from avatar.likeness import ROOM, Distinct
-from avatar.metrics import psnr, ssim
+from avatar.metrics import overlap, psnr, ssim
 from avatar.model import Avatar
 from avatar.prepare import PreparedFrame, prepare
 from avatar.render import render
 from avatar.rig import Rig
+from avatar.sharpness import Yardstick, equivalent_blur, yardstick
 from preprocess.observation import Observation
 from preprocess.observe import Dropped
 
@@ -23,6 +25,8 @@ Item = TypeVar("Item")
 
 MOST_HELD = 100
 """Held-out frames that are kept, so that memory stays bounded however long a video lasts."""
+SILHOUETTE = 0.5
+"""Alpha above which a pixel counts as the person's."""
 SCORED_AT_A_MARK = 12
 """Held-out frames scored at each mark of the curve; all of them at the end."""
 
@@ -39,6 +43,11 @@ class HeldOut:
 
     observation: Observation
     cells: WarpCells | None = None
+
+    @cached_property
+    def yardstick(self) -> Yardstick:
+        """What blurred copies of the frame score; the frame is rendered again and again."""
+        return yardstick(truth_on_white(self.observation), self.observation.alpha > SILHOUETTE)
 
     def solved(self, rig: Rig) -> "HeldOut":
         """The same with its warp, for whoever renders it again and again."""
@@ -120,18 +129,21 @@ def score(avatar: Avatar, held: HeldOut) -> Score:
     """Renders a held-out frame and compares it with the truth."""
     observation = held.observation
     picture = render(avatar, observation.pose, observation.camera, cells=held.cells)
-    return compared(picture, observation)
+    return compared(picture, held)
 
 
-def compared(picture: Float32[np.ndarray, "height width 4"], observation: Observation) -> Score:
-    """How close a rendering of a frame's pose comes to the frame."""
-    truth = truth_on_white(observation)
+def compared(picture: Float32[np.ndarray, "height width 4"], held: HeldOut) -> Score:
+    """How close a premultiplied rendering of a frame's pose comes to the frame."""
+    observation, truth = held.observation, truth_on_white(held.observation)
     image = np.clip(on_white(picture), 0.0, 1.0)
+    psnr_mask = psnr(image, truth, observation.alpha > SILHOUETTE)
     return Score(
         frame=observation.frame.index,
         psnr=psnr(image, truth),
-        psnr_mask=psnr(image, truth, observation.alpha > 0.5),
+        psnr_mask=psnr_mask,
         ssim=ssim(image, truth),
+        blur=equivalent_blur(psnr_mask, held.yardstick),
+        overlap=overlap(picture[..., 3], observation.alpha),
     )
 
 

@@ -1,7 +1,7 @@
 """How far a picture is from the truth."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import correlate1d
 
 
@@ -26,11 +26,14 @@ def psnr(
 
 
 def overlap(
-    shown: Bool[np.ndarray, "height width"], truth: Bool[np.ndarray, "height width"]
+    shown: Shaped[np.ndarray, "height width"], truth: Shaped[np.ndarray, "height width"]
 ) -> float:
-    """Intersection over union of two silhouettes, in [0, 1]; 1 if there is none in either."""
-    union = int((shown | truth).sum())
-    return int((shown & truth).sum()) / union if union else 1.0
+    """Intersection over union of two silhouettes, in [0, 1]; 1 if there is none in either.
+
+    Of two alphas it is the sum of the smaller over the sum of the larger: low for fog, too.
+    """
+    union = float(np.maximum(shown, truth).sum())
+    return float(np.minimum(shown, truth).sum()) / union if union else 1.0
 
 
 def ssim(

@@ -49,7 +49,7 @@ def drawn(
         image = render(avatar, seen.pose, seen.camera, cells=cells, samples_along=along)
         ready.append(1000.0 * (prepared - began))
         draw.append(1000.0 * (time.process_time() - prepared))
-        scores.append(compared(image, seen))
+        scores.append(compared(image, picture))
     return Drawn(
         name=name,
         ready_ms=float(np.median(ready[1:])),

@@ -22,11 +22,11 @@ from capture.errors import BadInput
 from export.bake import BakeConfig, read, tables_of
 from export.checks import (
     CHECKED_PX,
-    GOOD_PSNR,
     check_graph,
     check_pictures,
     fitted,
     shown_on_white,
+    warnings_for,
 )
 from export.codec import Layout
 from export.graph import build_graph
@@ -45,11 +45,6 @@ PROVEN = {"hq": 2, "lite": 1}
 """Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
 the arithmetic of this machine's onnxruntime, and further poses would prove it again."""
 MOST_GOLDEN = 4
-SIMPLIFIED = (
-    "The player draws the avatar at {score:.1f} dB to the volume renderer ({good:.0f} dB are "
-    "good): fine detail or fuzzy edges are simplified."
-)
-
 UNTUNED = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -109,8 +104,8 @@ def export_avatar(
             alone.
 
     Raises:
-        ExportRefused: If the player would not draw what the avatar looks like, or there is nothing
-            to draw.
+        ExportRefused: If there is nothing to draw, or this machine's onnxruntime does not compute
+            what the graph says.
         OSError: If it cannot be written.
     """
     occupied = avatar.rendering_grid().occupied.cpu().numpy()
@@ -178,15 +173,16 @@ def export_field(
             looks = slice(None) if tier == "hq" else slice(1)
             proofs = package.manifest.golden[: PROVEN[tier]]
             worst = check_graph(player, package, tier, proofs)
-            score = check_pictures(player, views[looks], exact[looks], tier)
-            if tier == "hq" and score < GOOD_PSNR:
-                warnings.append(SIMPLIFIED.format(score=score, good=GOOD_PSNR))
+            score = check_pictures(player, views[looks], exact[looks])
+            warnings += warnings_for(score) if tier == "hq" else []
             note = package.manifest.tiers[tier]
             notes[tier] = replace(note, psnr_to_renderer=score, largest_difference=worst)
         golden = tuple(hq.render(frame.pose, frame.camera) for frame in package.manifest.golden)
         package = replace(
             package,
-            manifest=replace(package.manifest, tiers=notes),
+            manifest=replace(
+                package.manifest, tiers=notes, metrics={**metrics, "warnings": warnings}
+            ),
             golden=golden,
             preview=_png(hq.render(*views[0])),
         )

@@ -2,4 +2,4 @@
 
 
 class ExportRefused(RuntimeError):  # noqa: N818 - it names what happened, and reads so in `raise`
-    """The package would not draw what the avatar looks like; nothing was written."""
+    """Nothing to draw, or a graph that does not compute what it should; nothing is written."""

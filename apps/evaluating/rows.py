@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from apps.reporting.report import mean
-from avatar.hold import on_white, truth_on_white
-from avatar.metrics import psnr, ssim
+from avatar.hold import SILHOUETTE, HeldOut, compared, on_white, truth_on_white
+from avatar.metrics import psnr
+from avatar.sharpness import Verdict, verdict_of
 from preprocess.observation import Observation
 
 Picture = Float32[np.ndarray, "height width 4"]
-SILHOUETTE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,8 @@ class FrameScore:
         psnr_mask: Where alpha > 0.5, dB.
         psnr_box: In the smallest upright box around that, dB.
         ssim: Of the whole picture (Wang et al. 2004), in [-1, 1].
+        blur: Equivalent blur, as a share of the person's height (`avatar.sharpness`).
+        overlap: Of the drawn alpha with the mask, in [0, 1].
         cpu_ms: What the picture took, of all the process's threads.
     """
 
@@ -35,6 +37,8 @@ class FrameScore:
     psnr_mask: float
     psnr_box: float
     ssim: float
+    blur: float
+    overlap: float
     cpu_ms: float
 
 
@@ -59,12 +63,18 @@ class Row:
         """The mean of one of `FIGURES` over the frames; None if no frame has it."""
         return mean([getattr(score, name) for score in self.scores])
 
+    @property
+    def verdict(self) -> Verdict | None:
+        """What the figures mean, in a word; None without a silhouette to look at."""
+        return verdict_of(self.scores)
+
     def as_json(self) -> dict[str, object]:
         """Means, then every frame."""
         return {
             "drawn_by": self.drawn_by,
             "poses": self.poses,
             **{name: _plain(self.figure(name)) for name in FIGURES},
+            "verdict": self.verdict,
             "frames": [
                 {key: _plain(value) for key, value in vars(score).items()} for score in self.scores
             ],
@@ -112,14 +122,11 @@ def scored(seen: Observation, draw: Callable[[], Picture]) -> FrameScore:
     picture = draw()
     cpu_ms = 1000.0 * (time.process_time() - started)
     shown, truth = np.clip(on_white(picture), 0.0, 1.0), truth_on_white(seen)
-    silhouette = seen.alpha > SILHOUETTE
-    rows, columns = _box(silhouette)
+    rows, columns = _box(seen.alpha > SILHOUETTE)
+    score = compared(picture, HeldOut(observation=seen))
     return FrameScore(
-        frame=seen.frame.index,
-        psnr=psnr(shown, truth),
-        psnr_mask=psnr(shown, truth, silhouette),
+        **vars(score),
         psnr_box=psnr(shown[rows, columns], truth[rows, columns]),
-        ssim=ssim(shown, truth),
         cpu_ms=cpu_ms,
     )
 

@@ -4,8 +4,11 @@ from collections.abc import Sequence
 
 from apps.evaluating.rows import Evaluation, Row
 
-HEAD = ("avatar", "frames", "drawn by", "poses", "PSNR", "in the box", "in the mask", "SSIM", "ms")
-WORDS = (0, 2, 3)
+HEAD = (
+    "avatar", "frames", "drawn by", "poses", "PSNR", "in the box", "in the mask", "SSIM", "ms",
+    "looks",
+)  # fmt: skip
+WORDS = (0, 2, 3, 9)
 """Columns that are aligned to the left."""
 FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f", "cpu_ms": ".0f"}
 PAPER = "InstantAvatar (paper)"
@@ -37,14 +40,15 @@ def _padded(line: Sequence[str], widths: Sequence[int]) -> list[str]:
 
 def _line(name: str, row: Row) -> tuple[str, ...]:
     figures = (_told(row.figure(figure), form) for figure, form in FORMATS.items())
-    return (name, str(len(row.scores)), row.drawn_by, row.poses, *figures)
+    looks = row.verdict or ""
+    return (name, str(len(row.scores)), row.drawn_by, row.poses, *figures, looks)
 
 
 def _paper(each: Evaluation) -> tuple[str, ...]:
     """The paper's own row, beside ours."""
     assert each.paper is not None
     figures = (_told(each.paper.get(figure), form) for figure, form in FORMATS.items())
-    return (each.name, "", PAPER, "fitted", *figures)
+    return (each.name, "", PAPER, "fitted", *figures, "")
 
 
 def _means(evaluations: Sequence[Evaluation]) -> list[tuple[str, ...]]:
@@ -59,7 +63,7 @@ def _means(evaluations: Sequence[Evaluation]) -> list[tuple[str, ...]]:
         for figure, form in FORMATS.items():
             values = [value for row in alike if (value := row.figure(figure)) is not None]
             figures.append(_told(sum(values) / len(values) if values else None, form))
-        lines.append(("mean", str(sum(len(row.scores) for row in alike)), *way, *figures))
+        lines.append(("mean", str(sum(len(row.scores) for row in alike)), *way, *figures, ""))
     return lines
 
 

@@ -10,6 +10,7 @@ from apps.playing.follow import FollowingCamera
 from apps.playing.novel import novel_motion
 from apps.recording.recording import Recording
 from apps.reporting.body_map import BodyMap
+from apps.reporting.failure import failure_of
 from apps.reporting.page import Pair, report_page
 from apps.reporting.pictures import data_uri, eight_bit, moving_data_uri
 from apps.reporting.report import (
@@ -25,6 +26,7 @@ from apps.terminal.console import Console
 from apps.terminal.whole import write_text
 from avatar.hold import on_white, spread, truth_on_white
 from avatar.render import render
+from avatar.sharpness import verdict_of
 from capture.memory import peak_memory_mb
 from export.build import ExportReport
 from export.player import Player
@@ -56,10 +58,12 @@ class Delivered:
     Attributes:
         report: As in report.json.
         refused: Why there is no package, if there is none.
+        failure: Why the result is no avatar of the person, if it is none.
     """
 
     report: Report
     refused: str | None
+    failure: str | None
 
 
 def deliver(
@@ -92,6 +96,7 @@ def deliver(
         package = _package_note(taken.exported, run)
     ready_at = None if taken.exported is None else taken.ready_at
     report = _report(learnt, recording, note, package, ready_at)
+    failure = failure_of(report)
     write_text(run.report, report.to_json())
     with console.waiting("drawing the report"):
         page = report_page(
@@ -100,10 +105,11 @@ def deliver(
             body_map=BodyMap(recording.shaped, learnt.coverage).svg(),
             pairs=pairs(learnt),
             novel=None if package is None else novel(Player.load(run.package)),
-            warnings=console.warnings if refused is None else [*console.warnings, refused],
+            warnings=[*console.warnings, *([] if refused is None else [refused])],
+            failure=failure,
         )
     write_text(run.page, page)
-    return Delivered(report=report, refused=refused)
+    return Delivered(report=report, refused=refused, failure=failure)
 
 
 def pairs(learnt: Learnt) -> list[Pair]:
@@ -121,6 +127,7 @@ def pairs(learnt: Learnt) -> list[Pair]:
             Pair(
                 frame=observation.frame.index,
                 psnr=scores[observation.frame.index].psnr,
+                verdict=verdict_of([scores[observation.frame.index]]),
                 truth=data_uri(eight_bit(truth_on_white(observation))),
                 render=data_uri(eight_bit(on_white(picture))),
             )

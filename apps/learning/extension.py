@@ -4,11 +4,12 @@ from dataclasses import replace
 from typing import Any, final
 
 from apps.learning.run_folder import RunFolder
-from apps.reporting.report import ExtendedNote
+from apps.reporting.report import ExtendedNote, decibels
 from apps.terminal.console import Console
 from avatar.events import Score
 from avatar.hold import HeldOut, score
 from avatar.kept_frames import CLIP, EARLIER, FINISHED, KeptFrames
+from avatar.sharpness import verdict_of
 from avatar.trainer import Trainer
 
 
@@ -64,7 +65,8 @@ class Extension:
         """Puts the key frames of earlier videos back into the trainer's memory."""
         if not self._kept.key_frames:
             return
-        with console.waiting(f"recalling {len(self._kept.key_frames)} key frames"):
+        count = len(self._kept.key_frames)
+        with console.waiting(f"preparing {count} frames of the earlier video"):
             for frame in self._kept.prepared(trainer.avatar.rig):
                 trainer.add(frame, again=True)
 
@@ -86,11 +88,14 @@ class Extension:
         if "before" not in self._notes:
             return None
         before = tuple(Score(**each) for each in self._notes["before"]["scores"])
-        note = ExtendedNote.of(before, self._scores(trainer), recalled=len(self._kept.key_frames))
+        after = self._scores(trainer)
+        note = ExtendedNote.of(before, after, recalled=len(self._kept.key_frames))
         if note.psnr_after is not None:
             console.say(
-                f"Frames of the earlier video: {note.psnr_before:.2f} dB before, "
-                f"{note.psnr_after:.2f} dB now; none lost more than {note.largest_fall:.2f} dB."
+                "Frames of the earlier video: "
+                f"{decibels(note.psnr_before, verdict_of(before))} before, "
+                f"{decibels(note.psnr_after, verdict_of(after))} now; none lost more than "
+                f"{note.largest_fall:.2f} dB."
             )
         return note
 

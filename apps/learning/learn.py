@@ -17,7 +17,7 @@ from apps.learning.watcher import Watcher, shown
 from apps.recording.recording import Recording
 from apps.reporting.curve import CurvePoint
 from apps.reporting.meter import Meter
-from apps.reporting.report import mean, percent
+from apps.reporting.report import decibels, mean, percent
 from apps.terminal.console import Bar, Console
 from apps.terminal.whole import whole_file
 from avatar import checkpoint
@@ -29,6 +29,7 @@ from avatar.fit import fitted_scores
 from avatar.hold import HeldOut, Ready, keep, prepared, score
 from avatar.prepare import PreparedFrame
 from avatar.rig import Rig
+from avatar.sharpness import verdict_of
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
@@ -230,13 +231,14 @@ class Lesson:
             case Evaluated():
                 point = self._mark(event.scores, event.wall_seconds, event.cpu_seconds)
                 if point.psnr is not None:
-                    self._console.say(f"{event.wall_seconds:6.1f} s   {point.psnr:.2f} dB")
+                    so_far = decibels(point.psnr, point.verdict)
+                    self._console.say(f"{event.wall_seconds:6.1f} s   {so_far}")
             case Warned(message=message):
                 self._console.warn(message)
 
     def _progress(self, event: Stepped) -> str:
         config = self.trainer.config
-        psnr = self.curve[-1].psnr if self.curve else None
+        last = self.curve[-1] if self.curve else None
         rays = self.trainer.rays / max(event.wall_seconds, 1e-6)
         parts = [
             f"{event.wall_seconds:.0f}" + ("" if config.steps else f"/{config.seconds:.0f}") + " s",
@@ -249,7 +251,9 @@ class Lesson:
         ]
         if self._recording.source.paced:
             parts.append(f"{1000.0 * self.meter.behind_s:.0f} ms behind")
-        return " · ".join(parts if psnr is None else [*parts, f"held out {psnr:.1f} dB"])
+        if last is not None and last.psnr is not None:
+            parts.append(f"held out {decibels(last.psnr, last.verdict, digits=1)}")
+        return " · ".join(parts)
 
     def _how_late(self) -> Iterator[str]:
         """What a user should know about a stream that could not be kept up with."""
@@ -274,6 +278,7 @@ class Lesson:
             frames_seen=self.trainer.frames_seen,
             psnr=mean([s.psnr for s in scores]),
             psnr_mask=mean([s.psnr_mask for s in scores]),
+            verdict=verdict_of(scores),
             frames=tuple((s.frame, s.psnr) for s in scores),
         )
         self.curve.append(point)

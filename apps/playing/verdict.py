@@ -6,6 +6,7 @@ from pathlib import Path
 
 import onnxruntime
 
+from export.manifest import Manifest
 from export.player import ALIKE, CLOSE, Likeness, provider_named, verify
 
 
@@ -64,6 +65,18 @@ class Verdict:
             ],
         }
         return json.dumps(content, indent=1) + "\n"
+
+
+def package_notes(manifest: Manifest) -> list[str]:
+    """What was found wrong with an avatar when its package was written, a sentence each."""
+    notes = [str(warning) for warning in manifest.metrics.get("warnings") or ()]
+    mark = manifest.metrics.get("held_out")
+    if isinstance(mark, dict) and mark.get("verdict") == "failed":
+        notes.append(
+            "This is no usable avatar of its person: when it was learnt, frames held out for "
+            f"scoring were drawn at {mark.get('psnr') or float('nan'):.1f} dB (failed)."
+        )
+    return notes
 
 
 def verdict_of(package: Path, *, provider: str) -> Verdict:

@@ -13,6 +13,7 @@ class CurvePoint:
         wall_seconds, cpu_seconds: Training time so far.
         frames_seen: Frames trained on so far.
         psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
+        verdict: What the scores mean, in a word (`avatar.sharpness`).
         frames: Which those were, each with its own PSNR of the whole picture: they need not be the
             same at every mark, so that only a frame's own scores tell whether it fell.
     """
@@ -22,6 +23,7 @@ class CurvePoint:
     frames_seen: int
     psnr: float | None
     psnr_mask: float | None
+    verdict: str | None = None
     frames: tuple[tuple[int, float], ...] = ()
 
     @classmethod

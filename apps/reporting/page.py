@@ -8,7 +8,7 @@ from typing import Any
 
 from apps.reporting.curve import largest_fall
 from apps.reporting.curve_svg import curve_svg
-from apps.reporting.report import Report, percent
+from apps.reporting.report import Report, decibels, percent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,11 +18,13 @@ class Pair:
     Attributes:
         frame: Its number in the video.
         psnr: Of the whole picture, dB.
+        verdict: What that means, in a word.
         truth, render: Pictures as addresses.
     """
 
     frame: int
     psnr: float
+    verdict: str | None
     truth: str
     render: str
 
@@ -35,6 +37,7 @@ def report_page(
     pairs: Sequence[Pair] = (),
     novel: str | None = None,
     warnings: Sequence[str] = (),
+    failure: str | None = None,
 ) -> str:
     """The page.
 
@@ -45,12 +48,14 @@ def report_page(
         pairs: Held-out frames, to look at.
         novel: A moving picture of poses that the video does not show, as an address.
         warnings: What the user was told.
+        failure: Why the result is no avatar of the person, if it is none.
     """
     style = (files("apps") / "reporting" / "page.css").read_text(encoding="utf-8")
     body = "\n".join(
         [
             f"<h1>{escape(name)}</h1>",
             f'<p class="lead">{escape(_lead(report))}</p>',
+            f'<p class="failure">{escape(failure)}</p>' if failure else "",
             _tiles(report),
             _section("How it learnt", _curve(report)),
             _section("What the camera has seen", _coverage(report, body_map)),
@@ -84,7 +89,8 @@ def _lead(report: Report) -> str:
 def _tiles(report: Report) -> str:
     held, package = report.held_out, report.package
     tiles = [
-        (_number(held.psnr, "dB"), "held-out PSNR, on white"),
+        (report.verdict or "not scored", "how it looks"),
+        (_number(held.psnr, "dB"), _meaning("held-out PSNR, on white", held.verdict)),
         (_number(held.psnr_mask, "dB"), "inside the mask"),
         (_number(held.ssim, "", digits=3), "SSIM"),
         (f"{report.training.steps:,}", "steps"),
@@ -95,6 +101,10 @@ def _tiles(report: Report) -> str:
         f'<div class="tile"><b>{value}</b><span>{label}</span></div>' for value, label in tiles
     )
     return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _meaning(label: str, verdict: str | None) -> str:
+    return f"{label}: {verdict}" if verdict else label
 
 
 def _number(value: float | None, unit: str, *, digits: int = 2) -> str:
@@ -167,7 +177,8 @@ def _pairs(pairs: Sequence[Pair]) -> str:
     figures = (
         f'<figure><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
         f'<img src="{pair.render}" alt="frame {pair.frame} rendered"></div>'
-        f"<figcaption>frame {pair.frame}: video | avatar, {pair.psnr:.2f} dB</figcaption></figure>"
+        f"<figcaption>frame {pair.frame}: video | avatar, "
+        f"{escape(decibels(pair.psnr, pair.verdict))}</figcaption></figure>"
         for pair in pairs
     )
     return f'<div class="pairs">{"".join(figures)}</div>' if pairs else ""

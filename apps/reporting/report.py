@@ -10,6 +10,7 @@ from apps.reporting.curve import CurvePoint
 from avatar.advice import advice
 from avatar.coverage import Coverage
 from avatar.events import Score
+from avatar.sharpness import better, typical_blur, typical_overlap, verdict_of
 from capture.reservoir import Reservoir
 
 FORMAT = 1
@@ -87,6 +88,11 @@ class HeldOutNote:
         psnr: Mean of the frames' PSNR over the whole picture, dB; null if nothing was scored.
         psnr_mask: The same over alpha > 0.5.
         ssim: Mean.
+        verdict: What these figures mean: sharp, soft, blurred or failed (`avatar.sharpness`); null
+            if nothing was scored.
+        blur: Equivalent blur that half of the frames stay within, as a share of the person's
+            height; null if it is beyond the widest that is measured.
+        overlap: Of the rendered alpha with the mask, reached by half of the frames.
         lpips: Not measured.
         background: What alpha was blended with.
         poses: Which poses the frames were rendered in.
@@ -97,6 +103,9 @@ class HeldOutNote:
     psnr: float | None
     psnr_mask: float | None
     ssim: float | None
+    verdict: str | None
+    blur: float | None
+    overlap: float | None
     lpips: float | None = None
     background: str = "white"
     poses: str = "given"
@@ -110,6 +119,9 @@ class HeldOutNote:
             psnr=mean([score.psnr for score in scores]),
             psnr_mask=mean([score.psnr_mask for score in scores]),
             ssim=mean([score.ssim for score in scores]),
+            verdict=verdict_of(scores),
+            blur=typical_blur(score.blur for score in scores),
+            overlap=typical_overlap(score.overlap for score in scores),
         )
 
 
@@ -237,13 +249,26 @@ class Report:
     cameras: dict[str, Any] | None = None
     format: int = FORMAT
 
+    @property
+    def verdict(self) -> str | None:
+        """What the avatar is, in a word: in fitted poses where it looks better in them."""
+        fitted = self.held_out_refined
+        return better(self.held_out.verdict, None if fitted is None else fitted.verdict)
+
     def to_json(self) -> str:
         """The text of report.json; what is not a number is null."""
-        content = _plain(dataclasses.asdict(self))
-        order = ("format", "command", "recipe", "machine", "frames", "training", "held_out")
-        order += ("held_out_refined", "curve", "stream", "package", "coverage", "extended")
-        order += ("cameras",)
+        content = _plain(dataclasses.asdict(self) | {"verdict": self.verdict})
+        order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
+        order += ("held_out", "held_out_refined", "curve", "stream", "package", "coverage")
+        order += ("extended", "cameras")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
+
+
+def decibels(psnr: float | None, verdict: str | None, *, digits: int = 2) -> str:
+    """A PSNR as people read it, with what it means: "22.78 dB (blurred)"."""
+    if psnr is None:
+        return "n/a"
+    return f"{psnr:.{digits}f} dB" + (f" ({verdict})" if verdict else "")
 
 
 def percent(share: float) -> str:

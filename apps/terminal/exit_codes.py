@@ -10,7 +10,8 @@ from apps.terminal.interrupt import INTERRUPTED as INTERRUPTED
 from apps.terminal.interrupt import noted
 from capture.errors import BadInput
 
-DONE, NO_PACKAGE, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
+DONE, NO_AVATAR, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
+"""1: learnt, and the result is no usable avatar (verdict "failed", or nothing to draw)."""
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """The disk, the quota, or the largest size that a file may have."""
@@ -35,7 +36,8 @@ class Stop(Exception):  # noqa: N818 - an end, not always an error
 def exit_code(program: str, work: Callable[[], int]) -> int:
     """Runs a command's work; what a user or a machine can cause becomes one message and a number.
 
-    Bad input is 2, a full disk or a busy device 3, Ctrl-C 130. Our own bugs keep their traceback.
+    No usable avatar is 1, bad input 2, a full disk or a busy device 3, Ctrl-C 130. Our own bugs
+    keep their traceback.
 
     Args:
         program: The command's name, in front of the message.

@@ -130,7 +130,8 @@ class Viewer:
             self.page.tell("No package yet", taken.refused or "")
             return
         size = f"{taken.exported.bytes / 1e6:.1f} MB after {trainer.wall_seconds:.0f} s of training"
-        self.page.tell("Package saved", f"{self._run.package}: {size}.")
+        notes = " ".join([f"{self._run.package}: {size}.", *taken.exported.warnings])
+        self.page.tell("Package saved", notes)
         self._console.say(f"Saved from the page: {self._run.package}, {size}.")
 
     def _look_after(self, lesson: Watched, status: str, *, idle: bool) -> None:
@@ -151,14 +152,16 @@ class Viewer:
 
     def _fill_panel(self, lesson: Watched, status: str) -> None:
         trainer = lesson.trainer
-        psnr = lesson.curve[-1].psnr if lesson.curve else None
+        last = lesson.curve[-1] if lesson.curve else None
+        psnr = None if last is None else last.psnr
+        held_out = "held out" if last is None or not last.verdict else f"held out: {last.verdict}"
         self.page.say(
             status,
             [
                 (f"{trainer.frames_seen}", "frames"),
                 (f"{trainer.steps:,}", "steps"),
                 (percent(lesson.coverage.seen), "seen"),
-                ("none yet" if psnr is None else f"{psnr:.1f} dB", "held out"),
+                ("none yet" if psnr is None else f"{psnr:.1f} dB", held_out),
             ],
             note=self._note,
         )

@@ -40,8 +40,8 @@ def unsound(
     seen = views(claim)
     if seen < ENOUGH_SECTORS:
         yield (
-            f"The camera sees the person from {seen:.0%} of the sides around them only; what it "
-            "does not see cannot be learnt. Turn round once."
+            f"The video shows the person from only {seen:.0%} of the directions around them; what "
+            "it does not show cannot be learnt. Film the person turning round once."
         )
     if evidence is not None:
         yield from _unusable(evidence)

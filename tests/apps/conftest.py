@@ -130,7 +130,10 @@ def call_play(capsys) -> Command:
 
 @pytest.fixture
 def without_baking(monkeypatch) -> None:
-    """Leaves out the seconds that baking takes, where a test is not about the package."""
+    """Leaves out the seconds that baking takes, where a test is not about the package.
+
+    Nor is it about how good the avatar is, for which half a second may not be enough.
+    """
 
     def export_nothing(avatar, path, *, views, metrics, hasty, fine_tuned, progress):
         path.write_bytes(b"stand-in")
@@ -140,6 +143,7 @@ def without_baking(monkeypatch) -> None:
         )  # fmt: skip
 
     monkeypatch.setattr(snapshot, "export_avatar", export_nothing)
+    monkeypatch.setattr(deliver, "failure_of", lambda report: None)
     monkeypatch.setattr(deliver, "novel", lambda player: "data:,")
     monkeypatch.setattr(deliver.Player, "load", lambda path: None)
 

@@ -52,6 +52,7 @@ def test_a_runs_own_table_says_what_its_report_says(run, call_evaluate, tmp_path
     assert rows["player hq", "given"]["psnr"] > rows["player lite", "given"]["psnr"] > 20.0
     assert (tmp_path / "t.md").read_text() == ended.out
     assert f"{report['held_out']['psnr']:.2f}" in ended.out
+    assert rows["renderer", "given"]["verdict"] == report["held_out"]["verdict"]
 
 
 def test_a_package_alone_is_scored_as_within_its_run(run, film, call_evaluate, tmp_path):
@@ -160,8 +161,9 @@ def test_a_box_is_scored_without_the_white_around_it(film):
 def test_a_table_is_markdown_and_its_means_are_means():
     def avatar(name, psnr):
         score = FrameScore(
-            frame=0, psnr=psnr, psnr_mask=20.0, psnr_box=25.0, ssim=0.9, cpu_ms=np.inf
-        )
+            frame=0, psnr=psnr, psnr_mask=20.0, psnr_box=25.0, ssim=0.9, cpu_ms=np.inf,
+            blur=0.01, overlap=0.9,
+        )  # fmt: skip
         row = Row(drawn_by="renderer", poses="given", scores=[score])
         return Evaluation(name=name, capture="c", size=(8, 8), rows=[row])
 
@@ -170,6 +172,7 @@ def test_a_table_is_markdown_and_its_means_are_means():
     assert len(set(map(len, lines))) == 1
     cells = [cell.strip() for cell in lines[-1].split("|")]
     assert cells[1:6] == ["mean", "2", "renderer", "given", "31.50"]
+    assert lines[2].endswith("| soft  |")
 
 
 def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):

@@ -1,29 +1,32 @@
 """The whole walk, from a film to a run folder."""
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from apps.learning import learn
+from apps.learning import deliver, learn
+from apps.reporting.failure import failure_of
 from avatar import checkpoint
 from avatar.advice import EVERYTHING
 from export.player import Player
 
 KEYS = {
-    "": "format command recipe machine frames training held_out held_out_refined curve stream "
-    "package coverage extended cameras",
+    "": "format verdict command recipe machine frames training held_out held_out_refined curve "
+    "stream package coverage extended cameras",
     "machine": "device backend threads",
     "frames": "read used held_out dropped alike not_replayed",
     "training": "wall_seconds cpu_seconds startup_seconds steps rays rays_per_second "
     "samples_per_ray peak_memory_mb",
-    "held_out": "frames size psnr psnr_mask ssim lpips background poses",
+    "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses",
     "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
     "lateness_ms inbox_depth",
     "package": "path bytes seconds psnr_to_renderer",
@@ -53,7 +56,8 @@ def test_the_report_has_the_keys_that_were_agreed(report):
         found = report[place] if place else report
         assert list(found) == keys.split()
     assert set(report["curve"][0]) == {
-        "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask", "frames",
+        "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask", "verdict",
+        "frames",
     }  # fmt: skip
     last = report["curve"][-1]
     assert [frame for frame, _ in last["frames"]] == report["held_out"]["frames"]
@@ -76,6 +80,33 @@ def test_something_was_learnt(report):
     assert report["held_out"]["psnr"] > 25.0
     assert report["held_out"]["psnr_mask"] < report["held_out"]["psnr"]
     assert report["package"]["psnr_to_renderer"]["hq"] >= 30.0
+    assert report["verdict"] in ("sharp", "soft")
+    assert report["held_out"]["overlap"] > 0.8
+
+
+def test_a_result_that_is_no_avatar_is_called_that_and_kept(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch
+):
+    """The package and the report are there; the exit code is not 0."""
+    monkeypatch.setattr(deliver, "failure_of", failure_of)
+    score = learn.score
+
+    def as_of_a_room(avatar, held):
+        return replace(score(avatar, held), psnr=6.88, blur=math.inf, overlap=0.2)
+
+    monkeypatch.setattr(learn, "score", as_of_a_room)
+    out = tmp_path / "run"
+    outcome = call_ingest(capture, *FEW, "--out", out, "--no-refine-poses")
+    assert outcome.code == 1
+    assert "no usable avatar" in outcome.complaint()
+    assert "6.88 dB (failed)" in outcome.complaint()
+    assert "held out 6.88 dB (failed)" in outcome.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == "failed"
+    assert report["held_out"]["blur"] is None  # beyond the widest
+    assert "no usable avatar" in (out / "report.html").read_text()
+    assert (out / "avatar.iavatar").exists()
+    assert (out / "checkpoint" / "state.pt").exists()
 
 
 def test_the_clock_counts_training_alone(report):

@@ -16,6 +16,7 @@ from apps import ingest, play
 from apps.playing import encoders
 from apps.playing.follow import FollowingCamera
 from apps.playing.novel import novel_motion
+from apps.playing.verdict import package_notes
 from export.package import read_package, write_package
 from export.player import Player
 from preprocess.kinematics import rotation_matrices
@@ -226,6 +227,16 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
         outcome = call_play(package, *arguments, "--provider", "abacus")
         assert outcome.code == 2
         assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
+
+
+def test_what_was_wrong_when_a_package_was_written_is_said(package):
+    manifest = replace(Player.load(package).manifest, metrics={})
+    assert package_notes(manifest) == []
+    mark = {"psnr": 6.9, "verdict": "failed"}
+    told = replace(manifest, metrics={"warnings": ["It is fog."], "held_out": mark})
+    fog, failed = package_notes(told)
+    assert fog == "It is fog."
+    assert "6.9 dB (failed)" in failed
 
 
 def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):

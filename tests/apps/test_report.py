@@ -13,6 +13,7 @@ import pytest
 
 from apps.reporting.curve import CurvePoint, largest_fall
 from apps.reporting.curve_svg import curve_svg
+from apps.reporting.failure import failure_of
 from apps.reporting.page import Pair, report_page
 from apps.reporting.pictures import data_uri, moving_data_uri
 from apps.reporting.report import (
@@ -121,7 +122,7 @@ def test_a_fall_is_a_frames_own_and_not_that_of_a_mean():
 def test_a_point_of_the_curve_survives_a_checkpoint():
     kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
     assert CurvePoint.again(json.loads(json.dumps(vars(kept)))) == kept
-    older = {key: value for key, value in vars(kept).items() if key != "frames"}
+    older = {key: value for key, value in vars(kept).items() if key not in ("frames", "verdict")}
     assert CurvePoint.again(older).frames == ()
 
 
@@ -150,7 +151,7 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
     page = report_page(
         report(),
         name="a <b> & c.mp4",
-        pairs=[Pair(frame=9, psnr=30.0, truth=white, render=white)],
+        pairs=[Pair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
         novel=moving_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
         warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
     )
@@ -169,6 +170,47 @@ def test_a_page_without_pictures_or_scores_is_whole_too():
     assert Tags(page).addresses == []
     assert "<svg" not in page
     assert "n/a" in page
+    assert "not scored" in page
+
+
+def test_every_decibel_on_the_page_has_its_word():
+    note = replace(
+        HeldOutNote.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
+    )
+    pair = Pair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
+    page = report_page(replace(report(), held_out=note), name="clip", pairs=[pair])
+    assert "held-out PSNR, on white: blurred" in page
+    assert "22.78 dB (blurred)" in page
+    assert "no usable avatar" not in page
+
+
+def failed(*, steps, video="my clip.mp4", overlap=0.9):
+    note = replace(HeldOutNote.of(scores((6.88, 6.0)), (64, 48)), verdict="failed", overlap=overlap)
+    given = report()
+    return replace(
+        given,
+        held_out=note,
+        training=replace(given.training, steps=steps),
+        command={"video": video, "poses": "p.npz", "masks": None, "cameras": "solve"},
+    )
+
+
+def test_a_failure_names_what_was_seen_and_what_to_do():
+    room = failure_of(failed(steps=900, overlap=0.2))
+    assert "6.88 dB (failed)" in room
+    assert "agrees with the masks by only 0.20" in room
+    assert room.endswith("ia-check 'my clip.mp4' --poses p.npz")
+    assert "8% of the person's height" in failure_of(failed(steps=900))
+    assert "Only 26 steps were made" in failure_of(failed(steps=26))
+    assert "ia-check" not in failure_of(failed(steps=900, video="camera:0"))
+    assert failure_of(report()) is None
+
+
+def test_an_avatar_that_is_good_in_fitted_poses_has_not_failed():
+    fitted = replace(HeldOutNote.of(scores((23.0, 18.0)), (64, 48)), verdict="soft")
+    kept = replace(failed(steps=900), held_out_refined=fitted)
+    assert kept.verdict == "soft"
+    assert failure_of(kept) is None
 
 
 @pytest.mark.parametrize(
