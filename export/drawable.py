@@ -6,6 +6,7 @@ import numpy as np
 
 from capture.camera import Camera
 from capture.errors import BadInput
+from preprocess.plausibility import LARGEST_BEND_RAD, overbent
 from preprocess.pose import BodyPose
 
 MOST_SAMPLES = 256
@@ -46,6 +47,11 @@ def check(pose: BodyPose, camera: Camera, samples: int) -> None:
     _check_array("root_rotation", pose.root_rotation, (3,))
     _check_array("root_translation", pose.root_translation, (3,))
     _check_array("joint_rotations", pose.joint_rotations, (23, 3))
+    if overbent(pose.joint_rotations):
+        raise BadInput(
+            f"joint_rotations turn a joint by more than {np.rad2deg(LARGEST_BEND_RAD):.0f}°; "
+            "axis-angles in radians were expected. Of degrees give numpy.deg2rad(degrees)."
+        )
     _check_array("camera_from_world", camera.camera_from_world, (4, 4))
     if camera.distortion:
         raise BadInput(

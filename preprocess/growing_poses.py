@@ -9,8 +9,9 @@ import numpy as np
 from capture.errors import BadInput
 from capture.frame import Frame
 from capture.pace import Pace
+from preprocess.plausibility import plausible, without_impossible
 from preprocess.pose import BodyPose, Motion
-from preprocess.pose_file import read_motion
+from preprocess.poses import read_poses
 
 PATIENCE_S = 2.0
 """So long after it was filmed a frame waits for its pose or its mask; then it is left out."""
@@ -50,7 +51,8 @@ class GrowingPoses:
             started_at: When the source's first picture was taken, in seconds since 1970.
 
         Raises:
-            BadInput: If there is no valid pose after `first_within_s`, with the reason.
+            BadInput: If there is no valid pose after `first_within_s`, with the reason, or the
+                first ones cannot be poses in radians and metres.
         """
         self._path, self._pace, self._patience_s = path, pace, patience_s
         self._default_model, self._started_at = default_model, started_at
@@ -128,11 +130,13 @@ class GrowingPoses:
         if version == self._version:
             return
         try:
-            read = read_motion(self._path, default_model=self._default_model)
-            self._motion = self._placed(read)
+            read = read_poses(self._path, default_model=self._default_model)
         except BadInput as cause:
             self._trouble = str(cause)
             return
+        if not self._has_any() and read.valid.any():
+            plausible(read, self._path)
+        self._motion = self._placed(without_impossible(read))
         self._version = version
         if self._motion.frames is not None:
             self._row_of = {int(number): row for row, number in enumerate(self._motion.frames)}

@@ -15,6 +15,7 @@ from preprocess.doctor.evidence import FRAMES, Evidence, gather
 from preprocess.doctor.soundness import unsound
 from preprocess.fit.pictures import edges, glance
 from preprocess.observe import check_cameras, check_masks
+from preprocess.plausibility import impossible
 from preprocess.silhouette import SkinPoints
 
 FEW = 8
@@ -95,7 +96,7 @@ def examined(recording: Recording, undecided: str | None = None) -> Examined:
     Raises:
         BadInput: If a part is unreadable, so that there is nothing to examine.
     """
-    claim, refused = _claim(recording), undecided
+    claim, refused = _claim(recording), impossible(recording.motion) or undecided
     try:
         recording.check()
     except BadInput as error:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from apps.terminal.console import Console
 from capture.errors import BadInput
+from preprocess.plausibility import oddities, plausible
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import about_pelvis
@@ -28,11 +29,14 @@ def driving_motion(
         person: Whose poses; None: of whom there are most.
 
     Raises:
-        BadInput: If there are none.
+        BadInput: If there are none, or the numbers cannot be poses in radians and metres.
     """
-    motion = about_pelvis(read_poses(path, person=person, driving=True), rest_joints)
+    read = plausible(read_poses(path, person=person, driving=True), path)
+    motion = about_pelvis(read, rest_joints)
     if motion.note is not None:
         console.say(f"note: {motion.note}")
+    for sentence in oddities(read):
+        console.warn(sentence)
     lost = int((~motion.valid).sum())
     if lost == len(motion):
         raise BadInput(f"None of the {len(motion)} poses in {path} is valid.")

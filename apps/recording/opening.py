@@ -23,6 +23,7 @@ from preprocess.live import LiveParts
 from preprocess.masks.choice import MaskChoice, choose_masks
 from preprocess.masks.files import Masks, masks_in_poses, open_masks
 from preprocess.masks.segmenter import Segmenter, make_segmenter, segmenter_name
+from preprocess.plausibility import oddities, plausible
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
 from preprocess.poses.place import placed
@@ -51,16 +52,21 @@ def open_recording(
     camera = camera_address(wanted.video)
     if wanted.live or camera is not None:
         return _live(wanted, camera, size_px, avatars)
-    recording = _recorded(wanted, size_px, avatars)
+    recording = _recorded(wanted, size_px, avatars, doubtful=doubtful)
     if not doubtful:
         recording.check()
     return recording
 
 
-def _recorded(wanted: RecordingPaths, size_px: int | None, avatars: Path | None) -> Recording:
+def _recorded(
+    wanted: RecordingPaths, size_px: int | None, avatars: Path | None, *, doubtful: bool
+) -> Recording:
     paths = find_capture(wanted.video, wanted.poses, _file(wanted.masks), wanted.cameras)
     source, body = open_source(paths.video, frames=wanted.frames), load_body(wanted.body)
     motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
+    doubts: tuple[str, ...] = ()
+    if not doubtful:  # ia-check wants the numbers as they are, and says what is odd by itself
+        doubts, motion = tuple(oddities(motion)), plausible(motion, paths.poses)
     choice, masks = _masks(paths, source, wanted)
     paths = replace(paths, masks=choice.path)
     cameras, given = _cameras(paths, motion, source), paths.cameras is not None
@@ -80,7 +86,7 @@ def _recorded(wanted: RecordingPaths, size_px: int | None, avatars: Path | None)
         cameras=cameras,
         shaped=fit.shaped,
         size_px=size_px,
-        notes=tuple(notes_of(fit, masks, cameras, choice, unread=_unread_alpha(source))),
+        notes=(*notes_of(fit, masks, cameras, choice, unread=_unread_alpha(source)), *doubts),
         segment=_segmenter(choice, fit.shaped),
         refit=fit.refit,
     )
@@ -105,6 +111,7 @@ def _live(
     paths = replace(paths, masks=choice.path)
     source.has_alpha = choice.alpha
     motion = live.poses.motion
+    doubts = tuple(oddities(motion))
     cameras, given = _cameras(paths, motion, source), paths.cameras is not None
     shaped = shaped_for(body, motion)
     live.poses.place(lambda read: placed(read, shaped, cameras, cameras_given=given))
@@ -119,7 +126,7 @@ def _live(
         cameras=cameras,
         shaped=fit.shaped,
         size_px=size_px,
-        notes=tuple(notes_of(fit, None, cameras, choice, looked_for=looked_for)),
+        notes=(*notes_of(fit, None, cameras, choice, looked_for=looked_for), *doubts),
         live=live,
         segment=_segmenter(choice, fit.shaped),
         growing_fit=growing_fit,

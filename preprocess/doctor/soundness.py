@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from preprocess.doctor.claim import Claim, step_of
 from preprocess.doctor.evidence import Evidence
+from preprocess.plausibility import oddities
 
-FAR_M = 50.0
-"""People are filmed from nearer than this."""
 JUMP_M, JUMP_RAD = 0.25, np.deg2rad(40.0)
 """What nobody does from one frame to the next …"""
 JUMPS = 6.0
@@ -88,18 +87,7 @@ def _times(claim: Claim, frames: list[int]) -> Iterator[str]:
 
 def _ranges(claim: Claim) -> Iterator[str]:
     motion = claim.motion
-    places = motion.root_translations[motion.valid]
-    if len(places) and float(np.median(np.linalg.norm(places, axis=1))) > FAR_M:
-        yield (
-            f"The poses lie {np.median(np.linalg.norm(places, axis=1)):.0f} m from the origin; "
-            "are they in metres?"
-        )
-    angles = np.linalg.norm(motion.joint_rotations[motion.valid], axis=-1)
-    if angles.size and angles.max() > 1.5 * np.pi:
-        yield (
-            f"A joint is bent by {np.rad2deg(angles.max()):.0f}°; were axis-angles in radians "
-            "expected, and degrees given?"
-        )
+    yield from oddities(motion)
     if len(motion.betas) and np.abs(motion.betas).max() > LARGE_BETA:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
 

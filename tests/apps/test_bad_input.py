@@ -44,6 +44,13 @@ def test_poses_that_were_not_named(refused, capture):
     refused(capture / "video.mp4", words=["--poses"])
 
 
+@pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:grabcut"]])
+def test_poses_in_degrees(refused, capture, changed, flags):
+    with np.load(capture / "poses.npz") as given:
+        changed(capture / "poses.npz", body_pose=np.rad2deg(given["body_pose"]))
+    refused(capture, *flags, words=["poses.npz: A joint is bent by", "degrees given"])
+
+
 def test_garbage_instead_of_a_video(refused, capture, rng):
     (capture / "video.mp4").write_bytes(rng.bytes(20000))
     refused(capture, words=["video.mp4", "video"])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,6 +20,7 @@ from apps.playing.novel import novel_motion
 from apps.playing.verdict import package_notes
 from export.package import read_package, write_package
 from export.player import Player
+from export.web import runtime
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import BodyPose
 from preprocess.pose_file import read_motion
@@ -284,6 +286,26 @@ def test_wrong_wishes(call_play, package, novel, tmp_path, monkeypatch, argument
     assert outcome.code == 2
     assert word in outcome.complaint("ia-play")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [["--out", "a.webm"], ["--bench"], ["--web", "--out", "page"]])
+def test_poses_in_other_units_are_refused(
+    call_play, package, novel, tmp_path, monkeypatch, changed, words
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runtime, "runtime_files", dict)
+    with np.load(novel) as given:
+        turned, places = given["body_pose"], given["transl"] + np.array([0.0, 0.0, 3.0])
+    for said, other in (
+        ("degrees given?", {"body_pose": np.rad2deg(turned)}),
+        ("millimetres or centimetres given?", {"transl": 1000.0 * places}),
+    ):
+        shutil.copy(novel, "poses.npz")
+        changed(tmp_path / "poses.npz", **other)
+        outcome = call_play(package, "--poses", "poses.npz", *words)
+        assert outcome.code == 2
+        assert said in outcome.complaint("ia-play")
+        assert [file.name for file in tmp_path.iterdir()] == ["poses.npz"]
 
 
 def test_what_a_proof_would_not_listen_to_is_refused(call_play, package, tmp_path):

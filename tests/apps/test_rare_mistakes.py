@@ -170,6 +170,7 @@ def test_degrees_are_told_from_radians_and_mended(capture, diagnosed, tmp_path):
     code, said, found = diagnosed("--fix", tmp_path / "mended")
     assert (code, found["cause"], len(found["cures"])) == (0, "root_rotation", 1)
     assert "the rotations are in degrees, not in radians" in said
+    assert "degrees given?" in found["refused"]
     assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
     mended = read_motion(tmp_path / "mended" / "poses.npz")
     np.testing.assert_allclose(mended.root_rotations, true.root_rotations, atol=1e-12)

@@ -178,6 +178,12 @@ def test_a_pose_without_numbers_is_refused(player, bent, camera):
         player.render(lost, camera(9, 9))
 
 
+def test_a_pose_in_degrees_is_refused(player, bent, camera):
+    degrees = replace(bent, joint_rotations=np.rad2deg(bent.joint_rotations))
+    with pytest.raises(BadInput, match=r"numpy\.deg2rad"):
+        player.render(degrees, camera(9, 9))
+
+
 def test_an_onnxruntime_that_is_too_old_is_named(exported, monkeypatch):
     class Older:
         """The options of 1.23, as far as they are asked."""

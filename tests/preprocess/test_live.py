@@ -62,6 +62,19 @@ def test_a_pose_that_comes_later_is_waited_for(tmp_path):
     thread.join()
 
 
+def test_degrees_are_refused_at_once_and_one_bad_pose_is_left_out(tmp_path):
+    path, bent = tmp_path / "poses.npz", np.zeros((3, 23, 3))
+    bent[:, 4, 0] = 60.0
+    write_motion(path, moving(3, joint_rotations=bent))
+    with pytest.raises(BadInput, match="degrees given"):
+        GrowingPoses(path, Pace(), default_model="body24", first_within_s=3600.0)
+    bent[:2] = 0.0
+    write_motion(path, moving(3, joint_rotations=bent))
+    growing = poses(path)
+    assert row(growing.of(frame(1))) == 1
+    assert growing.of(frame(2)) == "pose invalid"
+
+
 def test_a_pose_that_does_not_come_costs_its_frame_and_no_more(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(1))
