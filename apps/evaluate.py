@@ -156,12 +156,12 @@ def _learn(
     Returns:
         Whether it is whole; Ctrl-C leaves a part, with which the next evaluation goes on.
     """
-    from apps.evaluating.frames import learnt_seconds
+    from apps.evaluating.frames import is_learnt
     from apps.evaluating.protocol import PIXELS, TRAIN_POSES, poses_of
     from apps.ingest import ingest
     from apps.ingest_arguments import IngestArguments
 
-    if run.has_checkpoint() and learnt_seconds(run) >= given.seconds:
+    if is_learnt(run, seconds=given.seconds, steps=given.steps):
         console.say(f"{subject.name} was learnt before, in {run.path}.")
         return True
     console.say(f"Learning {subject.name}.")
@@ -172,7 +172,8 @@ def _learn(
         body=given.body,
         out=run.path,
         resume=run.has_checkpoint(),
-        seconds=given.seconds,
+        seconds=given.seconds if given.steps is None else None,
+        steps=given.steps,
         size=given.size or PIXELS,
         hold_out=0,
         device=given.device,

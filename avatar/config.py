@@ -139,17 +139,19 @@ class TrainConfig:
     @classmethod
     def within(
         cls,
-        seconds: float,
+        seconds: float | None = None,
         *,
+        steps: int | None = None,
         footprint_m: float,
         frames: int | None = None,
         seed: int = 0,
         hold_every: int = HOLD_EVERY,
     ) -> "TrainConfig":
-        """The recipe for a waiting time and a picture size.
+        """The recipe for a waiting time, or a number of steps, and a picture size.
 
         Args:
             seconds: How long the user will wait.
+            steps: Number of training steps instead of `seconds`.
             footprint_m: What one pixel covers on the body, metres.
             frames: How many frames there are, if that is known. Few of them, seen in poses that
                 are a little off, do not determine the finest detail: what they leave open would
@@ -161,6 +163,8 @@ class TrainConfig:
             seed: Of everything random.
             hold_every: Every so manieth frame is held out.
         """
+        if seconds is None:
+            seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
         too_few = 1.0 if frames is None else max(1.0, ENOUGH_FRAMES / max(frames, 1))
         footprint_m *= too_few**0.5
         few = min(too_few, FEWEST)
@@ -172,6 +176,7 @@ class TrainConfig:
         size = 1 << min(max(round(math.log2(wanted)), 15), 19 if seconds > 120 else 17)
         return cls(
             seconds=seconds,
+            steps=steps,
             step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,

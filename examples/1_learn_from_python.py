@@ -28,7 +28,7 @@ from avatar.warm import warm_up
 from capture.inbox import Inbox
 from export.build import export_avatar
 
-SECONDS = 10.0
+STEPS = 500
 
 
 def main(folder: Path) -> None:
@@ -38,11 +38,11 @@ def main(folder: Path) -> None:
     # Everything that is known about it, checked before a frame is read.
     recording = open_recording(RecordingPaths(video=folder / "capture"))
 
-    # The rig never changes; the recipe follows from your patience and the size of a pixel.
+    # The rig never changes; the recipe follows from the number of steps and the size of a pixel.
     rig = Rig.of(recording.shaped)
-    config = TrainConfig.within(SECONDS, footprint_m=recording.footprint_m())
+    config = TrainConfig.within(steps=STEPS, footprint_m=recording.footprint_m())
     trainer = Trainer(rig, config, torch.device("cpu"))
-    warm_up(trainer)  # compiles kernels, so that the clock counts learning alone
+    warm_up(trainer)  # compiles kernels
 
     # One thread makes frames ready, this one learns from them as they come.
     frames = prepared(recording.observations(), rig, every=10, total=recording.source.frame_count)

@@ -60,6 +60,8 @@ class EvaluateArguments:
     """Also as the package's player draws them, in each tier."""
     seconds: float = 60.0
     """Of a dataset: how long each subject is learnt."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Of a dataset: number of training steps for each subject, instead of --seconds."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Of a dataset: folder for the runs; without it runs/NAME, after the dataset."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -81,6 +83,8 @@ class EvaluateArguments:
             raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
         if not 0.0 < self.seconds < float("inf"):
             raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+        if self.steps is not None and self.steps < 1:
+            raise BadInput(f"--steps is {self.steps}; at least 1 was expected.")
         parsed_frames(self.frames)
         told = [
             f"--{name}" for name in ("poses", "masks", "cameras") if getattr(self, name) is not None

@@ -99,9 +99,12 @@ def learnt_px(run: RunFolder) -> int | None:
     return max(size) if size else None
 
 
-def learnt_seconds(run: RunFolder) -> float:
-    """For how long a run has learnt, as its report says; 0 if it was not finished or stopped."""
-    return read_report(run)["training"]["wall_seconds"] if run.report.is_file() else 0.0
+def is_learnt(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
+    """Whether a run's report says that it was trained for the steps, or else the seconds."""
+    if not (run.has_checkpoint() and run.report.is_file()):
+        return False
+    training = read_report(run)["training"]
+    return training["wall_seconds"] >= seconds if steps is None else training["steps"] >= steps
 
 
 def read_report(run: RunFolder) -> dict[str, Any]:

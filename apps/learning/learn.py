@@ -54,12 +54,13 @@ def new_trainer(
     """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
     config = TrainConfig.within(
         seconds,
+        steps=steps,
         footprint_m=recording.footprint_m(),
         frames=recording.source.frame_count,
         hold_every=hold_every,
         seed=seed,
     )
-    config = replace(config, steps=steps, refine_poses=refine_poses)
+    config = replace(config, refine_poses=refine_poses)
     return Trainer(Rig.of(recording.shaped), config, device)
 
 

@@ -15,7 +15,6 @@ from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
-from avatar.train import train
 from export import bake
 from export.build import ExportReport
 
@@ -44,7 +43,9 @@ class Outcome:
 Command = Callable[..., Outcome]
 
 ENOUGH_STEPS = 150
-"""So many make of this film an avatar that is firm enough for a package."""
+"""Training steps after which this film's avatar is firm enough for a package."""
+FEW_STEPS = 10
+"""Training steps where a test is not about what was learnt."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -63,26 +64,11 @@ def film(tmp_path_factory) -> Path:
     return folder
 
 
-def train_on_everything(trainer, inbox, held):
-    """As `train`, but all frames are ready before it begins, however slow the machine is."""
-    assert inbox._ended.wait(timeout=60.0)
-    yield from train(trainer, inbox, held)
-
-
-def train_enough(trainer, inbox, held):
-    """As `train_on_everything`; a slow machine catches up on the steps it had no time for."""
-    yield from train_on_everything(trainer, inbox, held)
-    while trainer.steps < ENOUGH_STEPS:
-        trainer.step(rate=0.3, hard_share=1.0)
-
-
 @pytest.fixture(scope="session")
 def run(film, tmp_path_factory) -> Path:
-    """What ia-ingest makes of it in three seconds."""
+    """What ia-ingest makes of it."""
     out = tmp_path_factory.mktemp("runs") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learn, "train", train_enough)
-        assert ingest.main([str(film), "--out", str(out), "--seconds", "3"]) == 0
+    assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
     return out
 
 
@@ -102,14 +88,13 @@ def capture(film, tmp_path) -> Path:
 
 @pytest.fixture
 def call_ingest(capsys, monkeypatch, rig) -> Command:
-    """Runs ia-ingest, half a second long unless the test says otherwise."""
-    monkeypatch.setattr(learn, "train", train_on_everything)
+    """Runs ia-ingest, for a few steps unless the test says otherwise."""
     monkeypatch.setattr(learn.Rig, "of", lambda shaped: rig)
     monkeypatch.setattr(warm, "warm_up", lambda trainer: 0.0)
 
-    def call(*arguments: object, seconds: float = 0.5) -> Outcome:
+    def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
         words = [str(argument) for argument in arguments]
-        code = ingest.main([*words, "--seconds", str(seconds)])
+        code = ingest.main([*words, "--steps", str(steps)])
         captured = capsys.readouterr()
         return Outcome(code=code, out=captured.out, err=captured.err)
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from apps import ingest
 from apps.recording.opening import open_recording
 from apps.recording.wanted import RecordingPaths
 
@@ -196,10 +197,14 @@ def test_numbers_out_of_range(refused, capture, option, value):
     refused(capture, option, value, words=[option, value])
 
 
-def test_no_time_at_all(call_ingest, capture, tmp_path):
-    outcome = call_ingest(capture, "--out", tmp_path / "run", seconds=0.0)
-    assert outcome.code == 2
-    assert "--seconds" in outcome.complaint()
+@pytest.mark.parametrize(
+    "words", [("--seconds", "0"), ("--steps", "0"), ("--seconds", "9", "--steps", "9")]
+)
+def test_a_budget_of_no_time_and_two_budgets_are_refused(capture, tmp_path, capsys, words):
+    assert ingest.main([str(capture), "--out", str(tmp_path / "run"), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"ia-ingest: {words[0]} is" if len(words) == 2 else "ia-ingest: --steps")
+    assert not (tmp_path / "run").exists()
 
 
 def test_frames_that_are_not_there(refused, capture):

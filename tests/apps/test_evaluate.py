@@ -97,15 +97,15 @@ def psnrs(ended):
 
 
 def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
-    dataset, call_evaluate, tmp_path
+    dataset, call_evaluate, without_baking, tmp_path
 ):
     place, out = dataset / "male-3-casual", tmp_path / "evaluation"
 
-    def call(seconds):
-        words = ("--out", out, "--size", 64, "--json", tmp_path / "t")
-        return call_evaluate(place, *words, "--seconds", seconds)
+    def call(steps):
+        words = ("--out", out, "--size", 64, "--no-player", "--json", tmp_path / "t")
+        return call_evaluate(place, *words, "--steps", steps)
 
-    ended = call(1)
+    ended = call(10)
     assert ended.code == 0, ended.err
     frames = json.loads((out / place.name / "report.json").read_text())["frames"]
     assert (frames["used"] + frames["alike"], frames["held_out"]) == (8, 0)
@@ -113,16 +113,16 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     assert [frame["frame"] for frame in row["frames"]] == [16, 19, 22]
     assert "InstantAvatar (paper)" in ended.out
     assert "29.65" in ended.out
-    again = call(1)
+    again = call(10)
     assert "was learnt before" in again.err
     assert psnrs(again) == psnrs(ended)
-    longer = call(1.5)
-    assert "Going on after 1 seconds" in longer.err
+    longer = call(15)
+    assert "Going on after 10 steps" in longer.err
     assert "was learnt before" not in longer.err
 
 
 def test_a_stopped_lesson_leaves_the_table_of_those_before(
-    dataset, call_evaluate, tmp_path, monkeypatch
+    dataset, call_evaluate, without_baking, tmp_path, monkeypatch
 ):
     learn = ingest.ingest
 
@@ -130,7 +130,9 @@ def test_a_stopped_lesson_leaves_the_table_of_those_before(
         return INTERRUPTED if given.video.name == "male-3-casual" else learn(given, console)
 
     monkeypatch.setattr(ingest, "ingest", stopped_in_the_second)
-    ended = call_evaluate(dataset, "--out", tmp_path / "out", "--seconds", 1, "--size", 64)
+    ended = call_evaluate(
+        dataset, "--out", tmp_path / "out", "--steps", 10, "--size", 64, "--no-player"
+    )
     assert ended.code == INTERRUPTED
     assert "female-3-casual" in ended.out
     assert "male-3-casual" not in ended.out.replace("female-3-casual", "")

@@ -26,7 +26,7 @@ def test_examples_are_one_walk_each():
 
 def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):
     example = load("1_learn_from_python.py")
-    monkeypatch.setattr(example, "SECONDS", 3.0)
+    monkeypatch.setattr(example, "STEPS", 150)
     monkeypatch.setattr(example, "shoot", lambda out, config, overwrite: shutil.copytree(film, out))
     monkeypatch.setattr(learn.Rig, "of", lambda shaped: rig)
     example.main(tmp_path)

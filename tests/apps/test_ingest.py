@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -111,12 +110,15 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
 
 def test_the_clock_counts_training_alone(report):
     training = report["training"]
-    assert 3.0 <= training["wall_seconds"] < 15.0  # start-up and baking are not in it
+    assert training["steps"] == report["recipe"]["steps"]
+    assert training["startup_seconds"] > 0.0
     assert training["rays"] == training["steps"] * report["recipe"]["rays"]
     expected = training["rays"] / training["wall_seconds"]
     assert training["rays_per_second"] == pytest.approx(expected, rel=1e-4)
     assert report["curve"][-1]["wall_seconds"] == training["wall_seconds"]
-    assert report["curve"][0]["wall_seconds"] == pytest.approx(2.0, abs=2.0)
+    marks = [point["wall_seconds"] for point in report["curve"]]
+    assert len(marks) == 2  # after 100 steps, and after the last
+    assert 0.0 < marks[0] < marks[1]
 
 
 def test_the_package_is_the_one_that_was_reported(run, report):
@@ -146,7 +148,7 @@ def test_a_clip_of_the_front_alone_asks_for_a_turn(capture, call_ingest, without
     assert first["parts"]["torso"]["back"] < 0.2
     assert "Turn until your back has been seen." in (out / "report.html").read_text()
     # what another clip shows is added to what this one did
-    call_ingest(capture, "--out", out, "--frames", "8:14", "--resume", seconds=1.0)
+    call_ingest(capture, "--out", out, "--frames", "8:14", "--resume", steps=15)
     second = json.loads((out / "report.json").read_text())["coverage"]
     assert second["parts"]["torso"]["back"] > 0.5
     assert second["parts"]["torso"]["front"] >= first["parts"]["torso"]["front"]
@@ -192,12 +194,11 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
     out = tmp_path / "run"
     assert "no checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
     first = json.loads((out / "report.json").read_text())
-    outcome = call_ingest(capture, *FEW, "--out", out, "--resume", seconds=1.5)
+    outcome = call_ingest(capture, *FEW, "--out", out, "--resume", steps=15)
     second = json.loads((out / "report.json").read_text())
     assert outcome.code == 0
-    before, after = (each["training"]["wall_seconds"] for each in (first, second))
-    assert max(before, 1.45) < after
-    assert second["training"]["steps"] > first["training"]["steps"]
+    assert (first["training"]["steps"], second["training"]["steps"]) == (10, 15)
+    assert second["training"]["wall_seconds"] > first["training"]["wall_seconds"]
     assert second["curve"][: len(first["curve"])] == first["curve"]
     assert second["frames"] == first["frames"]
 
@@ -205,7 +206,7 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
 def test_a_full_disk_keeps_the_checkpoint_before(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(learn, "CHECKPOINT_EVERY_S", 0.3)
+    monkeypatch.setattr(learn, "CHECKPOINT_EVERY_S", 0.0)
     save, written = torch.save, []
 
     def full_after_one(state, file):
@@ -215,13 +216,13 @@ def test_a_full_disk_keeps_the_checkpoint_before(
         written.append(save(state, file))
 
     monkeypatch.setattr(torch, "save", full_after_one)
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", seconds=5.0)
+    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "--resume" in outcome.complaint()
     left = [file.name for file in (tmp_path / "run").rglob("*") if file.is_file()]
     assert left == ["person.npz", "state.pt"]
     trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint", torch.device("cpu"))
-    assert 0.0 < trainer.wall_seconds < 5.0
+    assert trainer.steps == 1
 
 
 def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_found_room(
@@ -255,7 +256,7 @@ def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
 def test_ctrl_c_saves_what_was_learnt(film, tmp_path):
     command = [sys.executable, "-m", "apps.ingest", str(film), "--out", str(tmp_path / "run")]
     with subprocess.Popen(
-        [*command, "--seconds", "120"], stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--steps", "5000"], stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         said = ""
         while " dB" not in said:  # the first mark of the curve
@@ -263,13 +264,11 @@ def test_ctrl_c_saves_what_was_learnt(film, tmp_path):
             assert line, said
             said += line
         os.kill(process.pid, signal.SIGINT)
-        stopped_at = time.perf_counter()
         said += process.stderr.read()
         assert process.wait() == 130
-    assert time.perf_counter() - stopped_at < 60.0
     assert "Traceback" not in said
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert 2.0 <= report["training"]["wall_seconds"] < 60.0
+    assert 100 <= report["training"]["steps"] < 5000
     assert len(report["held_out"]["frames"]) >= 1
     Player.load(tmp_path / "run" / "avatar.iavatar")
     assert (tmp_path / "run" / "checkpoint" / "state.pt").exists()

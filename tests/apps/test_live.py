@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from apps import ingest
-from apps.learning import learn
 from avatar import warm
-from avatar.train import train
 from avatar.warm import warm_up
 from capture import camera_device
 from capture.opening import open_source
@@ -25,7 +23,6 @@ def watch(call_ingest, without_baking, monkeypatch, tmp_path, capsys):
     """Runs ia-ingest on a live source; returns its exit code and its report."""
 
     def watch(*arguments):
-        monkeypatch.setattr(learn, "train", train)  # frames come while it learns
         monkeypatch.setattr(warm, "warm_up", warm_up)  # a live source waits for no compiler
         code = ingest.main([*map(str, arguments), "--out", str(tmp_path / "run")])
         path = tmp_path / "run" / "report.json"

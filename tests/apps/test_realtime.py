@@ -6,16 +6,13 @@ import pytest
 
 from apps import ingest
 from apps.ingest_arguments import IngestArguments
-from apps.learning import learn
-from avatar.train import train
 
 
 @pytest.fixture
-def play(call_ingest, without_baking, monkeypatch, tmp_path):
+def play(call_ingest, without_baking, tmp_path):
     """Runs ia-ingest --realtime; returns its report."""
 
     def play(capture, *arguments):
-        monkeypatch.setattr(learn, "train", train)  # frames come while it learns
         words = [str(capture), "--realtime", "--out", str(tmp_path / "run"), *arguments]
         assert ingest.main(words) == 0
         return json.loads((tmp_path / "run" / "report.json").read_text())

@@ -42,6 +42,13 @@ def taught(rig, ready, config):
     return trainer, held, list(train(trainer, Inbox(ready), held))
 
 
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock that goes on by 5 ms each time it is read: time that no other program can take."""
+    ticks = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.005 * next(ticks))
+
+
 def silhouettes(learnt, held):
     """Where the avatar is, and where the person was."""
     observation = held.observation
@@ -140,7 +147,7 @@ def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
     assert per_ray * QUICK.rays == pytest.approx(finished.samples)
 
 
-def test_it_stops_when_the_time_is_up(rig, ready):
+def test_it_stops_when_the_time_is_up(rig, ready, ticking):
     _, _, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.4))
     steps = [event for event in events if isinstance(event, Stepped)]
     late = [step for step in steps if step.wall_seconds >= 0.4]
@@ -150,29 +157,26 @@ def test_it_stops_when_the_time_is_up(rig, ready):
 
 
 def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
-    monkeypatch.setattr(train_module, "MARKS_S", (0.05, 0.1, 60.0))
-    monkeypatch.setattr(train_module, "SCORING_SHARE", 1.0)
-    _, held, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.5))
+    monkeypatch.setattr(train_module, "MARKS_S", (1 / 50, 10 / 50, 60.0))  # after 1 and 10 steps
+    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=20))
     marks = [event for event in events if isinstance(event, Evaluated)]
-    assert 1 <= len(marks) <= 2
-    assert marks[0].wall_seconds >= 0.05
-    for mark in marks:
-        indices = [frame.observation.frame.index for frame in held]
-        assert [score.frame for score in mark.scores] == indices[: len(mark.scores)]
-        assert np.isfinite([score.psnr for score in mark.scores]).all()
-    assert len(marks[-1].scores) == 2
+    assert [mark.frames_seen for mark in marks] == [1, 5]
+    assert [[score.frame for score in mark.scores] for mark in marks] == [[], [2, 5]]
+    assert np.isfinite([score.psnr for score in marks[1].scores]).all()
 
 
-def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch):
+def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch, ticking):
     monkeypatch.setattr(train_module, "MARKS_S", (0.05, 60.0))
     monkeypatch.setattr(train_module, "SCORING_SHARE", 0.0)
-    _, held, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.5))
-    (mark,) = [event for event in events if isinstance(event, Evaluated)]
+    trainer, held = Trainer(rig, dataclasses.replace(QUICK, seconds=0.5), CPU), []
+    inbox = Inbox(ready)
+    inbox._thread.join()  # all frames are there before the first mark
+    (mark,) = [event for event in train(trainer, inbox, held) if isinstance(event, Evaluated)]
     assert len(held) == 2
     assert len(mark.scores) == 1
 
 
-def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip):
+def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ticking):
     frames = [prepare(observation, rig) for observation in clip.observations[:3]]
     gate = threading.Event()
 
@@ -182,14 +186,14 @@ def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip):
         yield frames[2]
 
     config = dataclasses.replace(QUICK, seconds=1.2)
-    trainer, rates, began = Trainer(rig, config, CPU), {2: [], 3: []}, time.monotonic()
+    trainer, rates = Trainer(rig, config, CPU), {1: [], 2: [], 3: []}
     for event in train(trainer, Inbox(arriving()), []):
         if isinstance(event, Stepped):
             group = trainer.optimizer.param_groups[0]
-            rates.setdefault(event.frames_seen, []).append(group["lr"])
-        if time.monotonic() - began > 0.5:
-            gate.set()
-    assert set(rates[2]) == {config.learning_rate}
+            rates[event.frames_seen].append(group["lr"])
+            if event.step == 10:
+                gate.set()
+    assert set(rates[1] + rates[2]) == {config.learning_rate}
     falling = np.array(rates[3][1:])
     assert (np.diff(falling) <= 0.0).all()
     assert falling[0] > 0.9 * config.learning_rate
@@ -244,7 +248,7 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
     gate = threading.Event()
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds), CPU)
     inbox = Inbox(arriving_at(rig, clip, gate=gate), paced=paced)
-    rates = {1: [], 3: []}
+    rates = {1: [], 2: [], 3: []}
     for event in train(trainer, inbox, []):
         if isinstance(event, Stepped):
             rates[event.frames_seen].append(trainer.optimizer.param_groups[0]["lr"])
@@ -253,24 +257,24 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
     return rates, trainer
 
 
-def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip):
+def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip, ticking):
     """Read as fast as possible, reading would come first after half of the time."""
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
-    assert set(rates[1]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
+    assert set(rates[1] + rates[2]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
     assert len(rates[3]) == train_module.FAREWELL_STEPS
     assert trainer.wall_seconds > 0.8  # the last frame came after the time that was given
 
 
-def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip):
+def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=1.5, opens_after_s=0.0)
-    assert set(rates[1]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
+    assert set(rates[1] + rates[2]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
     falling = np.array(rates[3][1:])
     assert (np.diff(falling) <= 0.0).all()
     assert falling[-1] < 0.1 * QUICK.learning_rate
     assert trainer.wall_seconds >= 1.5
 
 
-def test_a_live_source_is_left_when_the_time_is_up(rig, clip):
+def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
     frames = [prepare(observation, rig) for observation in clip.observations[:2]]
     closed = threading.Event()
 
@@ -284,7 +288,7 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip):
     closed.set()
     inbox.close()
     assert isinstance(events[-1], Finished)
-    assert 0.4 <= trainer.wall_seconds < 5.0
+    assert trainer.wall_seconds >= 0.4
     assert trainer.steps >= train_module.FAREWELL_STEPS
 
 
