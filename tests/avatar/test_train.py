@@ -151,16 +151,16 @@ def test_it_stops_when_the_time_is_up(rig, ready, ticking):
     _, _, events = taught(rig, ready, dataclasses.replace(QUICK, seconds=0.4))
     steps = [event for event in events if isinstance(event, Stepped)]
     late = [step for step in steps if step.wall_seconds >= 0.4]
-    assert len(late) == 1 or len(steps) == train_module.FAREWELL_STEPS
-    assert steps[-1] is late[-1]
-    assert steps[-1].wall_seconds <= events[-1].wall_seconds
+    assert len(late) <= 1
+    assert len(steps) >= train_module.FAREWELL_STEPS
+    assert events[-1].wall_seconds >= 0.4
 
 
 def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
     monkeypatch.setattr(train_module, "MARKS_S", (1 / 50, 10 / 50, 60.0))  # after 1 and 10 steps
     _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=20))
     marks = [event for event in events if isinstance(event, Evaluated)]
-    assert [mark.frames_seen for mark in marks] == [1, 5]
+    assert [mark.frames_seen for mark in marks] == [2, 5]
     assert [[score.frame for score in mark.scores] for mark in marks] == [[], [2, 5]]
     assert np.isfinite([score.psnr for score in marks[1].scores]).all()
 
