@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -91,22 +92,21 @@ def _learnt_and_delivered(
         viewer = _viewer(given, recording, run, console)
     run.begin(resume=given.resume)
     try:
-        with asked_to_stop(console) as stop:
+        kept = nullcontext() if attempt is None else attempt.kept(recording, run, console)
+        with kept, asked_to_stop(console) as stop:
             lesson = Lesson(
                 trainer, recording, run, console, stop, notes,
                 watchers=() if viewer is None else (viewer,),
             )  # fmt: skip
             learnt, taken = _taught(lesson, recall, recording, run, console)
             if attempt is not None:
-                recording = attempt.after(recording, console, stop)
+                recording = attempt.after(recording, run, console, stop)
             startup = (learnt.meter.first_at or started) - started
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
             delivered = deliver(learnt, taken, recording, run, note, console)
             if given.json is not None:
                 write_text(given.json, delivered.report.to_json())
             code = _conclude(delivered, run, console, interrupted=stop.is_set())
-            if attempt is not None:
-                attempt.write(recording, run, console)
         if viewer is not None and code == DONE:
             console.say(f"The page stays at {viewer.page.address}. Ctrl-C ends it.")
             viewer.stay(lesson)
@@ -259,12 +259,12 @@ def _check_learnt(learnt: "Learnt", recording: Recording) -> None:
     if learnt.trained:
         return
     if learnt.interrupted:
-        raise Stop("stopped before anything was learnt; nothing was written.", INTERRUPTED)
+        raise Stop("stopped before anything was learnt; no avatar was written.", INTERRUPTED)
     reasons = Counter(drop.reason for drop in learnt.meter.dropped)
     told = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))
     raise Stop(
         f"no frame of {recording.source.path} could be used ({told or 'it has none'}); at least "
-        "two usable frames were expected. Nothing was written.",
+        "two usable frames were expected. No avatar was written.",
         BAD_INPUT,
     )
 

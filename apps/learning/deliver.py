@@ -1,6 +1,8 @@
 """What a run leaves on disk beside its package: report.json and report.html."""
 
+import shlex
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from apps.learning.learnt import Learnt
@@ -107,9 +109,16 @@ def deliver(
             novel=None if package is None else novel(Player.load(run.package)),
             warnings=[*console.warnings, *([] if refused is None else [refused])],
             failure=failure,
+            present=[path.name for path in (run.cameras, run.poses) if path.exists()],
+            play=None if package is None else play_command(run.package, recording.paths.poses),
         )
     write_text(run.page, page)
     return Delivered(report=report, refused=refused, failure=failure)
+
+
+def play_command(package: Path, poses: Path) -> str:
+    """What plays a package in the poses that it was learnt from, to be pasted into a shell."""
+    return shlex.join(["ia-play", str(package), "--poses", str(poses)])
 
 
 def pairs(learnt: Learnt) -> list[Pair]:

@@ -95,15 +95,18 @@ class RunFolder:
             shutil.rmtree(self.checkpoint)
 
     def what_is_kept(self) -> str:
-        """What a user can do after a run has failed half-way."""
+        """What is there after a run has failed half-way, and what a user can do."""
+        files = (self.package, self.report, self.page, self.cameras, self.poses)
+        names = [path.name for path in files if path.exists()]
+        there = f"{self.path} holds {', '.join(names)}." if names else ""
         if not self.has_checkpoint() and self.package.exists():
-            return f"Only {self.package} was written: it can be played, but not learnt on."
+            return f"{there} Without a checkpoint the avatar can be played, but not learnt on."
         if not self.has_checkpoint():
-            return f"Nothing was written to {self.path}."
+            return there or f"Nothing was written to {self.path}."
         return (
-            f"The newest checkpoint is kept in {self.checkpoint}: run the same command with "
-            "--resume, in place of any --overwrite, to go on from it."
-        )
+            f"{there} The newest checkpoint is kept in {self.checkpoint}: run the same command "
+            "with --resume, in place of any --overwrite, to go on from it."
+        ).lstrip()
 
     def tidy(self) -> None:
         """Removes folders that nothing was written to."""

@@ -1,6 +1,6 @@
 """report.html: one page without a second file, that shows what report.json says."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from importlib.resources import files
@@ -38,6 +38,8 @@ def report_page(
     novel: str | None = None,
     warnings: Sequence[str] = (),
     failure: str | None = None,
+    present: Collection[str] = (),
+    play: str | None = None,
 ) -> str:
     """The page.
 
@@ -49,7 +51,10 @@ def report_page(
         novel: A moving picture of poses that the video does not show, as an address.
         warnings: What the user was told.
         failure: Why the result is no avatar of the person, if it is none.
+        present: Names of what lies beside the page; nothing else is named as being there.
+        play: The command that plays the package, if there is one.
     """
+    playing = "" if play is None else f" Play the avatar: <code>{escape(play)}</code>"
     style = (files("apps") / "reporting" / "page.css").read_text(encoding="utf-8")
     body = "\n".join(
         [
@@ -59,13 +64,13 @@ def report_page(
             _tiles(report),
             _section("How it learnt", _curve(report)),
             _section("What the camera has seen", _coverage(report, body_map)),
-            _section("Where the camera was", _cameras(report)),
+            _section("Where the camera was", _cameras(report, present)),
             _section("Frames it was never trained on", _pairs(pairs)),
             _section("Poses that the video does not show", _novel(novel)),
             _section("Worth knowing", _warnings(report, warnings)),
             _section("All figures", _figures(report)),
             "<footer>Written by ia-ingest of instant-avatar-stream. The same figures for machines: "
-            "report.json. Play the avatar: <code>ia-play avatar.iavatar --poses P</code></footer>",
+            f"report.json.{playing}</footer>",
         ]
     )
     return (
@@ -128,7 +133,7 @@ def _curve(report: Report) -> str:
     )
 
 
-def _cameras(report: Report) -> str:
+def _cameras(report: Report, present: Collection[str]) -> str:
     """A sentence, if cameras were to be solved."""
     found = report.cameras
     if found is None:
@@ -144,8 +149,10 @@ def _cameras(report: Report) -> str:
             f"Solved from {frames['key']} key frames; {frames['placed']} were placed between "
             f"them, {frames['interpolated']} interpolated, {frames['missing']} are missing. Focal "
             f"length {found['focal_px']:.0f} px; the size of the room is told by "
-            f"{' and '.join(scale['cues'])}. cameras.npz and poses.npz hold the walk."
+            f"{' and '.join(scale['cues'])}."
         )
+        if {"cameras.npz", "poses.npz"} <= set(present):
+            told += " cameras.npz and poses.npz hold the cameras and the poses in their world."
     return f'<p class="legend">{escape(told)}</p>'
 
 

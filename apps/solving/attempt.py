@@ -7,7 +7,7 @@ lens must be found first; without masks they are estimated, which must know that
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import final
 
@@ -36,6 +36,7 @@ class Attempt:
         """Takes over a process that has begun."""
         self._solving, self.beside = solving, beside
         self.refused: str | None = None
+        self._asked = False
 
     def before(self, recording: Recording, console: Console) -> Recording:
         """What the run learns from: the recording in its solved world, if it had to be waited for.
@@ -56,13 +57,19 @@ class Attempt:
         _say_new(recording, found, console)
         return found
 
-    def after(self, recording: Recording, console: Console, stop: threading.Event) -> Recording:
-        """What the report is about, once the run has learnt beside the solving.
+    def after(
+        self, recording: Recording, run: RunFolder, console: Console, stop: threading.Event
+    ) -> Recording:
+        """What the report is about, once the run has learnt beside the solving; it is written.
 
         Cameras that are refused now cost nobody the avatar.
+
+        Raises:
+            OSError: If the cameras cannot be written.
         """
         if not self.beside:
             return recording
+        self._asked = True
         try:
             solved = self._solving.wait(console, stop)
             if solved is None:
@@ -72,6 +79,7 @@ class Attempt:
             self.refused = str(refusal)
             return replace(recording, solved={"verdict": "refused", "reason": str(refusal)})
         _say_new(recording, found, console)
+        self._write(found, run, console)
         stated, true = recording.cameras[0].focal_px[0], found.cameras[0].focal_px[0]
         if found.solved is not None and abs(true / stated - 1.0) > MOST_OFF:
             console.warn(
@@ -81,12 +89,32 @@ class Attempt:
             )
         return found
 
-    def write(self, recording: Recording, run: RunFolder, console: Console) -> None:
-        """Writes what was solved beside the avatar.
+    @contextmanager
+    def kept(self, recording: Recording, run: RunFolder, console: Console) -> Iterator[None]:
+        """Writes the cameras that are solved already, and, if the block fails, those since then.
+
+        Solving takes minutes: whatever becomes of the avatar, its result is not lost.
+
+        Args:
+            recording: As `before` gave it.
+            run: Where they go; it has begun.
+            console: Where they are named.
 
         Raises:
-            OSError: If it cannot be written.
+            OSError: If cameras that were solved before the block cannot be written.
         """
+        self._write(recording, run, console)
+        try:
+            yield
+        except BaseException:
+            if self.beside and not self._asked:
+                with suppress(BadInput, OSError):  # what ended the block is what is said
+                    at_once = threading.Event()
+                    at_once.set()
+                    self.after(recording, run, console, at_once)
+            raise
+
+    def _write(self, recording: Recording, run: RunFolder, console: Console) -> None:
         if recording.solved is None or recording.solved["verdict"] != "solved":
             return
         write_solved(recording, run)

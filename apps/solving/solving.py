@@ -74,7 +74,8 @@ class Solving:
 
         Args:
             console: Where the bar is.
-            stop: Set by who does not want to wait any longer; stages that are finished stay.
+            stop: Set by who does not want to wait any longer; a solution that is there counts all
+                the same, and stages that are finished stay.
 
         Raises:
             BadInput: If the cameras cannot be solved with certainty.
@@ -97,7 +98,7 @@ class Solving:
     def _next_line(self, stop: threading.Event | None) -> str | None:
         """What the process says; None at its end, and nothing if it is to be stopped."""
         while True:
-            if stop is not None and stop.is_set():
+            if stop is not None and stop.is_set() and self.running:
                 return ""
             try:
                 return self._lines.get(timeout=LOOK_EVERY_S)

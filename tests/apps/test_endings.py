@@ -255,6 +255,9 @@ def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):
     run.begin(resume=True)
     assert run.has_checkpoint()
     assert "--resume" in run.what_is_kept()
+    assert "cameras.npz" not in run.what_is_kept()
+    run.cameras.write_bytes(b"solved")
+    assert f"{run.path} holds cameras.npz." in run.what_is_kept()
     run.begin(resume=False)
     assert [file.name for file in run.path.iterdir()] == ["notes.txt"]
 

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from apps.learning.deliver import play_command
 from apps.reporting.curve import CurvePoint, largest_fall
 from apps.reporting.curve_svg import curve_svg
 from apps.reporting.failure import failure_of
@@ -234,6 +235,25 @@ def test_the_page_says_where_the_camera_was(found, said):
     assert Tags(page).addresses == []
     assert ("Where the camera was" in page) == (said is not None)
     assert said is None or said in page
+
+
+SOLVED = {
+    "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground"]},
+    "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("there", [(), ("cameras.npz",), ("cameras.npz", "poses.npz")])
+def test_the_page_names_no_file_that_is_not_there(there):
+    solved = replace(report(), cameras=SOLVED)
+    page = report_page(solved, name="clip", present=there)
+    assert "60 key frames" in page
+    assert ("cameras.npz" in page) == ("poses.npz" in page) == (len(there) == 2)
+    assert "avatar.iavatar" not in page
+    assert "ia-play" not in page
+    command = play_command(Path("a run/avatar.iavatar"), Path("clip/poses.npz"))
+    page = report_page(solved, name="clip", play=command)
+    assert "ia-play &#x27;a run/avatar.iavatar&#x27; --poses clip/poses.npz" in page
 
 
 def test_the_curve_goes_up_when_the_score_does():

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+import subprocess
 import threading
 import time
 from dataclasses import replace
@@ -12,16 +14,20 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
+from apps.learning.run_folder import RunFolder
 from apps.recording.opening import open_recording
 from apps.recording.wanted import RecordingPaths
 from apps.solving import solving as solving_module
+from apps.solving.attempt import Attempt
 from apps.solving.job import SolveJob
 from apps.solving.joining import joined
 from apps.solving.solving import Solving
 from apps.solving.worker import person_finder
 from apps.studio.writer import ShootConfig, shoot
 from apps.terminal.console import Console
+from apps.terminal.exit_codes import Stop
 from capture.errors import BadInput
+from export.errors import ExportRefused
 from preprocess.camera_file import read_cameras, write_cameras
 from preprocess.fit.stature import height_of
 from preprocess.pose_file import read_motion
@@ -235,6 +241,84 @@ def test_a_run_learns_beside_the_solving_and_tells_of_both(
     )  # fmt: skip
     heights = [again.shaped.with_pose(motion[row]).vertices()[:, 1].min() for row in range(FRAMES)]
     assert np.abs(heights).max() < 0.06  # whoever stands on the floor stands on y = 0
+
+
+def test_an_avatar_that_is_refused_costs_nobody_the_cameras(
+    walkaround, solved_run, call_ingest, tmp_path, monkeypatch
+):
+    def refuse(*_, **__):
+        raise ExportRefused("The player would not draw it.")
+
+    monkeypatch.setattr("apps.learning.snapshot.export_avatar", refuse)
+    out = tmp_path / "run"
+    shutil.copytree(solved_run / "cameras", out / "cameras")  # solved before: the same job
+    outcome = call_ingest(
+        walkaround / "video.mp4", "--poses", walkaround / "poses.npz", "--cameras", "solve",
+        "--out", out, "--threads", 1,
+    )  # fmt: skip
+    assert outcome.code == 1
+    assert "cameras.npz" in outcome.err
+    assert len(read_cameras(out / "cameras.npz", (256, 144)).cameras) == FRAMES
+    assert len(read_motion(out / "poses.npz")) == FRAMES
+    page = (out / "report.html").read_text()
+    assert "cameras.npz and poses.npz hold" in page
+    assert "ia-play" not in page
+
+
+@pytest.fixture
+def attempt(monkeypatch):
+    """An attempt whose process has solved this by now, or nothing."""
+
+    def make(solved, *, beside):
+        def wait(self, console, stop=None):
+            assert stop is not None
+            assert stop.is_set()  # nobody waits any longer
+            return solved
+
+        monkeypatch.setattr(Solving, "wait", wait)
+        return Attempt(Solving.__new__(Solving), beside=beside)
+
+    return make
+
+
+def fails_in(block, error):
+    with block:
+        raise error
+
+
+@pytest.mark.parametrize("end", [Stop("a reason", 1), KeyboardInterrupt(), OSError(28, "full")])
+@pytest.mark.parametrize("finished", [True, False])
+def test_cameras_that_were_solved_by_then_outlive_any_end(
+    walkaround, solved_run, attempt, tmp_path, end, finished
+):
+    recording, run = open_recording(job_of(walkaround).paths), RunFolder(path=tmp_path / "run")
+    begun = attempt(solved_of(solved_run) if finished else None, beside=True)
+    with pytest.raises(type(end)):
+        fails_in(begun.kept(recording, run, quiet()), end)
+    assert run.cameras.exists() == run.poses.exists() == finished
+
+
+def test_cameras_that_are_solved_first_are_written_before_anything_is_learnt(
+    walkaround, solved_run, attempt, tmp_path
+):
+    found = joined(open_recording(job_of(walkaround).paths), solved_of(solved_run))
+    run = RunFolder(path=tmp_path / "run")
+    with attempt(None, beside=False).kept(found, run, quiet()):
+        assert len(read_motion(run.poses)) == len(read_cameras(run.cameras, (256, 144)).cameras)
+
+
+def test_what_is_solved_when_the_run_is_stopped_counts(walkaround, solved_run, tmp_path):
+    """Its process has ended; what it said on its way was not read yet."""
+    shutil.copytree(solved_run / "cameras", tmp_path / "cameras")
+    stop = threading.Event()
+    stop.set()
+    with Solving(job_of(walkaround), tmp_path) as solving:
+        ended = subprocess.Popen(["true"])
+        ended.wait()
+        solving._process = ended
+        solving._lines.put(json.dumps({"stage": "frames between", "share": 1.0}))
+        solving._lines.put(None)
+        assert solving.wait(quiet(), stop) is not None
 
 
 def test_cameras_that_are_refused_cost_nobody_the_avatar(
