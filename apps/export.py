@@ -125,9 +125,9 @@ def _package(folder: Path, out: Path, console: Console, *, for_player: bool = Tr
         from avatar import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
-    with console.waiting("baking the avatar and checking its player") as tell:
+    with console.bar("writing the package", 1.0) as bar:
         shots = views(trainer.avatar.rig)
-        taken = snapshot(trainer, out, shots, mark=None, fine_tuned=for_player, tell=tell)
+        taken = snapshot(trainer, out, shots, mark=None, fine_tuned=for_player, progress=bar.share)
     if taken.exported is None:
         raise Stop(taken.refused or "nothing was written.", NO_AVATAR)
     for warning in taken.exported.warnings:

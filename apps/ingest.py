@@ -89,6 +89,7 @@ def _learnt_and_delivered(
     with nothing_to_save(console, PROGRAM):
         trainer, recall, notes = _trainer(given, recording, run, console)
         _warm_up(trainer, console)
+        _announce(given, recording, trainer, console)
         viewer = _viewer(given, recording, run, console)
     run.begin(resume=given.resume)
     try:
@@ -221,6 +222,29 @@ def _warm_up(trainer: "Trainer", console: Console) -> None:
         compiled.warm_up()
 
 
+def _announce(
+    given: IngestArguments, recording: Recording, trainer: "Trainer", console: Console
+) -> None:
+    """Says how long it will take: learning, and what comes after it."""
+    from apps.learning.remaining import after_learning_s, held_out_of
+    from apps.terminal.console import duration
+    from avatar.hold import MOST_HELD
+
+    source, config, longest = recording.source, trainer.config, max(recording.source.size_px)
+    held = held_out_of(source.frame_count, given.hold_out, MOST_HELD)
+    rest = after_learning_s(
+        held, min(longest, recording.size_px or longest), fitted=config.refine_poses
+    )
+    seconds = max(0.0, config.seconds - trainer.wall_seconds)
+    learning = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
+    if config.steps:
+        learning = f"{config.steps - trainer.steps} steps"
+    console.say(
+        f"{learning} of learning, then about {duration(rest)} for the package and the scores, if "
+        "nothing else needs this machine."
+    )
+
+
 def _viewer(
     given: IngestArguments, recording: Recording, run: RunFolder, console: Console
 ) -> "Viewer | None":
@@ -243,14 +267,15 @@ def _taught(
     learnt, hasty = lesson.learn(recall=recall), recording.source.paced
     _check_learnt(learnt, recording)
     views, trainer = views_of(learnt.held, recording), learnt.trainer
-    with console.waiting("baking the avatar and checking its player") as tell, lesson.saving():
+    with console.bar("writing the package", 1.0) as bar, lesson.saving():
         mark = learnt.curve[-1] if learnt.curve else None
-        taken = snapshot(trainer, run.package, views, mark=mark, hasty=hasty, tell=tell)
+        taken = snapshot(trainer, run.package, views, mark=mark, hasty=hasty, progress=bar.share)
     learnt = lesson.scored(learnt)
     if hasty:
-        with console.waiting("baking the avatar more finely") as tell:
+        with console.bar("writing the final package, with finer detail", 1.0) as bar:
             mark = learnt.curve[-1] if learnt.curve else None
-            taken = finer(taken, snapshot(trainer, run.package, views, mark=mark, tell=tell))
+            last = snapshot(trainer, run.package, views, mark=mark, progress=bar.share)
+            taken = finer(taken, last)
     return learnt, taken
 
 

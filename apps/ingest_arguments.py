@@ -27,6 +27,9 @@ LEARNABLE_PX = 540
 
 A_MINUTE = 60.0
 
+LEAST_SECONDS = 0.1
+"""A few steps; every frame is trained on once in any case."""
+
 VIEW_PORT = 8008
 """Of the page that --view opens."""
 
@@ -130,8 +133,11 @@ class IngestArguments:
         Raises:
             BadInput: Naming the option.
         """
-        if self.seconds is not None and not 0.0 < self.seconds < float("inf"):
-            raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+        if self.seconds is not None and not LEAST_SECONDS <= self.seconds < float("inf"):
+            raise BadInput(
+                f"--seconds is {self.seconds}; at least {LEAST_SECONDS:g} was expected "
+                f"({A_MINUTE:.0f} make a good avatar)."
+            )
         if self.steps is not None and self.steps < 1:
             raise BadInput(f"--steps is {self.steps}; at least 1 was expected.")
         if self.steps is not None and self.seconds is not None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -23,12 +23,20 @@ CORRECTIONS = 32
 RAYS_A_CORRECTION = 512
 
 
-def fitted_scores(trainer: Trainer, held: list[HeldOut]) -> tuple[Score, ...]:
+FITTING_SHARE = 0.8
+"""Of the time that fitting and scoring take."""
+
+
+def fitted_scores(
+    trainer: Trainer, held: list[HeldOut], *, progress: Callable[[float], None] = lambda _: None
+) -> tuple[Score, ...]:
     """Scores of held-out frames after their poses have been fitted to them (see `fitted`)."""
-    return tuple(found for _, found in fitted(trainer, held))
+    return tuple(found for _, found in fitted(trainer, held, progress=progress))
 
 
-def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Score]]:
+def fitted(
+    trainer: Trainer, held: list[HeldOut], *, progress: Callable[[float], None] = lambda _: None
+) -> Iterator[tuple[HeldOut, Score]]:
     """Held-out frames in poses that have been fitted to them, each with its score.
 
     The avatar stays as it is: nothing of these frames is learnt but where the body was, from where
@@ -39,6 +47,7 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Sco
     Args:
         trainer: Whose avatar; its field's gradients are overwritten.
         held: Frames that were never trained on.
+        progress: Gets the share that is done, from 0 to 1.
     """
     if not held:
         return
@@ -71,9 +80,11 @@ def fitted(trainer: Trainer, held: list[HeldOut]) -> Iterator[tuple[HeldOut, Sco
         field.table_grad.zero_()
         for _ in range(2):
             let_follow(avatar.rig, trainer.backend, replay, poses, rate=cosine(step / steps))
+        progress(FITTING_SHARE * (step + 1) / steps)
     for slot, frame in enumerate(held):
         pose = poses.pose(slot)
         cells = WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
         moved = HeldOut(observation=replace(frame.observation, pose=pose), cells=cells)
         either = [(one, score(avatar, one)) for one in (frame, moved)]
+        progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(held))
         yield max(either, key=lambda scored: scored[1].psnr)

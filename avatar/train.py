@@ -95,12 +95,14 @@ def train(trainer: Trainer, inbox: Inbox[Ready], held: list[HeldOut]) -> Iterato
 
 
 def _stepped(trainer: Trainer, stream: "_Stream", now: float) -> Stepped:
-    falling = cosine(stream.progress(now))
+    falling, wall, cpu = cosine(stream.progress(now)), time.perf_counter(), time.process_time()
     result = trainer.step(
         rate=min(falling, stream.highest_rate),
         pose_rate=falling,
         hard_share=min(1.0, 4.0 * now / trainer.config.seconds),
     )
+    trainer.stepping_wall += time.perf_counter() - wall
+    trainer.stepping_cpu += time.process_time() - cpu
     stream.clock.read()
     return Stepped(
         step=trainer.steps,
@@ -115,9 +117,9 @@ def _farewell(trainer: Trainer, *, paced: bool) -> Iterator[Warned | Finished]:
     config = trainer.config
     if trainer.wall_seconds > 1.1 * config.seconds and not (config.steps or paced):
         yield Warned(
-            message=f"Reading the video took longer than the {config.seconds:.0f} s that were "
+            message=f"Reading the video took longer than the {config.seconds:g} s that were "
             f"given: training ended after {trainer.wall_seconds:.0f} s, when every frame had been "
-            "learnt from. Give more --seconds, or fewer --frames"
+            "learnt from once. Give more --seconds, or fewer --frames."
         )
     yield Finished(
         wall_seconds=trainer.wall_seconds,

@@ -51,6 +51,8 @@ class Trainer:
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
         frames_seen: Frames taken in so far, whether or not they are still kept.
+        stepping_wall, stepping_cpu: Seconds inside steps of this process, by the wall clock and of
+            CPU time.
         held_up_wall, held_up_cpu: Seconds for which somebody held training up (`held_up`).
     """
 
@@ -74,6 +76,7 @@ class Trainer:
         self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
+        self.stepping_wall = self.stepping_cpu = 0.0
         self.held_up_wall = self.held_up_cpu = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
         rate = config.learning_rate

@@ -45,6 +45,8 @@ PROVEN = {"hq": 2, "lite": 1}
 """Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
 the arithmetic of this machine's onnxruntime, and further poses would prove it again."""
 MOST_GOLDEN = 4
+BAKED_SHARE, TUNED_SHARE = 0.25, 0.55
+"""Of an export's time, baking comes first and fine-tuning follows; the rest are the checks."""
 UNTUNED = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -100,8 +102,8 @@ def export_avatar(
         hasty: Whether it is wanted at once: coarser, with one quality alone and not fine-tuned.
         fine_tuned: Whether bricks are fine-tuned against the renderer's pictures, some ten
             seconds; a hasty package's never are.
-        progress: Told how much of the fine-tuning is done, from 0 to 1. Ctrl-C meanwhile ends that
-            alone.
+        progress: Gets the share of the export that is done, from 0 to 1, while bricks are
+            fine-tuned. Ctrl-C meanwhile ends that alone.
 
     Raises:
         ExportRefused: If there is nothing to draw, or this machine's onnxruntime does not compute
@@ -160,7 +162,10 @@ def export_field(
             better = config.finer()
             return tables_of(read(field_at, rig, occupied=occupied, config=better), rig, better)
 
-        better = _tuned(baked.result(), finer, rig, renderer, views, config, beside, progress)
+        better = _tuned(
+            baked.result(), finer, rig, renderer, views, config, beside,
+            lambda share: progress(BAKED_SHARE + TUNED_SHARE * share),
+        )  # fmt: skip
         tables = better.tables
         compressed = beside.submit(draft.add_tables, tables)
         rules = {tier: better.rules if tier == "hq" else TIERS[tier] for tier in config.tiers}

@@ -222,6 +222,7 @@ def _training_note(learnt: Learnt, note: RunNote) -> TrainingNote:
     return TrainingNote(
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
+        cpu_waited_seconds=learnt.cpu.waited_s,
         startup_seconds=note.startup_seconds,
         steps=trainer.steps,
         rays=trainer.rays,

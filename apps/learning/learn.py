@@ -12,13 +12,15 @@ import torch
 
 from apps.learning.extension import Extension
 from apps.learning.learnt import Learnt
+from apps.learning.remaining import after_learning_s, how_far
 from apps.learning.run_folder import RunFolder
 from apps.learning.watcher import Watcher, shown
 from apps.recording.recording import Recording
+from apps.reporting.cpu_wait import CpuTime, CpuWait
 from apps.reporting.curve import CurvePoint
 from apps.reporting.meter import Meter
 from apps.reporting.report import decibels, mean, percent
-from apps.terminal.console import Bar, Console
+from apps.terminal.console import Bar, Console, duration
 from apps.terminal.whole import whole_file
 from avatar import checkpoint
 from avatar.advice import advice
@@ -132,7 +134,7 @@ class Lesson:
         try:
             added = self._recall(inbox, recall) - self.trainer.frames_seen
             self._rush(False)
-            self._saved_at = time.perf_counter()
+            self._saved_at, waited = time.perf_counter(), CpuWait(self.trainer)
             with self._console.bar("learning", self.trainer.config.seconds) as bar:
                 for event in train(self.trainer, inbox, self.held):
                     self._listen(event, bar)
@@ -144,14 +146,16 @@ class Lesson:
         finally:
             source.close()
             inbox.close()
-        self.meter.inbox_dropped = inbox.dropped
+        self.meter.inbox_dropped, cpu = inbox.dropped, waited.read()
         interrupted = self._stop.is_set()
-        for warning in [*source.warnings, *self._how_late(), *self._recording.told_at_the_end()]:
+        late = [*self._how_late(), *filter(None, [cpu.warning()])]
+        for warning in [*source.warnings, *late, *self._recording.told_at_the_end()]:
             self._console.warn(warning)
         self._console.count_the_rest()
         if len(self.trainer.replay):
             seen = percent(self.coverage.seen)
             self._console.say(f"{seen} of the person was seen. {advice(self.coverage)}")
+            self._console.say(f"The package and the scores take {self._after(cpu)} more.")
         return Learnt(
             trainer=self.trainer,
             held=self.held,
@@ -160,6 +164,7 @@ class Lesson:
             coverage=self.coverage,
             added=added + self.trainer.frames_seen,
             interrupted=interrupted,
+            cpu=cpu,
         )
 
     @contextmanager
@@ -224,36 +229,53 @@ class Lesson:
         match event:
             case Arrived(index=index, held_out=held_out):
                 self.meter.arrived(index, held_out=held_out)
+                bar.move(self.trainer.scheduled_seconds, self._progress())
             case Stepped():
                 self.meter.depth.add(float(self._inbox.waiting))
-                bar.move(self.trainer.scheduled_seconds, self._progress(event))
+                bar.move(self.trainer.scheduled_seconds, self._progress())
                 if time.perf_counter() - self._saved_at > CHECKPOINT_EVERY_S:
                     self._save()
             case Evaluated():
                 point = self._mark(event.scores, event.wall_seconds, event.cpu_seconds)
                 if point.psnr is not None:
-                    so_far = decibels(point.psnr, point.verdict)
+                    so_far = decibels(point.psnr, point.verdict, learning=True)
                     self._console.say(f"{event.wall_seconds:6.1f} s   {so_far}")
             case Warned(message=message):
                 self._console.warn(message)
 
-    def _progress(self, event: Stepped) -> str:
-        config = self.trainer.config
-        last = self.curve[-1] if self.curve else None
-        rays = self.trainer.rays / max(event.wall_seconds, 1e-6)
-        parts = [
-            f"{event.wall_seconds:.0f}" + ("" if config.steps else f"/{config.seconds:.0f}") + " s",
-            f"{event.frames_seen} frames",
-            f"step {event.step}" + (f"/{config.steps}" if config.steps else ""),
-            f"{rays / 1000.0:.0f}k rays/s",
-            f"{event.samples_per_ray:.1f} samples/ray",
-            f"{self._inbox.waiting} waiting",
+    def _after(self, cpu: CpuTime) -> str:
+        """How long the run takes from now on, about."""
+        config, size = self.trainer.config, self.meter.size_px or (0, 0)
+        rest = after_learning_s(
+            len(self.held), max(size), fitted=config.refine_poses, slowed=1.0 / max(cpu.share, 0.05)
+        )
+        return f"about {duration(rest)}"
+
+    def _how_far(self) -> str:
+        trainer, total = self.trainer, self._recording.source.frame_count
+        return how_far(
+            wall_s=trainer.wall_seconds,
+            given_s=trainer.config.seconds,
+            step=trainer.steps,
+            steps=trainer.config.steps,
+            reading=None if self._inbox.finished else (self.meter.read, total),
+        )
+
+    def _progress(self) -> str:
+        trainer, last = self.trainer, self.curve[-1] if self.curve else None
+        rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
+        parts = [self._how_far()]  # what matters most comes first: terminals cut the rest off
+        if last is not None and last.psnr is not None:
+            parts.append(f"held out {decibels(last.psnr, last.verdict, digits=1, learning=True)}")
+        parts += [
             f"{percent(self.coverage.seen)} seen",
+            f"{trainer.frames_seen} frames",
+            f"{rays / 1000.0:.0f}k rays/s",
+            f"{trainer.samples / max(trainer.rays, 1):.1f} samples/ray",
+            f"{self._inbox.waiting} waiting",
         ]
         if self._recording.source.paced:
             parts.append(f"{1000.0 * self.meter.behind_s:.0f} ms behind")
-        if last is not None and last.psnr is not None:
-            parts.append(f"held out {decibels(last.psnr, last.verdict, digits=1)}")
         return " · ".join(parts)
 
     def _how_late(self) -> Iterator[str]:
@@ -288,18 +310,23 @@ class Lesson:
     def _final_scores(self) -> tuple[Score, ...]:
         if not self.held:
             return ()
-        with self._console.waiting(f"scoring {len(self.held)} held-out frames"):
-            scores = tuple(score(self.trainer.avatar, held) for held in self.held)
+        scores = tuple(self._counted(self.held))
         last = self.curve[-1].wall_seconds if self.curve else -1.0
         if self.trainer.wall_seconds > last:
             self._mark(scores, self.trainer.wall_seconds, self.trainer.cpu_seconds)
         return scores
 
+    def _counted(self, held: Sequence[HeldOut]) -> Iterator[Score]:
+        with self._console.bar(f"scoring {len(held)} held-out frames", float(len(held))) as bar:
+            for done, frame in enumerate(held, start=1):
+                yield score(self.trainer.avatar, frame)
+                bar.count(done)
+
     def _fitted_scores(self) -> tuple[Score, ...]:
         if not (self.held and self.trainer.config.refine_poses):
             return ()
-        with self._console.waiting("fitting poses to the held-out frames"):
-            return fitted_scores(self.trainer, self.held)
+        with self._console.bar("fitting poses to the held-out frames", 1.0) as bar:
+            return fitted_scores(self.trainer, self.held, progress=bar.share)
 
     def _save(self) -> None:
         curve = [vars(point) for point in self.curve]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from apps.reporting.cpu_wait import CpuTime
 from apps.reporting.curve import CurvePoint
 from apps.reporting.meter import Meter
 from apps.reporting.report import ExtendedNote
@@ -25,6 +26,7 @@ class Learnt:
         interrupted: Whether Ctrl-C ended it.
         scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
         fitted: The same in poses fitted to them, if poses are refined.
+        cpu: What the machine gave, and what the run waited for.
         extended: What an earlier video lost, if there was one.
     """
 
@@ -35,6 +37,7 @@ class Learnt:
     coverage: Coverage
     added: int
     interrupted: bool
+    cpu: CpuTime
     scores: tuple[Score, ...] = ()
     fitted: tuple[Score, ...] = ()
     extended: ExtendedNote | None = None

@@ -41,7 +41,7 @@ def snapshot(
     mark: CurvePoint | None,
     hasty: bool = False,
     fine_tuned: bool = True,
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Snapshot:
     """Writes the package, whole or not at all; training may go on afterwards.
 
@@ -53,7 +53,7 @@ def snapshot(
         mark: How well held-out frames were rendered when that was last asked; goes with it.
         hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
         fine_tuned: Whether there are ten seconds more, for a better likeness.
-        tell: Hears how far that is.
+        progress: Gets the share that is done, from 0 to 1.
 
     Raises:
         OSError: If the disk is full; what was there before stays.
@@ -70,7 +70,7 @@ def snapshot(
             metrics=metrics,
             hasty=hasty,
             fine_tuned=fine_tuned,
-            progress=lambda share: tell(f"fine-tuned {share:.0%}"),
+            progress=progress,
         )
     except ExportRefused as error:
         return Snapshot(exported=None, refused=str(error), ready_at=time.perf_counter())

@@ -9,8 +9,8 @@ from apps.reporting.report import HeldOutNote, Report, decibels
 from avatar.sharpness import BLURRED, LEAST_OVERLAP
 from capture.camera_device import camera_address
 
-FEW_STEPS = 200
-"""Below this many steps the avatar may simply not have had the time: fog clears in about 150."""
+FEW_STEPS = 60
+"""Below this many steps the avatar may simply not have had the time: fog clears in about 50."""
 ASKED_OF_CHECK = ("poses", "person", "masks", "cameras", "body")
 """Arguments of ia-ingest that ia-check needs to look at the same capture."""
 

@@ -61,6 +61,8 @@ class TrainingNote:
     Attributes:
         wall_seconds: From the first frame handed to the trainer to the last step.
         cpu_seconds: CPU time of the whole process in that time.
+        cpu_waited_seconds: For how long threads of this run were ready and had no core, because
+            other programs held them, summed; a resumed run counts only its own.
         startup_seconds: Before it: imports, reading and checking, kernels.
         steps, rays: How much was done.
         rays_per_second: By the wall clock.
@@ -70,6 +72,7 @@ class TrainingNote:
 
     wall_seconds: float
     cpu_seconds: float
+    cpu_waited_seconds: float
     startup_seconds: float
     steps: int
     rays: int
@@ -264,11 +267,26 @@ class Report:
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 
-def decibels(psnr: float | None, verdict: str | None, *, digits: int = 2) -> str:
-    """A PSNR as people read it, with what it means: "22.78 dB (blurred)"."""
+def so_far(verdict: str | None) -> str | None:
+    """The word for an avatar that is still learnt: nothing has failed then."""
+    return "no person to be seen yet" if verdict == "failed" else verdict
+
+
+def decibels(
+    psnr: float | None, verdict: str | None, *, digits: int = 2, learning: bool = False
+) -> str:
+    """A PSNR as people read it, with what it means: "22.78 dB (blurred)".
+
+    Args:
+        psnr: In dB.
+        verdict: Its word.
+        digits: After the point.
+        learning: Whether the avatar is still learnt: nothing has failed then.
+    """
     if psnr is None:
         return "n/a"
-    return f"{psnr:.{digits}f} dB" + (f" ({verdict})" if verdict else "")
+    word = so_far(verdict) if learning else verdict
+    return f"{psnr:.{digits}f} dB" + (f" ({word})" if word else "")
 
 
 def percent(share: float) -> str:

@@ -10,12 +10,25 @@ from typing import final
 from rich.console import Console as RichConsole
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.table import Column
 
 MOST_WARNINGS = 5
 """Warnings that are printed; the rest are counted, and all stand in the report."""
 MOST_KEPT = 500
 """Warnings that are kept, so that memory stays bounded however long a video lasts."""
 LOG_EVERY_S = 10.0
+NARROWEST_BAR = 8
+"""Characters of a bar beside a long note."""
+ESTIMATED_AFTER_S, ESTIMATED_FROM = 2.0, 0.15
+"""Before that time, and before that share is done, too little is known to say how long the rest
+takes."""
+
+
+def duration(seconds: float) -> str:
+    """A duration as people say it: "5 s", "40 s", "2 min"; above ten seconds in steps of five."""
+    if seconds > 90.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{5 * round(seconds / 5.0) if seconds > 10.0 else max(1, round(seconds))} s"
 
 
 @final
@@ -96,8 +109,13 @@ class Console:
             yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
 
     def bar(self, label: str, total: float) -> "Bar":
-        """A progress bar; use it in a `with` block."""
+        """A progress bar; use it in a `with` block. A log gets a line at its beginning."""
         return Bar(self._rich, label, total)
+
+
+def _kept(width: int) -> Column:
+    """A column that keeps this many characters in a narrow terminal."""
+    return Column(min_width=width, no_wrap=True)
 
 
 @final
@@ -109,21 +127,23 @@ class Bar:
         self._console, self._label, self._total = console, label, total
         self._progress: Progress | None = None
         self._task = TaskID(0)
-        self._said_at = time.perf_counter()
+        self._began_at = self._said_at = time.perf_counter()
         self._drawn_at = 0.0
 
     def __enter__(self) -> "Bar":
         """Shows it."""
         if self._console.is_terminal:
             self._progress = Progress(
-                TextColumn("[bold]{task.description}"),
-                BarColumn(bar_width=28),
+                TextColumn("[bold]{task.description}", table_column=_kept(len(self._label))),
+                BarColumn(bar_width=28, table_column=_kept(NARROWEST_BAR)),
                 TextColumn("{task.fields[note]}"),
                 console=self._console,
                 transient=True,
             )
             self._progress.start()
             self._task = self._progress.add_task(self._label, total=self._total, note="")
+        else:
+            self._console.print(escape(self._label), highlight=False)
         return self
 
     def __exit__(
@@ -135,6 +155,21 @@ class Bar:
         """Takes it away."""
         if self._progress is not None:
             self._progress.stop()
+
+    def count(self, done: int) -> None:
+        """This number of the total is done; says how long the rest takes."""
+        self.move(float(done), f"{done} of {self._total:.0f}{self._rest(float(done))}")
+
+    def share(self, done: float) -> None:
+        """This share of the total is done; says how long the rest takes."""
+        self.move(done, f"{done / self._total:.0%}{self._rest(done)}")
+
+    def _rest(self, done: float) -> str:
+        took = time.perf_counter() - self._began_at
+        early = done < ESTIMATED_FROM * self._total or took < ESTIMATED_AFTER_S
+        if early or done >= self._total:
+            return ""
+        return f", about {duration(took * (self._total - done) / done)} left"
 
     def move(self, done: float, note: str) -> None:
         """So far, and a few words; cheap enough to call at every step."""

@@ -12,7 +12,7 @@ from apps.learning.snapshot import snapshot, views_of
 from apps.learning.watcher import Watched
 from apps.recording.recording import Recording
 from apps.reporting.body_map import BodyMap
-from apps.reporting.report import percent
+from apps.reporting.report import percent, so_far
 from apps.terminal.console import Console
 from apps.terminal.interrupt import ended_by_ctrl_c
 from apps.view.page import FRAME_PX, Page
@@ -154,7 +154,8 @@ class Viewer:
         trainer = lesson.trainer
         last = lesson.curve[-1] if lesson.curve else None
         psnr = None if last is None else last.psnr
-        held_out = "held out" if last is None or not last.verdict else f"held out: {last.verdict}"
+        word = so_far(None if last is None else last.verdict)
+        held_out = f"held out: {word}" if word else "held out"
         self.page.say(
             status,
             [

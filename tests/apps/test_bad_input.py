@@ -198,7 +198,13 @@ def test_numbers_out_of_range(refused, capture, option, value):
 
 
 @pytest.mark.parametrize(
-    "words", [("--seconds", "0"), ("--steps", "0"), ("--seconds", "9", "--steps", "9")]
+    "words",
+    [
+        ("--seconds", "0"),
+        ("--seconds", "1e-9"),
+        ("--steps", "0"),
+        ("--seconds", "9", "--steps", "9"),
+    ],
 )
 def test_a_budget_of_no_time_and_two_budgets_are_refused(capture, tmp_path, capsys, words):
     assert ingest.main([str(capture), "--out", str(tmp_path / "run"), *words]) == 2

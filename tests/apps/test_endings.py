@@ -14,7 +14,7 @@ from rich.console import Console as RichConsole
 
 from apps.learning.run_folder import RunFolder
 from apps.playing.background import background
-from apps.terminal.console import MOST_WARNINGS, Console
+from apps.terminal.console import MOST_WARNINGS, Console, duration
 from apps.terminal.exit_codes import Stop, exit_code
 from apps.terminal.interrupt import asked_to_stop
 from apps.terminal.whole import check_file_place, check_place, whole_file, whole_folder, write_text
@@ -308,7 +308,41 @@ def test_a_log_gets_plain_lines_and_few(monkeypatch):
             bar.move(float(step), f"step {step}")
         monkeypatch.setattr("apps.terminal.console.LOG_EVERY_S", 0.0)
         bar.move(60.0, "the end")
-    assert said.getvalue() == "learning: the end\n"
+    assert said.getvalue() == "learning\nlearning: the end\n"
+
+
+def test_a_count_says_how_long_the_rest_takes(monkeypatch):
+    """A quarter is done after ten seconds, so thirty are left."""
+    now, said = [100.0], io.StringIO()
+    monkeypatch.setattr("apps.terminal.console.time.perf_counter", lambda: now[0])
+    with Console(RichConsole(file=said)).bar("scoring 12 held-out frames", 12.0) as bar:
+        bar.count(1)  # too early to say
+        now[0] += 10.0
+        bar.count(3)
+        now[0] += 30.0
+        bar.count(12)
+    assert said.getvalue().splitlines() == [
+        "scoring 12 held-out frames",
+        "scoring 12 held-out frames: 3 of 12, about 30 s left",
+        "scoring 12 held-out frames: 12 of 12",
+    ]
+
+
+def test_a_long_note_leaves_a_bar_its_name():
+    said = io.StringIO()
+    rich = RichConsole(file=said, force_terminal=True, width=100, color_system=None)
+    with Console(rich).bar("writing the package", 1.0) as bar:
+        bar.move(0.4, "40% " + 200 * "x")
+    assert "writing the package" in said.getvalue()
+    assert "40%" in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.2, "1 s"), (8.4, "8 s"), (43.0, "45 s"), (89.0, "90 s"), (130.0, "2 min")],
+)
+def test_durations_as_people_say_them(seconds, said):
+    assert duration(seconds) == said
 
 
 def test_colours_and_pictures_stand_behind_an_avatar(tmp_path, rng):

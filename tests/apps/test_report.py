@@ -26,6 +26,7 @@ from apps.reporting.report import (
     Spread,
     StreamNote,
     TrainingNote,
+    decibels,
     mean,
 )
 from avatar.events import Score
@@ -53,6 +54,7 @@ def report(**changes):
         "training": TrainingNote(
             wall_seconds=60.0,
             cpu_seconds=61.0,
+            cpu_waited_seconds=0.5,
             startup_seconds=3.0,
             steps=100,
             rays=102400,
@@ -205,6 +207,14 @@ def test_a_failure_names_what_was_seen_and_what_to_do():
     assert "Only 26 steps were made" in failure_of(failed(steps=26))
     assert "ia-check" not in failure_of(failed(steps=900, video="camera:0"))
     assert failure_of(report()) is None
+
+
+def test_nothing_has_failed_while_it_is_learnt():
+    assert decibels(13.3, "failed", digits=1) == "13.3 dB (failed)"
+    assert decibels(13.3, "failed", learning=True) == "13.30 dB (no person to be seen yet)"
+    assert decibels(30.0, "soft", learning=True) == "30.00 dB (soft)"
+    assert decibels(30.0, None) == "30.00 dB"
+    assert decibels(None, None) == "n/a"
 
 
 def test_an_avatar_that_is_good_in_fitted_poses_has_not_failed():
