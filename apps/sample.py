@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from apps.studio.writer import ShootConfig, shoot
+from apps.studio.shoot_config import ShootConfig
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, exit_code
@@ -19,9 +19,10 @@ from apps.terminal.exit_codes import DONE, exit_code
 class SampleConfig:
     """Films a synthetic person into a capture folder, with the truth beside it.
 
-    OUT then holds video.mp4 (lossless), masks/, cameras.npz, poses.npz, dance.npz (a motion to
-    drive the avatar with, never filmed) and truth/: the exact poses, and twelve never-seen poses
-    with their true images. Try it:
+    OUT then holds video.mp4 (lossless FFV1: VLC, mpv and ffmpeg play it), preview.webm (the same
+    film for browsers and phones), masks/, cameras.npz, poses.npz, dance.npz (a motion to drive the
+    avatar with, never filmed) and truth/: the exact poses, and twelve never-seen poses with their
+    true images. Try it:
 
         ia-sample demo/capture
 
@@ -55,12 +56,15 @@ def _sample(config: SampleConfig, console: Console) -> int:
         error.add_note("Nothing was left behind.")
         raise
     video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
-    console.say(f"Filmed {config.shoot.frames} frames into {config.out}. Next:")
+    console.say(f"Filmed {config.shoot.frames} frames into {config.out}.")
+    console.say(f"To look at in a browser: {config.out / 'preview.webm'}. Next:")
     console.say(f"  ia-ingest {video} --poses {poses}")
     return DONE
 
 
 def _shoot_with_bar(config: SampleConfig, console: Console) -> None:
+    from apps.studio.writer import shoot
+
     with console.bar("filming", 1.0) as bar:
 
         def advance(done: int, total: int) -> None:

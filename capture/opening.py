@@ -14,6 +14,8 @@ from capture.video import VIDEO_SUFFIXES, VideoFile
 HEIC = frozenset({".heic", ".heif"})
 NO_VIDEO = HEIC | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
 """Endings of files that people name by mistake."""
+BESIDE = ("mask", "preview")
+"""How the names of videos begin that lie beside the one that is meant."""
 
 
 def open_source(path: Path, *, frames: slice | None = None) -> Source:
@@ -47,10 +49,10 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
 
 
 def _videos(folder: Path) -> list[Path]:
-    """The videos in a folder; one of masks is none where there is another."""
+    """List the videos in a folder; masks and a preview do not count where there is another."""
     files = (file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
     seen = sorted(file for file in files if not file.name.startswith("."))
-    return [file for file in seen if not file.stem.lower().startswith("mask")] or seen
+    return [file for file in seen if not file.stem.lower().startswith(BESIDE)] or seen
 
 
 def _unclear(path: Path, videos: list[Path]) -> BadInput:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float32, Int, Int32
 from scipy import ndimage
 
 from export.compiled import optical_depth_ends
+from export.isosurface import resampled
 from export.lattice import Lattice
 
 CONTRAST = 16.0
@@ -73,19 +74,6 @@ def _log_density(lattice: Lattice, level: float) -> Float32[np.ndarray, "x y z"]
     dense = lattice.density.ravel()[places] / np.float32(level)
     logs.ravel()[places] = np.log(np.clip(dense, 1.0 / CONTRAST, CONTRAST))
     return logs
-
-
-def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
-    """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
-    for axis in range(3):
-        places = np.arange(0.0, values.shape[axis] - 1, step)
-        below = np.minimum(places.astype(int), values.shape[axis] - 2)  # a last place by rounding
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        part = (places - below).astype(np.float32).reshape(shape)
-        lower = np.take(values, below, axis=axis)
-        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
-    return values
 
 
 def _largest_parts(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:

@@ -28,6 +28,19 @@ def isosurface(
     return vertices, _triangles(vertices, np.concatenate(quads))
 
 
+def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
+    """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
+    for axis in range(3):
+        places = np.arange(0.0, values.shape[axis] - 1, step)
+        below = np.minimum(places.astype(int), values.shape[axis] - 2)  # a last place by rounding
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        part = (places - below).astype(np.float32).reshape(shape)
+        lower = np.take(values, below, axis=axis)
+        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
+    return values
+
+
 def _crossed_cells(inside: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "cells 3"]:
     """Lowest corners of the cells whose corners do not agree."""
     x, y, z = (size - 1 for size in inside.shape)

@@ -8,8 +8,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 
-from export.hull import resampled
-from export.isosurface import isosurface
+from export.isosurface import isosurface, resampled
 from export.tables import BRICK, LOG_DENSITY, Bricks, Tables
 
 SPACING_M = 0.005

@@ -4,15 +4,17 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
-from onnx import TensorProto, helper
 
 from capture.camera import Camera
 from export.player import Player
 from preprocess.pose import BodyPose
 
+REFERENCE_GRAPH = Path(__file__).with_name("reference.onnx")
+"""Made by tests/apps/test_bench_graph.py, which compares it with what `onnx` makes."""
 WARM_UP = 3
 FEWEST = 10
 """Pictures that are timed at least; short motions are repeated."""
@@ -88,24 +90,14 @@ def benchmark(
 
 
 def _reference_graph() -> onnxruntime.InferenceSession:
-    """GatherElements, MatMul and ScatterElements of fixed sizes; its numbers are meaningless."""
-    nodes = [
-        helper.make_node("GatherElements", ["table", "places"], ["taken"], axis=0),
-        helper.make_node("MatMul", ["taken", "matrix"], ["product"]),
-        helper.make_node(
-            "ScatterElements", ["table", "places", "product"], ["out"], axis=0, reduction="min"
-        ),
-    ]
-    shapes = {"table": [1 << 15, 16], "matrix": [16, 16]}
-    inputs = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items()]
-    inputs.append(helper.make_tensor_value_info("places", TensorProto.INT64, [1 << 15, 16]))
-    outputs = [helper.make_tensor_value_info("out", TensorProto.FLOAT, [1 << 15, 16])]
-    graph = helper.make_graph(nodes, "reference", inputs, outputs)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    """Load the reference graph: GatherElements, MatMul and ScatterElements of fixed sizes.
+
+    Its numbers are meaningless. It lies here as a file, so that a player needs no `onnx` package.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        REFERENCE_GRAPH.read_bytes(), options, providers=["CPUExecutionProvider"]
     )
 
 

@@ -1,20 +1,21 @@
 """The shoot: the actor in front of the camera, written as a native capture folder."""
 
 import errno
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from apps.playing.encoders import video_encoder
 from apps.studio import backdrop, motions, walk
 from apps.studio.actor import Actor
 from apps.studio.framing import framed
 from apps.studio.room import Room
 from apps.studio.roughen import roughened
+from apps.studio.shoot_config import ShootConfig as ShootConfig
 from apps.studio.stage import Stage
 from apps.studio.tracker import in_cameras, tracked
 from apps.terminal.whole import check_place, whole_folder
@@ -28,77 +29,14 @@ Progress = Callable[[int, int], None]
 """Called after each picture with how many are done and how many there will be."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShootConfig:
-    """What is filmed, and how well the poses and masks are known."""
-
-    frames: int = 120
-    """Frames of the video."""
-    fps: float = 30.0
-    """Frames per second of the video."""
-    size: int = 270
-    """Width and height of the pictures in pixels; a walkaround's are so wide, and 16:9."""
-    turns: float | None = None
-    """How often the actor turns round; if not given 2, in a walkaround -0.75 (against the walk)."""
-    seed: int = 0
-    """Of the swaying, the clutter and the noise; from 1 on it varies the actor's looks, too."""
-    subject: Literal[1, 2] = 1
-    """Which of the two actors."""
-    motion: Literal["turn", "dance", "walkaround"] = "turn"
-    """What happens: the actor turns with arms held off the body, or dances; or gestures while a
-    phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras
-    lie in truth/cameras.npz)."""
-    background: Literal["plain", "clutter", "room", "tiles"] | None = None
-    """What stands behind the actor: a bare wall, a painted room full of things (if not given), a
-    real room with furniture (a walkaround's, if not given), or one where every pattern repeats."""
-    pose_noise_deg: float = 0.0
-    """Noise of the poses: standard deviation of each rotation component, in degrees."""
-    pose_noise_cm: float = 0.0
-    """Noise of the poses: standard deviation of each component of the place, in centimetres."""
-    mask_noise_px: float = 0.0
-    """Noise of the masks: standard deviation of their border, in pixels."""
-
-    @property
-    def walks(self) -> bool:
-        """Whether the camera moves."""
-        return self.motion == "walkaround"
-
-    @property
-    def behind(self) -> Literal["plain", "clutter", "room", "tiles"]:
-        """What stands behind the actor, if nobody said it, too."""
-        return self.background or ("room" if self.walks else "clutter")
-
-    def check(self) -> None:
-        """Refuses what cannot be filmed.
-
-        Raises:
-            BadInput: If a number is out of its range.
-        """
-        ranges = {
-            "frames": (1, 100_000), "fps": (0.1, 1000.0), "size": (16, 4096),
-            "turns": (-100.0, 100.0), "seed": (0, 2**31 - 1), "pose_noise_deg": (0.0, 90.0),
-            "pose_noise_cm": (0.0, 100.0), "mask_noise_px": (0.0, 50.0),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                option = "--" + name.replace("_", "-")
-                raise BadInput(f"{option} is {value}, but must lie between {low} and {high}.")
-        if self.walks and self.behind in ("plain", "clutter"):
-            raise BadInput(
-                f"--background {self.behind} is painted for a camera that stands still; with "
-                "--motion walkaround give room or tiles."
-            )
-
-
 def shoot(
     out: Path, config: ShootConfig, progress: Progress | None = None, *, overwrite: bool = False
 ) -> None:
     """Films the actor into the folder `out`, which appears whole or not at all.
 
     Args:
-        out: Folder that will hold video.mp4, masks/, cameras.npz (a walkaround's lie in truth/),
-            poses.npz, dance.npz and truth/.
+        out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
+            in truth/), poses.npz, dance.npz and truth/.
         config: What is filmed.
         progress: Told after each picture; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way.
@@ -135,6 +73,7 @@ def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:
     novel = motions.novel(actor)
     total = len(truth) + len(novel)
     _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
+    _write_preview(folder, config.fps)
     _write_novel(
         folder / "truth" / "novel", stages[1], novel,
         lambda done: progress(len(truth) + done, total),
@@ -232,6 +171,18 @@ def _check_video(path: Path, frames: int) -> None:
     video.release()
     if written != frames:
         raise OSError(errno.ENOSPC, f"only {written} of {frames} video frames could be written")
+
+
+def _write_preview(folder: Path, fps: float) -> None:
+    """Write preview.webm: the film for browsers and phones, which play no lossless video."""
+
+    def frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        video = cv2.VideoCapture(str(folder / "video.mp4"), cv2.CAP_FFMPEG)
+        while (read := video.read())[0]:
+            yield np.ascontiguousarray(read[1][..., ::-1])
+        video.release()
+
+    video_encoder(".webm", transparent=False).write(folder / "preview.webm", frames(), fps)
 
 
 def _write_novel(folder: Path, stage: Stage, motion: Motion, done: Callable[[int], None]) -> None:

@@ -8,6 +8,7 @@ from rich.markup import escape
 from apps.terminal.console import Stderr
 from apps.terminal.interrupt import INTERRUPTED as INTERRUPTED
 from apps.terminal.interrupt import noted
+from apps.terminal.packages import advice
 from capture.errors import BadInput
 
 DONE, NO_AVATAR, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
@@ -36,8 +37,8 @@ class Stop(Exception):  # noqa: N818 - an end, not always an error
 def exit_code(program: str, work: Callable[[], int]) -> int:
     """Runs a command's work; what a user or a machine can cause becomes one message and a number.
 
-    No usable avatar is 1, bad input 2, a full disk or a busy device 3, Ctrl-C 130. Our own bugs
-    keep their traceback.
+    No usable avatar is 1, bad input or a package that is not installed 2, a full disk or a busy
+    device 3, Ctrl-C 130. Our own bugs keep their traceback.
 
     Args:
         program: The command's name, in front of the message.
@@ -60,6 +61,11 @@ def _exit_code(program: str, work: Callable[[], int]) -> int:
         code, message = end.code, str(end)
     except BadInput as error:
         code, message = BAD_INPUT, str(error)
+    except ModuleNotFoundError as error:
+        missing = advice(error)
+        if missing is None:
+            raise
+        code, message = BAD_INPUT, missing
     except KeyboardInterrupt as error:
         code, message = INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
     except (OSError, RuntimeError, MemoryError) as error:

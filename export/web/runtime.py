@@ -3,6 +3,8 @@
 import base64
 import hashlib
 import io
+import shlex
+import sys
 import tarfile
 from importlib import resources
 from pathlib import Path
@@ -28,8 +30,8 @@ NOTICES = ("LICENSE", "ThirdPartyNotices.txt")
 """The npm package carries neither; those of the Python package are of the same project."""
 MISSING = (
     "The browser page needs onnxruntime-web, which is not here: {why}. In a checkout, `make web` "
-    "fetches it (npm package onnxruntime-web {version}, 33 MB once); a wheel built after that "
-    "carries it."
+    "fetches it (npm package onnxruntime-web {version}, 33 MB once), anywhere else "
+    "{python} -m apps.fetch_runtime"
 )
 
 
@@ -68,5 +70,6 @@ def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
     wanted = (*MEMBERS, *NOTICES)
     missing = [name for name in wanted if not (folder / name).is_file()]
     if missing:
-        raise BadInput(MISSING.format(why=f"no {folder / missing[0]}", version=VERSION))
+        why, python = f"no {folder / missing[0]}", shlex.quote(sys.executable)
+        raise BadInput(MISSING.format(why=why, version=VERSION, python=python))
     return {name: (folder / name).read_bytes() for name in wanted}

@@ -4,6 +4,7 @@ import shlex
 import pytest
 
 from apps import sample
+from apps.studio import writer
 
 
 def run(*arguments):
@@ -56,5 +57,5 @@ def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(sample, "shoot", fail)
+    monkeypatch.setattr(writer, "shoot", fail)
     assert run(tmp_path / "c") == code

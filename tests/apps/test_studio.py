@@ -18,6 +18,7 @@ from apps.studio.tracker import tracked
 from apps.studio.wardrobe import dressed
 from apps.studio.writer import ShootConfig, shoot
 from capture.errors import BadInput
+from capture.opening import open_source
 from preprocess.body_file import load_body
 from preprocess.pose import BodyPose, Motion
 from preprocess.pose_file import read_motion
@@ -223,7 +224,7 @@ def test_mask_noise_moves_the_border_by_what_is_asked():
 
 
 def test_the_folder_is_a_native_capture(capture):
-    top = {"video.mp4", "masks", "cameras.npz", "poses.npz", "dance.npz", "truth"}
+    top = {"video.mp4", "preview.webm", "masks", "cameras.npz", "poses.npz", "dance.npz", "truth"}
     assert {path.name for path in capture.iterdir()} == top
     assert len(list((capture / "masks").glob("*.png"))) == SMALL.frames
     with np.load(capture / "cameras.npz") as cameras:
@@ -263,6 +264,15 @@ def test_the_video_is_exact_and_masks_fit_it(capture):
         mask = png(capture / "masks" / f"{row:04d}.png")
         np.testing.assert_array_equal(mask, alpha)
         np.testing.assert_array_equal(frame[mask == 255], rgb[mask == 255])
+
+
+def test_a_preview_shows_the_film_to_browsers(capture):
+    exact, shown = (list(frames_of(capture / n)) for n in ("video.mp4", "preview.webm"))
+    assert len(shown) == SMALL.frames
+    off = np.abs(np.stack(shown).astype(float) - np.stack(exact))
+    assert off.mean() < 12.0  # of 255: colors at half the resolution
+    assert (capture / "preview.webm").read_bytes()[:64].find(b"webm") > 0
+    assert open_source(capture).path == capture / "video.mp4"
 
 
 def test_masks_are_soft(capture):

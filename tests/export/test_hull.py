@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from export.compiled import spread_colors
-from export.hull import MARGIN_M, OPAQUE, find_hull, resampled
+from export.hull import MARGIN_M, OPAQUE, find_hull
+from export.isosurface import resampled
 from export.lattice import Lattice
 
 VOXEL_M = 0.004
