@@ -53,8 +53,9 @@ class ExportArguments:
 
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
     """Folder that ia-ingest wrote (--out), with a checkpoint/ in it; for meshes a package, too."""
-    to: Literal["iavatar", "glb", "ply"] = "iavatar"
-    """Format: the package that ia-play plays; glTF 2.0 binary; or a still, coloured mesh."""
+    to: Literal["iavatar", "glb", "ply", "obj"] = "iavatar"
+    """Format: the package that ia-play plays; glTF 2.0 binary; or a still mesh with vertex colors,
+    as PLY or OBJ (canonical pose, no skeleton)."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write; it appears whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -77,7 +78,7 @@ def export(given: ExportArguments, console: Console) -> int:
         OSError: If the disk is full.
         Stop: If there is nothing to draw.
     """
-    if given.out.suffix != f".{given.to}":
+    if given.out.suffix.lower() != f".{given.to}":
         raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
     if not given.out.resolve().parent.is_dir():
         raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
@@ -110,7 +111,7 @@ def _package(folder: Path, out: Path, console: Console, *, for_player: bool = Tr
     if folder.is_file():
         raise BadInput(
             f"{folder} is a file; a package is made from the folder that ia-ingest wrote. From a "
-            "package come --to glb and --to ply."
+            "package come --to glb, --to ply and --to obj."
         )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():

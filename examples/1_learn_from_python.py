@@ -9,24 +9,26 @@ whatever you do with them.
 import sys
 from pathlib import Path
 
-import apps  # noqa: F401 - sets OpenMP's variables, which torch reads when it is imported
+try:
+    import apps  # noqa: F401, I001 - sets OpenMP's variables, which torch reads when it is imported
 
-# isort: split
+    import torch
 
-import torch
-
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
-from apps.studio.writer import ShootConfig, shoot
-from avatar.config import TrainConfig
-from avatar.events import Evaluated, Finished, Warned
-from avatar.hold import prepared
-from avatar.rig import Rig
-from avatar.train import train
-from avatar.trainer import Trainer
-from avatar.warm import warm_up
-from capture.inbox import Inbox
-from export.build import export_avatar
+    from apps.recording.opening import open_recording
+    from apps.recording.wanted import RecordingPaths
+    from apps.studio.writer import ShootConfig, shoot
+    from avatar.config import TrainConfig
+    from avatar.events import Evaluated, Finished, Warned
+    from avatar.hold import prepared
+    from avatar.rig import Rig
+    from avatar.train import train
+    from avatar.trainer import Trainer
+    from avatar.warm import warm_up
+    from capture.errors import BadInput
+    from capture.inbox import Inbox
+    from export.build import export_avatar
+except ModuleNotFoundError as missing:
+    sys.exit(f"{missing}. To learn, install: pip install 'instant-avatar-stream[learn]'")
 
 STEPS = 500
 
@@ -64,4 +66,7 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "demo/python"))
+    try:
+        main(Path(sys.argv[1] if len(sys.argv) > 1 else "demo/python"))
+    except BadInput as error:
+        sys.exit(str(error))

@@ -8,13 +8,17 @@ A pose is 24 axis-angles: the root's and 23 joints' (SMPL's order), and a place 
 import sys
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
+try:
+    import numpy as np
+    from PIL import Image
 
-from capture.camera import Camera
-from export.player import Player
-from preprocess.pose import BodyPose
-from preprocess.skeleton import JOINT_NAMES
+    from capture.camera import Camera
+    from capture.errors import BadInput
+    from export.player import Player
+    from preprocess.pose import BodyPose
+    from preprocess.skeleton import JOINT_NAMES
+except ModuleNotFoundError as missing:
+    sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
 
 
 def joints(**rotations: tuple[float, float, float]) -> np.ndarray:
@@ -59,4 +63,7 @@ def main(package: Path, picture: Path) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "pose.png"))
+    try:
+        main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "pose.png"))
+    except BadInput as error:  # no package there, or a damaged one
+        sys.exit(str(error))

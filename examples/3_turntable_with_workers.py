@@ -10,12 +10,16 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
+try:
+    import numpy as np
+    from PIL import Image
 
-from capture.camera import Camera
-from export.player import Player
-from preprocess.pose import BodyPose
+    from capture.camera import Camera
+    from capture.errors import BadInput
+    from export.player import Player
+    from preprocess.pose import BodyPose
+except ModuleNotFoundError as missing:
+    sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
 
 PICTURES, SIZE, DISTANCE_M = 24, 270, 5.0
 
@@ -61,4 +65,7 @@ def main(package: Path, moving: Path) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "turntable.webp"))
+    try:
+        main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "turntable.webp"))
+    except BadInput as error:  # no package there, or a damaged one
+        sys.exit(str(error))

@@ -37,7 +37,7 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
     Raises:
         BadInput: As `read_cameras`.
     """
-    of_colmap = find_model(path) if path.is_dir() else path.suffix in (".bin", ".txt")
+    of_colmap = find_model(path) if path.is_dir() else path.suffix.lower() in (".bin", ".txt")
     if (tag := _mirroring(source)) is not None:
         return _of_mirrored(path, source, tag, of_colmap=bool(of_colmap))
     if source.quarter_turns % 2 == 0:

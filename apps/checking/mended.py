@@ -111,8 +111,9 @@ def _write_masks(examined: Examined, healed: Claim, folder: Path) -> None:
     if stored and masks.path.is_dir():
         _linked(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
         return
-    if stored and masks.path.suffix in (".npz", ".npy"):
-        _link(masks.path, folder / f"masks{masks.path.suffix}")
+    suffix = masks.path.suffix.lower()
+    if stored and suffix in (".npz", ".npy"):
+        _link(masks.path, folder / f"masks{suffix}")
         return
     (folder / "masks").mkdir()
     for row in range(masks.count):

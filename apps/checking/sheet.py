@@ -47,7 +47,9 @@ def write_sheet(path: Path, examined: Examined) -> bool:
         rows.append(_row(shown, examined.diagnosis.healed, evidence, "mended"))
     sheet = np.concatenate(rows)
     with whole_file(path) as part:
-        _, code = cv2.imencode(path.suffix or ".png", np.ascontiguousarray(sheet[..., ::-1]))
+        _, code = cv2.imencode(
+            path.suffix.lower() or ".png", np.ascontiguousarray(sheet[..., ::-1])
+        )
         part.write_bytes(code.tobytes())
     return True
 

@@ -1,4 +1,4 @@
-"""An avatar's package as a mesh file: .glb with skeleton and motion, or .ply as it stands."""
+"""An avatar's package as a mesh file: .glb with skeleton and motion, or a still .ply or .obj."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +30,7 @@ def write_mesh(
 
     Args:
         package: The avatar.
-        out: A .glb or a .ply.
+        out: A .glb, a .ply or an .obj, in letters of either case.
         console: Where it says how far it is.
         poses: What the .glb does; without it, a turn.
         name: Of the avatar.
@@ -44,7 +44,8 @@ def write_mesh(
     motion = novel_motion()
     if poses is not None:
         motion = driving_motion(poses, held.manifest.rest_joints, console, person=person)
-    write = _ply if out.suffix == ".ply" else _glb(held.manifest, motion, name)
+    suffix = out.suffix.lower()
+    write = _glb(held.manifest, motion, name) if suffix == ".glb" else _still(suffix)
     with console.waiting("taking the surface"):
         mesh = mesh_of(held.tables["hq"])
         content = write(mesh)
@@ -59,17 +60,21 @@ def _glb(manifest: Manifest, motion: Motion, name: str) -> Callable[[SkinnedMesh
     return lambda mesh: glb(mesh, manifest, animation, name=name)
 
 
-def _ply(mesh: SkinnedMesh) -> bytes:
-    """In the canonical pose; colours are sRGB, as all programs take a PLY's to be."""
-    import trimesh
+def _still(suffix: str) -> Callable[[SkinnedMesh], bytes]:
+    """Return what encodes the canonical pose; colors are sRGB, as programs take a PLY's to be."""
+    import trimesh  # an installation of the player alone has none, and is told what to install
 
-    solid = trimesh.Trimesh(
-        vertices=mesh.positions,
-        faces=mesh.faces,
-        vertex_normals=mesh.normals,
-        vertex_colors=mesh.colors,
-        process=False,
-    )
-    content = solid.export(file_type="ply", vertex_normal=True)
-    assert isinstance(content, bytes)
-    return content
+    options = {".ply": {"vertex_normal": True}, ".obj": {"include_normals": True}}[suffix]
+
+    def encoded(mesh: SkinnedMesh) -> bytes:
+        solid = trimesh.Trimesh(
+            vertices=mesh.positions,
+            faces=mesh.faces,
+            vertex_normals=mesh.normals,
+            vertex_colors=mesh.colors,
+            process=False,
+        )
+        content = solid.export(file_type=suffix[1:], **options)
+        return content if isinstance(content, bytes) else str(content).encode()
+
+    return encoded

@@ -1,10 +1,13 @@
 """The examples run as they stand, only shorter."""
 
 import importlib.util
+import runpy
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from apps.learning import learn
@@ -22,6 +25,18 @@ def load(name):
 def test_examples_are_one_walk_each():
     for file in EXAMPLES.glob("*.py"):
         assert len(file.read_text().splitlines()) <= 80
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_what_is_missing_is_one_line(file, tmp_path, monkeypatch):
+    """A package that is not installed; and an avatar, or a folder, that is not there."""
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", [str(file), str(tmp_path / "file" / "none")])
+    with pytest.raises(SystemExit, match=r"none|is a file"):
+        runpy.run_path(str(file), run_name="__main__")
+    monkeypatch.setitem(sys.modules, "numpy" if file.stem[0] != "1" else "torch", None)
+    with pytest.raises(SystemExit, match=r"pip install '?instant-avatar-stream"):
+        runpy.run_path(str(file), run_name="__main__")
 
 
 def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):

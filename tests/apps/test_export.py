@@ -58,14 +58,14 @@ def test_what_cannot_be_done_is_said_and_nothing_is_written(
 
 
 def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
-    out = tmp_path / "a.glb"
+    out = tmp_path / "a.GLB"
     poses = film / "truth" / "novel" / "poses.npz"
     code, said = call_export(run, "--to", "glb", "--poses", poses, "--out", out)
     assert code == 0, said.err
     (mesh,) = trimesh.load(out).geometry.values()
     low, high = mesh.bounds
     assert 1.4 < high[1] - low[1] < 2.1  # a person's height
-    assert [file.name for file in tmp_path.iterdir()] == ["a.glb"]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.GLB"]
 
 
 def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_path):
@@ -90,10 +90,12 @@ def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_p
     assert "7" in said.err
 
 
-def test_a_package_becomes_a_still_mesh_in_colour(run, call_export, tmp_path):
-    code, said = call_export(run / "avatar.iavatar", "--to", "ply", "--out", tmp_path / "a.ply")
+@pytest.mark.parametrize("name", ["a.ply", "A.PLY", "a.OBJ"])
+def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, name):
+    out = tmp_path / name
+    code, said = call_export(run / "avatar.iavatar", "--to", name[2:].lower(), "--out", out)
     assert code == 0, said.err
-    mesh = trimesh.load(tmp_path / "a.ply")
+    mesh = trimesh.load(out)
     assert len(mesh.faces) > 10_000
     assert mesh.visual.kind == "vertex"
     colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
