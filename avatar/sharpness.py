@@ -20,7 +20,7 @@ for fog and for a body that does not cover its mask):
 | failed | more, or an overlap below 0.5 | | no avatar of this person |
 
 Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB, 1.2 % at
-27 dB after 45 steps; the real person of eight photographs 1.4 % at 22.8 dB in the given poses. The
+27 dB after 45 steps; the real person of eight photographs 1.2 and 1.6 % at 22.8 dB in the given poses. The
 same actor with poses 6° and 4 cm off has 6 % and an overlap of 0.64 at 19 dB, and is still a
 person. Fog after 26 steps (overlap 0.38, 13 dB) and runs that learnt the room instead of the
 person (overlap 0.2, 6.9 dB) are beyond the widest blur. 14 cm is thicker than an arm or a leg: what
@@ -31,7 +31,7 @@ from collections.abc import Iterable
 from itertools import pairwise
 from math import exp, inf, isnan, log, nan
 from statistics import median_high, median_low
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import cv2
 import numpy as np
@@ -40,6 +40,7 @@ from jaxtyping import Bool, Float32
 from avatar.metrics import psnr
 
 Verdict = Literal["sharp", "soft", "blurred", "failed"]
+"""From the best to the worst."""
 
 SHARP, SOFT, BLURRED = 0.0075, 0.0125, 0.08
 """The largest equivalent blur of each verdict, as a share of the person's height."""
@@ -142,9 +143,8 @@ def verdict_of(scores: Iterable[Sharpness]) -> Verdict | None:
 
 def better(one: Verdict | None, other: Verdict | None) -> Verdict | None:
     """The better of two verdicts on one avatar: poses that are off are not its fault."""
-    order = ("sharp", "soft", "blurred", "failed")
-    known = [word for word in (one, other) if word is not None]
-    return min(known, key=order.index) if known else None
+    known: list[Verdict] = [word for word in (one, other) if word is not None]
+    return min(known, key=get_args(Verdict).index) if known else None
 
 
 def _blurred(

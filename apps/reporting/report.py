@@ -10,7 +10,7 @@ from apps.reporting.curve import CurvePoint
 from avatar.advice import advice
 from avatar.coverage import Coverage
 from avatar.events import Score
-from avatar.sharpness import better, typical_blur, typical_overlap, verdict_of
+from avatar.sharpness import Verdict, better, typical_blur, typical_overlap, verdict_of
 from capture.reservoir import Reservoir
 
 FORMAT = 1
@@ -106,7 +106,7 @@ class HeldOutNote:
     psnr: float | None
     psnr_mask: float | None
     ssim: float | None
-    verdict: str | None
+    verdict: Verdict | None
     blur: float | None
     overlap: float | None
     lpips: float | None = None
@@ -253,7 +253,7 @@ class Report:
     format: int = FORMAT
 
     @property
-    def verdict(self) -> str | None:
+    def verdict(self) -> Verdict | None:
         """What the avatar is, in a word: in fitted poses where it looks better in them."""
         fitted = self.held_out_refined
         return better(self.held_out.verdict, None if fitted is None else fitted.verdict)
