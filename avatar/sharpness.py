@@ -19,12 +19,12 @@ for fog and for a body that does not cover its mask):
 | blurred | 8 % | 14 cm | a person, whose face and hands are smears |
 | failed | more, or an overlap below 0.5 | | no avatar of this person |
 
-Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB, 1.2 % at
-27 dB after 45 steps; the real person of eight photographs 1.2 and 1.6 % at 22.8 dB in the given poses. The
-same actor with poses 6° and 4 cm off has 6 % and an overlap of 0.64 at 19 dB, and is still a
-person. Fog after 26 steps (overlap 0.38, 13 dB) and runs that learnt the room instead of the
-person (overlap 0.2, 6.9 dB) are beyond the widest blur. 14 cm is thicker than an arm or a leg: what
-is blurred by more shows no person any longer.
+Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB and 1.2 % at
+27 dB after 45 steps; with poses 6° and 4 cm off, 6 % and an overlap of 0.64 at 19 dB, which is still
+a person. The real person of eight photographs has 1.2 and 1.6 % at 22.8 dB in the given poses. Fog
+after 26 steps (overlap 0.38, 13 dB) and runs that learnt the room instead of the person (overlap
+0.2, 6.9 dB) are beyond the widest blur. 14 cm is thicker than an arm or a leg: what is blurred by
+more shows no person any longer.
 """
 
 from collections.abc import Iterable
