@@ -20,8 +20,8 @@ for fog and for a body that does not cover its mask):
 | failed | more, or an overlap below 0.5 | | no avatar of this person |
 
 Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB and 1.2 % at
-27 dB after 45 steps; with poses 6° and 4 cm off, 6 % and an overlap of 0.64 at 19 dB, which is still
-a person. The real person of eight photographs has 1.2 and 1.6 % at 22.8 dB in the given poses. Fog
+27 dB after 45 steps; with poses 6° and 4 cm off, 6 % and an overlap of 0.64 at 19 dB, still a
+person. The real person of eight photographs has 1.2 and 1.6 % at 22.8 dB in the given poses. Fog
 after 26 steps (overlap 0.38, 13 dB) and runs that learnt the room instead of the person (overlap
 0.2, 6.9 dB) are beyond the widest blur. 14 cm is thicker than an arm or a leg: what is blurred by
 more shows no person any longer.
