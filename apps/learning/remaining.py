@@ -1,7 +1,8 @@
 """How long a run takes: where learning stands, and what comes after it.
 
-The constants are core-seconds of a free core at 540 px (docs/benchmarks.md: ten seconds for a
-package), rounded up; what is made of them is always called "about".
+The constants are core-seconds of a free core at 540 px: of the package as the README has it, of
+scoring as docs/evaluation.md has it, rounded up; fitting and report are estimates. What is made of
+them is always called "about".
 """
 
 PACKAGE_S = 12.0
