@@ -161,7 +161,7 @@ def _trainer(
             recording, seconds=seconds, steps=given.steps, seed=given.seed,
             refine_poses=given.refine_poses, hold_every=given.hold_out, device=device,
         )  # fmt: skip
-        return trainer, 0, {"video": video}
+        return trainer, 0, {"video": video, "name": recording.paths.video.name}
     trainer, notes = checkpoint.load(run.checkpoint, device)
     _check_person(trainer, recording, run)
     unit, budget = ("seconds", seconds) if given.steps is None else ("steps", given.steps)
@@ -180,6 +180,7 @@ def _trainer(
     else:
         console.say(f"Adding another video to an avatar that has learnt for {had:.0f} {unit}.")
         extension.begin(trainer, console)
+        notes["name"] = recording.paths.video.name
         earlier, seen, notes["video"] = had, 0, video
     trainer.config = replace(
         trainer.config,

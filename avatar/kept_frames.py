@@ -28,9 +28,20 @@ FORMAT = 1
 FINISHED, EARLIER = "frames.tensors", "earlier.tensors"
 """Of the run that ended last; of the runs before the video that is being learnt now."""
 CLIP = 1 << 32
-"""Frames of an earlier video have numbers so much smaller: no two frames share one."""
+"""Among the frames of a trainer's memory, those of an earlier video have numbers so much smaller:
+no two share one. Whoever shows a number shows `number_in_video`."""
 HELD_OUT = 12
 """Held-out frames that are kept."""
+
+
+def number_in_video(index: int) -> int:
+    """A frame's number in its own video."""
+    return index % CLIP
+
+
+def videos_ago(index: int) -> int:
+    """How many videos were added since a frame's own: 0 for the one that is learnt now."""
+    return -(index // CLIP)
 
 
 class KeptFrames(NamedTuple):

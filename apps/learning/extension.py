@@ -1,6 +1,7 @@
 """Another video added to a finished avatar: what it knew stays, and what it loses is said."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, final
 
 from apps.learning.run_folder import RunFolder
@@ -8,7 +9,14 @@ from apps.reporting.report import ExtendedNote, decibels
 from apps.terminal.console import Console
 from avatar.events import Score
 from avatar.hold import HeldOut, score
-from avatar.kept_frames import CLIP, EARLIER, FINISHED, KeptFrames
+from avatar.kept_frames import (
+    CLIP,
+    EARLIER,
+    FINISHED,
+    KeptFrames,
+    number_in_video,
+    videos_ago,
+)
 from avatar.sharpness import verdict_of
 from avatar.trainer import Trainer
 
@@ -44,8 +52,6 @@ class Extension:
         trainer.corrections = {
             index - CLIP: correction for index, correction in trainer.corrections.items()
         }
-        for point in self._notes.get("curve", []):
-            point["frames"] = [(frame - CLIP, psnr) for frame, psnr in point.get("frames", [])]
         if not self._kept.key_frames:
             console.warn(
                 "The frames of the earlier video were not kept, for its run did not come to its "
@@ -55,6 +61,7 @@ class Extension:
         with console.waiting(f"scoring {len(self.held)} frames of the earlier video"):
             scores = self._scores(trainer)
         self._notes["before"] = {
+            "videos": [*earlier_videos(self._notes), self._name()],
             "frames": trainer.frames_seen,
             "seconds": trainer.wall_seconds,
             "steps": trainer.steps,
@@ -87,9 +94,15 @@ class Extension:
         kept.save(self._run.checkpoint / FINISHED)
         if "before" not in self._notes:
             return None
-        before = tuple(Score(**each) for each in self._notes["before"]["scores"])
-        after = self._scores(trainer)
-        note = ExtendedNote.of(before, after, recalled=len(self._kept.key_frames))
+        history = self._notes["before"]
+        before = tuple(Score(**each) for each in history["scores"])
+        after, videos = self._scores(trainer), earlier_videos(self._notes)
+        places = [len(videos) + 1 - videos_ago(h.observation.frame.index) for h in self.held]
+        note = ExtendedNote.of(
+            before, after, videos=videos, video_of_frame=places,
+            used=history["frames"], wall_seconds=history["seconds"],
+            recalled=len(self._kept.key_frames),
+        )  # fmt: skip
         if note.psnr_after is not None:
             console.say(
                 "Frames of the earlier video: "
@@ -99,7 +112,16 @@ class Extension:
             )
         return note
 
+    def _name(self) -> str:
+        """Of the video that was learnt last, as its user named it."""
+        return self._notes.get("name") or Path(self._notes["video"]).name
+
     def _scores(self, trainer: Trainer) -> tuple[Score, ...]:
         """Of the held-out frames, by the numbers that they had in their own video."""
         scores = (score(trainer.avatar, frame) for frame in self.held)
-        return tuple(replace(each, frame=each.frame % CLIP) for each in scores)
+        return tuple(replace(each, frame=number_in_video(each.frame)) for each in scores)
+
+
+def earlier_videos(notes: dict[str, Any]) -> tuple[str, ...]:
+    """Names of the videos that were learnt before the present one, by what a checkpoint keeps."""
+    return tuple(notes.get("before", {}).get("videos", ()))

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import torch
 
-from apps.learning.extension import Extension
+from apps.learning.extension import Extension, earlier_videos
 from apps.learning.learnt import Learnt
 from apps.learning.remaining import after_learning_s, how_far
 from apps.learning.run_folder import RunFolder
@@ -303,6 +303,7 @@ class Lesson:
             psnr_mask=mean([s.psnr_mask for s in scores]),
             verdict=verdict_of(scores),
             frames=tuple((s.frame, s.psnr) for s in scores),
+            video=1 + len(earlier_videos(self._notes)),
         )
         self.curve.append(point)
         return point

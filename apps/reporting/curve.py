@@ -14,8 +14,10 @@ class CurvePoint:
         frames_seen: Frames trained on so far.
         psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
         verdict: What the scores mean, in a word (`avatar.sharpness`).
-        frames: Which those were, each with its own PSNR of the whole picture: they need not be the
-            same at every mark, so that only a frame's own scores tell whether it fell.
+        frames: Which those were, by their numbers in the video, each with its own PSNR of the whole
+            picture: they need not be the same at every mark, so that only a frame's own scores tell
+            whether it fell.
+        video: Whose frames they are: 1 for the video that was learnt first.
     """
 
     wall_seconds: float
@@ -25,6 +27,7 @@ class CurvePoint:
     psnr_mask: float | None
     verdict: str | None = None
     frames: tuple[tuple[int, float], ...] = ()
+    video: int = 1
 
     @classmethod
     def again(cls, content: dict[str, Any]) -> "CurvePoint":
@@ -33,15 +36,22 @@ class CurvePoint:
         return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
 
 
-def largest_fall(curve: Sequence[CurvePoint]) -> float | None:
-    """How far any held-out frame has fallen below its own best by a later mark, dB.
+def largest_falls(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
+    """How far each held-out frame fell below its own best by a later mark, dB; 0 if it did not.
 
-    None if no frame was scored twice.
+    By video and number, of the frames that were scored more than once.
     """
-    best: dict[int, float] = {}
-    falls: list[float] = []
-    for frame, value in (pair for point in curve for pair in point.frames):
-        if frame in best:
-            falls.append(best[frame] - value)
-        best[frame] = max(best.get(frame, value), value)
-    return max(0.0, *falls) if falls else None
+    best: dict[tuple[int, int], float] = {}
+    falls: dict[tuple[int, int], float] = {}
+    for point in curve:
+        for number, value in point.frames:
+            frame = point.video, number
+            if frame in best:
+                falls[frame] = max(falls.get(frame, 0.0), best[frame] - value)
+            best[frame] = max(best.get(frame, value), value)
+    return falls
+
+
+def largest_fall(curve: Sequence[CurvePoint]) -> float | None:
+    """The largest of `largest_falls`, dB; None if no frame was scored twice."""
+    return max(largest_falls(curve).values(), default=None)

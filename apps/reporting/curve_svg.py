@@ -9,20 +9,23 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
 """Room around the plot for its labels."""
 
 Place = Callable[[float], float]
+Scored = list[tuple[CurvePoint, float]]
 
 
 def curve_svg(curve: Sequence[CurvePoint]) -> str:
     """PSNR of held-out frames over seconds of training: whole picture, and inside the mask.
 
+    Each video has a line of its own: what was held out of one cannot be compared with another's.
+
     An empty string if nothing was measured.
     """
-    whole = [(p.wall_seconds, p.psnr) for p in curve if p.psnr is not None]
-    masked = [(p.wall_seconds, p.psnr_mask) for p in curve if p.psnr_mask is not None]
+    whole = [(p, p.psnr) for p in curve if p.psnr is not None]
+    masked = [(p, p.psnr_mask) for p in curve if p.psnr_mask is not None]
     if not whole:
         return ""
     values = [value for _, value in whole + masked]
     low, high = 5.0 * (min(values) // 5.0), 5.0 * (max(values) // 5.0 + 1.0)
-    end = max(seconds for seconds, _ in whole)
+    end = max(point.wall_seconds for point, _ in whole)
 
     def x(seconds: float) -> float:
         return LEFT + (WIDTH - LEFT - RIGHT) * seconds / max(end, 1e-6)
@@ -34,8 +37,9 @@ def curve_svg(curve: Sequence[CurvePoint]) -> str:
         f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
         'aria-label="PSNR of held-out frames over seconds of training">',
         *_axes(x, y, low, high, end),
-        *_line(masked, x, y, "masked", "inside the mask"),
-        *_line(whole, x, y, "whole", "whole picture"),
+        *_videos(whole, x),
+        *_lines(masked, x, y, "masked", "inside the mask"),
+        *_lines(whole, x, y, "whole", "whole picture"),
         "</svg>",
     ]
     return "\n".join(parts)
@@ -67,15 +71,26 @@ def _ticks(end: float) -> list[float]:
     return [step * i for i in range(int(end / step) + 1)]
 
 
-def _line(
-    points: list[tuple[float, float]], x: Place, y: Place, kind: str, label: str
-) -> list[str]:
-    if not points:
-        return []
-    path = " ".join(f"{x(seconds):.1f},{y(value):.1f}" for seconds, value in points)
-    dots = [
-        f'<circle class="{kind}" cx="{x(seconds):.1f}" cy="{y(value):.1f}" r="4">'
-        f"<title>{seconds:.1f} s: {value:.2f} dB {label}</title></circle>"
-        for seconds, value in points
+def _videos(scored: Scored, x: Place) -> list[str]:
+    """Where each video's line begins, if there are several."""
+    first = {point.video: point.wall_seconds for point, _ in reversed(scored)}
+    return [
+        f'<text class="tick" x="{x(seconds):.1f}" y="{TOP - 12}">video {video}</text>'
+        for video, seconds in sorted(first.items())
+        if len(first) > 1
     ]
-    return [f'<polyline class="{kind}" points="{path}"/>', *dots]
+
+
+def _lines(scored: Scored, x: Place, y: Place, kind: str, label: str) -> list[str]:
+    parts = []
+    for video in sorted({point.video for point, _ in scored}):
+        points = [(p, value) for p, value in scored if p.video == video]
+        path = " ".join(f"{x(p.wall_seconds):.1f},{y(value):.1f}" for p, value in points)
+        parts.append(f'<polyline class="{kind}" points="{path}"/>')
+        parts += [
+            f'<circle class="{kind}" cx="{x(p.wall_seconds):.1f}" cy="{y(value):.1f}" r="4">'
+            f"<title>{p.wall_seconds:.1f} s: {value:.2f} dB {label}, mean over "
+            f"{len(p.frames)} held-out frames</title></circle>"
+            for p, value in points
+        ]
+    return parts

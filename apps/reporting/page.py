@@ -6,7 +6,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from apps.reporting.curve import largest_fall
+from apps.reporting.curve import CurvePoint, largest_falls
 from apps.reporting.curve_svg import curve_svg
 from apps.reporting.report import Report, decibels, percent
 
@@ -63,6 +63,7 @@ def report_page(
             f'<p class="failure">{escape(failure)}</p>' if failure else "",
             _tiles(report),
             _section("How it learnt", _curve(report)),
+            _section("The video before", _extended(report)),
             _section("What the camera has seen", _coverage(report, body_map)),
             _section("Where the camera was", _cameras(report, present)),
             _section("Frames it was never trained on", _pairs(pairs)),
@@ -85,10 +86,34 @@ def _lead(report: Report) -> str:
     training, machine = report.training, report.machine
     threads = "one thread" if machine.threads == 1 else f"{machine.threads} threads"
     where = f"a CPU, {threads}" if machine.device == "cpu" else "a GPU"
-    return (
-        f"An avatar from {report.frames.used} frames, learnt in {training.wall_seconds:.0f} "
-        f"seconds on {where}."
-    )
+    earlier, learnt = report.extended, f"{training.wall_seconds:.0f} seconds"
+    frames = f"{report.frames.used} frames"
+    if earlier is not None:
+        frames += f" of this video, and {earlier.used} of {_list(earlier.videos)} before"
+        now_s = training.wall_seconds - earlier.wall_seconds
+        learnt += f" ({now_s:.0f} on this video)"
+    return f"An avatar from {frames}, learnt in {learnt} on {where}."
+
+
+def _list(names: Sequence[str]) -> str:
+    return " and ".join(names) or "an earlier video"
+
+
+def _extended(report: Report) -> str:
+    """Two sentences, if the video was added to an avatar."""
+    earlier = report.extended
+    if earlier is None:
+        return ""
+    told = f"{earlier.recalled} frames of {_list(earlier.videos)} were learnt from again. "
+    if earlier.psnr_before is None or earlier.psnr_after is None or earlier.largest_fall is None:
+        told += "None of its frames had been held out, so what it lost cannot be said."
+    else:
+        told += (
+            f"Held-out frames there ({len(earlier.frames)}): {earlier.psnr_before:.2f} dB before "
+            f"this video, {earlier.psnr_after:.2f} dB now; none of them lost more than "
+            f"{earlier.largest_fall:.2f} dB."
+        )
+    return f'<p class="legend">{escape(told)}</p>'
 
 
 def _tiles(report: Report) -> str:
@@ -124,13 +149,32 @@ def _curve(report: Report) -> str:
     svg = curve_svg(report.curve)
     if not svg:
         return ""
-    fall = largest_fall(report.curve)
-    told = "" if fall is None else f"No frame fell more than {fall:.1f} dB below its best."
     return (
-        f'<div class="card">{svg}<p class="legend">PSNR of held-out frames'
+        f'<div class="card">{svg}<p class="legend">Mean PSNR of the held-out frames so far'
         '<i style="background:var(--whole)"></i>whole picture'
-        f'<i style="background:var(--masked)"></i>inside the mask. {told}</p></div>'
+        '<i style="background:var(--masked)"></i>inside the mask. '
+        f"{_own_falls(report.curve)}</p></div>"
     )
+
+
+def _own_falls(curve: Sequence[CurvePoint]) -> str:
+    """How the frames themselves fared, where marks are means over different frames."""
+    scored = [len(point.frames) for point in curve if point.frames]
+    falls = largest_falls(curve)
+    told = ""
+    if len({(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}) > 1:
+        told = (
+            f"Marks are means over different frames ({min(scored)} to {max(scored)} of them), so "
+            "the line can fall where no frame does. "
+        )
+    if falls:
+        told += (
+            f"Of the {len(falls)} frames that were scored more than once, none was at any "
+            f"later mark more than {max(falls.values()):.1f} dB below its own best."
+        )
+    elif scored:
+        told += "No frame was scored more than once, so whether one got worse cannot be said."
+    return told
 
 
 def _cameras(report: Report, present: Collection[str]) -> str:

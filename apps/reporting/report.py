@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -203,30 +204,50 @@ class CoverageNote:
 
 @dataclass(frozen=True, kw_only=True)
 class ExtendedNote:
-    """What became of an earlier video when this one was added.
+    """What became of earlier videos when this one was added.
 
     Attributes:
-        recalled: Its key frames that were learnt from again.
-        frames: Its frames that were scored, by their numbers in it; never trained on.
+        videos: Names of the videos that were learnt before, in order.
+        used: How many of their frames the avatar had been trained on.
+        wall_seconds: How long it had been trained.
+        recalled: Their key frames that were learnt from again.
+        frames: Their held-out frames that were scored, by their numbers in their own video.
+        video_of_frame: Of which of `videos` each of those is, counted from 1.
         psnr_before, psnr_after: Means over them before this video, and at the end, dB.
         largest_fall: Of any of them, dB; 0 if none fell.
     """
 
+    videos: tuple[str, ...]
+    used: int
+    wall_seconds: float
     recalled: int
     frames: tuple[int, ...]
+    video_of_frame: tuple[int, ...]
     psnr_before: float | None
     psnr_after: float | None
     largest_fall: float | None
 
     @classmethod
     def of(
-        cls, before: tuple[Score, ...], after: tuple[Score, ...], *, recalled: int
+        cls,
+        before: tuple[Score, ...],
+        after: tuple[Score, ...],
+        *,
+        videos: tuple[str, ...],
+        video_of_frame: Sequence[int],
+        used: int,
+        wall_seconds: float,
+        recalled: int,
     ) -> "ExtendedNote":
-        """From the scores of the same frames."""
+        """From the scores of the same frames before and after."""
         falls = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
         return cls(
+            videos=videos,
+            used=used,
+            wall_seconds=wall_seconds,
             recalled=recalled,
             frames=tuple(score.frame for score in before),
+            video_of_frame=tuple(video_of_frame),
             psnr_before=mean([score.psnr for score in before]),
             psnr_after=mean([score.psnr for score in after]),
             largest_fall=max(0.0, *falls) if falls else None,

@@ -25,7 +25,7 @@ FRAME_PX = (720, 440)
 """Width and height that a frame in the panel must fit into; it is shown at half of that."""
 TEAL, ORANGE = "#1f6f8b", "#c8742b"
 CURVE_TITLE = (
-    "<h2>Frames it never trains on, dB over seconds</h2>"
+    "<h2>Frames it never trains on: mean of those so far, dB over seconds</h2>"
     f'<p class="legend"><i style="background:{TEAL}"></i>whole picture'
     f'<i style="background:{ORANGE}"></i>inside the mask</p>'
 )

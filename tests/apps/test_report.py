@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from apps.learning.deliver import play_command
-from apps.reporting.curve import CurvePoint, largest_fall
+from apps.reporting.curve import CurvePoint, largest_fall, largest_falls
 from apps.reporting.curve_svg import curve_svg
 from apps.reporting.failure import failure_of
 from apps.reporting.page import Pair, report_page
 from apps.reporting.pictures import data_uri, moving_data_uri
 from apps.reporting.report import (
     DroppedNote,
+    ExtendedNote,
     FramesNote,
     HeldOutNote,
     MachineNote,
@@ -120,6 +121,56 @@ def test_a_fall_is_a_frames_own_and_not_that_of_a_mean():
     assert largest_fall(joined) == pytest.approx(0.5)
     assert largest_fall(joined[:2]) == 0.0
     assert largest_fall(joined[:1]) is None
+
+
+def test_a_frame_of_another_video_has_no_best_in_this_one():
+    first = replace(point(2.0, 30.0), frames=((9, 30.0),))
+    added = replace(point(4.0, 20.0), frames=((9, 20.0), (19, 21.0)), video=2)
+    assert largest_fall((first, added)) is None
+    lower = replace(point(6.0, 19.0), frames=((9, 19.5), (19, 22.0)), video=2)
+    assert largest_falls((first, added, lower)) == {(2, 9): 0.5, (2, 19): 0.0}
+
+
+def test_the_page_says_what_the_curve_is_a_mean_of():
+    """Where it falls because other frames joined, that is said; where frames fall, how far."""
+    one = replace(point(2.0, 30.0), frames=((9, 30.0),))
+    nine = replace(point(5.0, 24.0), frames=((9, 30.0), (19, 18.0)))
+    joined = report_page(report(curve=(one, nine)), name="clip")
+    assert "means over different frames (1 to 2 of them)" in joined
+    assert "Of the 1 frames that were scored more than once" in joined
+    assert "more than 0.0 dB below its own best" in joined
+    fallen = replace(point(9.0, 22.0), frames=((9, 28.0), (19, 16.0)))
+    same = report_page(report(curve=(nine, fallen)), name="clip")
+    assert "different frames" not in same
+    assert "Of the 2 frames" in same
+    assert "more than 2.0 dB below its own best" in same
+    assert "whether one got worse cannot be said" in report_page(report(curve=(one,)), name="clip")
+
+
+def test_the_page_tells_of_the_video_before():
+    marks = (
+        point(2.0, 24.0),
+        replace(point(40.0, 20.0), video=2),
+        replace(point(50.0, 21.0), video=2),
+    )
+    before, after = scores((20.0, 18.0), (22.0, 19.0)), scores((21.0, 18.0), (21.5, 19.0))
+    earlier = ExtendedNote.of(
+        before, after, videos=("first <1>.mp4",), video_of_frame=(1, 1), used=54, wall_seconds=30.0,
+        recalled=40,
+    )  # fmt: skip
+    page = report_page(report(extended=earlier, curve=marks), name="second.mp4")
+    lead = "17 frames of this video, and 54 of first &lt;1&gt;.mp4 before"
+    assert lead in page
+    assert "60 seconds (30 on this video)" in page
+    assert "40 frames of first" in page
+    assert "21.00 dB before this video, 21.25 dB now; none of them lost more than 0.50 dB" in page
+    svg = ElementTree.fromstring(curve_svg(marks))
+    lines = [line.get("points").split() for line in svg.findall("polyline[@class='whole']")]
+    assert [len(line) for line in lines] == [1, 2]
+    assert [text.text for text in svg.findall("text") if "video" in text.text] == [
+        "video 1",
+        "video 2",
+    ]
 
 
 def test_a_point_of_the_curve_survives_a_checkpoint():

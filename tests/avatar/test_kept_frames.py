@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avatar.hold import HeldOut
-from avatar.kept_frames import CLIP, HELD_OUT, KeptFrames
+from avatar.kept_frames import CLIP, HELD_OUT, KeptFrames, number_in_video, videos_ago
 from avatar.prepare import prepare, restored
 from avatar.replay import Replay
 from capture.errors import BadInput
@@ -73,8 +73,11 @@ def test_frames_of_an_earlier_video_have_numbers_of_their_own(kept):
     assert [frame.index + 2 * CLIP for frame in earlier.key_frames] == [
         frame.index for frame in kept.key_frames
     ]
-    assert [h.observation.frame.index % CLIP for h in earlier.held] == [3, 4]
-    assert all(h.observation.frame.index < 0 for h in earlier.held)
+    indices = [h.observation.frame.index for h in earlier.held]
+    assert all(index < 0 for index in indices)
+    assert [number_in_video(index) for index in indices] == [3, 4]
+    assert [videos_ago(index) for index in indices] == [2, 2]
+    assert [videos_ago(h.observation.frame.index) for h in kept.held] == [0, 0]
 
 
 def test_few_held_out_frames_are_kept_of_many(clip):
