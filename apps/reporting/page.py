@@ -162,14 +162,15 @@ def _own_falls(curve: Sequence[CurvePoint]) -> str:
     scored = [len(point.frames) for point in curve if point.frames]
     falls = largest_falls(curve)
     told = ""
-    if len({(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}) > 1:
+    sets = {(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}
+    if len(sets) > len({video for video, _ in sets}):
         told = (
             f"Marks are means over different frames ({min(scored)} to {max(scored)} of them), so "
             "the line can fall where no frame does. "
         )
     if falls:
         told += (
-            f"Of the {len(falls)} frames that were scored more than once, none was at any "
+            f"Of the held-out frames, {len(falls)} {'was' if len(falls) == 1 else 'were'} scored more than once; none was at any "
             f"later mark more than {max(falls.values()):.1f} dB below its own best."
         )
     elif scored:

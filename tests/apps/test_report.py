@@ -137,12 +137,14 @@ def test_the_page_says_what_the_curve_is_a_mean_of():
     nine = replace(point(5.0, 24.0), frames=((9, 30.0), (19, 18.0)))
     joined = report_page(report(curve=(one, nine)), name="clip")
     assert "means over different frames (1 to 2 of them)" in joined
-    assert "Of the 1 frames that were scored more than once" in joined
+    assert "Of the held-out frames, 1 was scored more than once" in joined
     assert "more than 0.0 dB below its own best" in joined
     fallen = replace(point(9.0, 22.0), frames=((9, 28.0), (19, 16.0)))
     same = report_page(report(curve=(nine, fallen)), name="clip")
     assert "different frames" not in same
-    assert "Of the 2 frames" in same
+    assert "Of the held-out frames, 2 were" in same
+    other = replace(fallen, frames=((3, 28.0), (13, 16.0)), video=2)
+    assert "different frames" not in report_page(report(curve=(nine, fallen, other)), name="clip")
     assert "more than 2.0 dB below its own best" in same
     assert "whether one got worse cannot be said" in report_page(report(curve=(one,)), name="clip")
 
