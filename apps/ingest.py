@@ -77,13 +77,16 @@ def _learnt_and_delivered(
         with console.waiting("loading torch"):
             from apps.learning.deliver import RunNote, deliver
             from apps.learning.learn import Lesson
-            from apps.terminal.device import device_for
+            from apps.terminal.device import SLOW_ON_CUDA, device_for
             from apps.terminal.threads import use_threads
             from avatar.kernels.choice import backend_for
 
             threads = use_threads(given.threads)
         with console.waiting("compiling kernels (slow on the first run only)"):
-            backend_for(device_for(given.device))  # a bad --device is said here, too
+            device = device_for(given.device)
+            backend_for(device)
+        if device.type == "cuda":
+            console.warn(SLOW_ON_CUDA)
     if attempt is not None:
         recording = attempt.before(recording, console)
     with nothing_to_save(console, PROGRAM):

@@ -119,7 +119,8 @@ class IngestArguments:
     turn the avatar, see what the camera has not seen yet, pause, save a package now. Needs viser:
     pip install 'instant-avatar-stream[viewer]'. Ctrl-C closes the page in the end."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to train; auto takes a GPU if there is one."""
+    """Where to train; auto is the CPU. There are no CUDA kernels yet: cuda runs the plain-torch
+    reference, which is slower."""
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Threads of the trainer; without it one for each core."""
     seed: int = 0

@@ -64,7 +64,10 @@ def _still(suffix: str) -> Callable[[SkinnedMesh], bytes]:
     """Return what encodes the canonical pose; colors are sRGB, as programs take a PLY's to be."""
     import trimesh  # an installation of the player alone has none, and is told what to install
 
-    options = {".ply": {"vertex_normal": True}, ".obj": {"include_normals": True}}[suffix]
+    options: dict[str, Any] = {
+        ".ply": {"vertex_normal": True},
+        ".obj": {"include_normals": True},
+    }[suffix]
 
     def encoded(mesh: SkinnedMesh) -> bytes:
         solid = trimesh.Trimesh(

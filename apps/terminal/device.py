@@ -1,23 +1,28 @@
-"""Where training runs."""
+"""The device that trains and renders."""
 
 import torch
 
 from capture.errors import BadInput
 
+SLOW_ON_CUDA = (
+    "--device cuda runs the plain-torch reference, which is slower than the CPU: there are no CUDA "
+    "kernels yet. Leave --device out to train on the CPU."
+)
 
-def device_for(wish: str) -> torch.device:
-    """The device that was asked for.
+
+def device_for(name: str) -> torch.device:
+    """Returns the device for --device.
 
     Args:
-        wish: "cpu", "cuda", or "auto": a GPU if there is one.
+        name: "cpu", "cuda", or "auto". Auto is the CPU, which is faster until there are CUDA
+            kernels.
 
     Raises:
-        BadInput: If a GPU was asked for, and there is none.
+        BadInput: If CUDA was asked for, and torch sees no GPU.
     """
-    if wish == "cuda" and not torch.cuda.is_available():
+    if name == "cuda" and not torch.cuda.is_available():
         raise BadInput(
             "--device cuda was asked for, but torch sees no GPU here. Leave --device out, or "
             "install torch with CUDA and check nvidia-smi."
         )
-    wanted = wish != "cpu" and torch.cuda.is_available()
-    return torch.device("cuda" if wanted else "cpu")
+    return torch.device("cuda" if name == "cuda" else "cpu")

@@ -62,3 +62,12 @@ def test_masks_cannot_be_dark_and_bright(program, capsys):
     words = ["capture", "--mask-invert", "--no-mask-invert"]
     assert getattr(importlib.import_module(module), function)(words) == 2
     assert "contradict" in capsys.readouterr().err
+
+
+def test_auto_trains_on_the_cpu_even_if_torch_sees_a_gpu(monkeypatch):
+    import torch
+
+    from apps.terminal.device import device_for
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [device_for(name).type for name in ("auto", "cpu", "cuda")] == ["cpu", "cpu", "cuda"]
