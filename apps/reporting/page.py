@@ -169,8 +169,9 @@ def _own_falls(curve: Sequence[CurvePoint]) -> str:
             "the line can fall where no frame does. "
         )
     if falls:
+        were = "was" if len(falls) == 1 else "were"
         told += (
-            f"Of the held-out frames, {len(falls)} {'was' if len(falls) == 1 else 'were'} scored more than once; none was at any "
+            f"Of the held-out frames, {len(falls)} {were} scored more than once; none was at any "
             f"later mark more than {max(falls.values()):.1f} dB below its own best."
         )
     elif scored:
