@@ -18,7 +18,8 @@ from apps.recording.wanted import RecordingPaths
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
-from apps.terminal.whole import check_file_place, write_text
+from apps.terminal.places import check_apart, check_file_place
+from capture.atomic_files import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 from preprocess.doctor.diagnosis import GOOD, USABLE
@@ -77,6 +78,8 @@ class CheckArguments:
     """Where the sheet of pictures goes; without it runs/NAME-check.png, after the video."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write what was found to this file."""
+    overwrite: Flag = False
+    """Replace the files that --sheet and --json name, if they are there."""
 
     def wanted(self) -> RecordingPaths:
         """What is to be opened.
@@ -103,11 +106,15 @@ class CheckArguments:
         Raises:
             BadInput: If not.
         """
+        inputs = self.wanted().inputs()
         if self.json is not None:
-            check_file_place(self.json, "--json")
+            check_file_place(self.json, "--json", inputs, overwrite=self.overwrite)
         if self.sheet is not None and self.sheet.suffix.lower() not in SHEETS:
             raise BadInput(f"--sheet is {self.sheet}; a name in {', '.join(SHEETS)} was expected.")
-        check_file_place(self.sheet_path(), "--sheet")
+        check_file_place(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
+        if self.fix is not None:
+            check_apart(self.fix, "--fix", inputs)
+            check_new_folder(self.fix)
 
     def sheet_path(self) -> Path:
         """Where the sheet goes."""
@@ -131,20 +138,23 @@ def check(given: CheckArguments, console: Console) -> int:
     """
     wanted = given.wanted()
     given.check_places()
-    if given.fix is not None:
-        check_new_folder(given.fix)
     try:
         with console.waiting("looking at poses, masks and cameras"):
             examined = examine(wanted)
     except BadInput as error:
         if given.json is not None:
-            write_text(given.json, json.dumps(unreadable(str(error)), indent=1) + "\n")
+            write_text(
+                given.json, json.dumps(unreadable(str(error)), indent=1) + "\n",
+                replace=given.overwrite,
+            )  # fmt: skip
         raise
     if given.json is not None:
-        write_text(given.json, json.dumps(as_json(examined), indent=1) + "\n")
+        text = json.dumps(as_json(examined), indent=1) + "\n"
+        write_text(given.json, text, replace=given.overwrite)
     _say(examined, console)
-    if write_sheet(given.sheet_path(), examined):
-        console.made("look at it", given.sheet_path())
+    path, ours = given.sheet_path(), given.sheet is None
+    if write_sheet(path, examined, replace=given.overwrite, listed=ours):
+        console.made("look at it", path)
     if given.fix is not None:
         write_mended(examined, given.fix)
         console.made("mended", given.fix)

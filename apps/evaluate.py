@@ -39,7 +39,7 @@ def evaluate(given: EvaluateArguments, console: Console) -> int:
         from apps.evaluating.rows import to_json
         from apps.evaluating.table import table
         from apps.terminal.interrupt import asked_to_stop
-        from apps.terminal.whole import write_text
+        from capture.atomic_files import write_text
 
     found: list[Evaluation] = []
     with asked_to_stop(console, "the table shows what was scored") as stop:
@@ -55,9 +55,9 @@ def evaluate(given: EvaluateArguments, console: Console) -> int:
     told = table(found)
     print(told, end="")  # noqa: T201 - the table goes to stdout, for scripts
     if given.json is not None:
-        write_text(given.json, to_json(found))
+        write_text(given.json, to_json(found), replace=given.overwrite)
     if given.markdown is not None:
-        write_text(given.markdown, told)
+        write_text(given.markdown, told, replace=given.overwrite)
     return INTERRUPTED if stop.is_set() else DONE
 
 

@@ -1,5 +1,6 @@
 """ia-export: what a run has learnt so far, as a package or a mesh that others can use."""
 
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -8,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.learning.run_folder import RunFolder
 from apps.playing.novel import novel_motion
 from apps.terminal.command_line import parsed
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import DONE, NO_AVATAR, Stop, exit_code
-from apps.terminal.whole import check_file_place
+from apps.terminal.places import check_file_place
+from capture.atomic_files import whole_file
 from capture.camera import Camera
 from capture.errors import BadInput
 from preprocess.pose import BodyPose
@@ -63,6 +65,9 @@ class ExportArguments:
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Whose poses, where the file holds several people's; without it whoever has most."""
 
+    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    """Replace the file that --out names, if there is one."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
@@ -82,18 +87,21 @@ def export(given: ExportArguments, console: Console) -> int:
         raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
     if not given.out.resolve().parent.is_dir():
         raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
-    check_file_place(given.out, "--out")
+    inputs = [path for path in (given.run, given.poses) if path is not None and path.is_file()]
+    check_file_place(given.out, "--out", inputs, overwrite=given.overwrite)
     if given.poses is not None and given.to != "glb":
         raise BadInput(f"--poses go into a .glb; a .{given.to} holds no motion. Leave them out.")
-    if given.to == "iavatar":
-        _package(given.run, given.out, console)
-    elif given.run.is_dir():
+    if given.run.is_file() and given.to != "iavatar":
+        _mesh(given, given.run, console)
+    else:
         with tempfile.TemporaryDirectory() as folder:
             package = Path(folder) / "avatar.iavatar"
-            _package(given.run, package, console, for_player=False)
-            _mesh(given, package, console)
-    else:
-        _mesh(given, given.run, console)
+            _package(given.run, package, console, for_player=given.to == "iavatar")
+            if given.to != "iavatar":
+                _mesh(given, package, console)
+            else:
+                with whole_file(given.out, replace=given.overwrite) as part:
+                    shutil.copyfile(package, part)
     console.made("mesh" if given.to != "iavatar" else "package", given.out)
     return DONE
 
@@ -102,8 +110,9 @@ def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
     from apps.playing.mesh_file import write_mesh
 
     write_mesh(
-        package, given.out, console, poses=given.poses, name=given.out.stem, person=given.person
-    )
+        package, given.out, console, poses=given.poses, name=given.out.stem, person=given.person,
+        replace=given.overwrite,
+    )  # fmt: skip
 
 
 def _package(folder: Path, out: Path, console: Console, *, for_player: bool = True) -> None:

@@ -18,7 +18,7 @@ from apps.terminal.console import Console
 from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_AVATAR, Stop, exit_code
 from apps.terminal.interrupt import asked_to_stop, nothing_to_save
 from apps.terminal.port import with_port
-from apps.terminal.whole import write_text
+from capture.atomic_files import write_text
 from capture.camera_device import camera_address
 from capture.errors import BadInput
 
@@ -52,9 +52,18 @@ def ingest(given: IngestArguments, console: Console) -> int:
     started = time.perf_counter()
     given.check()
     run = given.run_folder()
-    run.check(resume=given.resume, overwrite=given.overwrite)
+    run.check(given.inputs(), resume=given.resume, overwrite=given.overwrite)
+    with run.claimed(console, resume=given.resume, overwrite=given.overwrite):
+        return _opened_and_learnt(given, run, console, started)
+
+
+def _opened_and_learnt(
+    given: IngestArguments, run: RunFolder, console: Console, started: float
+) -> int:
+    """All that is done while no other run may write into the folder."""
     with console.waiting("opening video and poses"):
         recording = _opened(given)
+    run.check(given.inputs(recording), resume=given.resume, overwrite=given.overwrite)
     console.say(_described(recording))
     for note in recording.notes:
         console.warn(note)
@@ -109,7 +118,7 @@ def _learnt_and_delivered(
             note = RunNote(command=given.as_json(), startup_seconds=startup, threads=threads)
             delivered = deliver(learnt, taken, recording, run, note, console)
             if given.json is not None:
-                write_text(given.json, delivered.report.to_json())
+                write_text(given.json, delivered.report.to_json(), replace=given.replaces_json)
             code = _conclude(delivered, run, console, interrupted=stop.is_set())
         if viewer is not None and code == DONE:
             console.say(f"The page stays at {viewer.page.address}. Ctrl-C ends it.")
@@ -123,7 +132,6 @@ def _learnt_and_delivered(
     finally:
         if viewer is not None:
             viewer.close()
-        run.tidy()
 
 
 def _opened(given: IngestArguments) -> Recording:

@@ -50,7 +50,7 @@ def _clip(given: PlayArguments, console: Console) -> int:
 
     out = given.clip
     suffix = out.suffix.lower()
-    check_clip(out)
+    check_clip(out, given.inputs, overwrite=given.overwrite)
     clear = suffix in ("", ".png") if given.background is None else given.background == TRANSPARENT
     blend = None if clear else background(given.background or "white")
     encoder = encoder_of(out, blend)
@@ -74,7 +74,9 @@ def _clip(given: PlayArguments, console: Console) -> int:
                     drawn.close()
                     return
 
-        count = write_clip(out, pictures(), fps=shots.fps, blend=blend, encoder=encoder)
+        count = write_clip(
+            out, pictures(), fps=shots.fps, blend=blend, encoder=encoder, replace=given.overwrite
+        )
     width, height = shots.cameras[0].size_px
     pace = f" at {shots.fps:.4g} a second" if count > 1 else ""
     what = "a picture" if count == 1 else f"{count} pictures"
@@ -94,7 +96,7 @@ def _warn(player: "Player", console: Console) -> None:
 def _bench(given: PlayArguments, console: Console) -> int:
     from apps.playing.bench import benchmark
     from apps.playing.shots import shots_of
-    from apps.terminal.whole import write_text
+    from capture.atomic_files import write_text
     from export.player import Player
 
     started = time.perf_counter()
@@ -110,7 +112,7 @@ def _bench(given: PlayArguments, console: Console) -> int:
         samples=given.samples,
     )
     if given.json is not None:
-        write_text(given.json, result.to_json())
+        write_text(given.json, result.to_json(), replace=given.overwrite)
     console.say(
         f"{result.cpu_ms_per_frame:.1f} CPU-ms a picture of {result.size} px, "
         f"{result.pictures_per_second:.1f} pictures a second with {_counted(result.workers)} "
@@ -128,7 +130,8 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
     from apps.playing.driving import driving_motion
     from apps.playing.novel import novel_motion
     from apps.playing.rate import poses_a_second
-    from apps.playing.web import check_folder, clip_of, serve, write_site
+    from apps.playing.web import clip_of, serve, write_site
+    from apps.terminal.places import check_folder_place
     from export.player import Player
     from export.web.runtime import runtime_files
     from export.web.site import site
@@ -137,7 +140,7 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
         raise BadInput(f"--web {port} is no port; 1 to 65535 were expected.")
     runtime_files()
     if given.out is not None:
-        check_folder(given.out)
+        check_folder_place(given.out, "--out", given.inputs)
     player = Player.load(given.avatar)
     _warn(player, console)
     joints, motion = player.manifest.rest_joints, novel_motion()
@@ -162,11 +165,11 @@ def _web(given: PlayArguments, port: int, console: Console) -> int:
 
 def _verify(given: PlayArguments, console: Console) -> int:
     from apps.playing.verdict import verdict_of
-    from apps.terminal.whole import write_text
+    from capture.atomic_files import write_text
 
     verdict = verdict_of(given.avatar, provider=given.provider)
     if given.json is not None:
-        write_text(given.json, verdict.to_json())
+        write_text(given.json, verdict.to_json(), replace=given.overwrite)
     for line in verdict.lines():
         console.say(line)
     return DONE if verdict.same else BAD_INPUT

@@ -10,7 +10,7 @@ from PIL import Image
 
 from apps.playing.background import background
 from apps.playing.follow import FollowingCamera
-from apps.terminal.whole import whole_file
+from capture.atomic_files import whole_file
 from capture.opening import open_source
 from export.player import Player
 from preprocess.camera_file import read_cameras

@@ -1,8 +1,6 @@
 """The `.iavatar` file: manifest, graph and compact streams in a zip, whole or not at all."""
 
 import hashlib
-import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -14,6 +12,7 @@ from typing import Any, BinaryIO, final
 import numpy as np
 from jaxtyping import UInt8
 
+from capture.atomic_files import Draft
 from capture.errors import BadInput
 from export.codec import Layout, decode, encode
 from export.manifest import Manifest
@@ -90,7 +89,7 @@ class PackageDraft:
         """Nothing is opened yet.
 
         Args:
-            path: Where the package will stand; replaced at once if it exists.
+            path: Where the package will stand; an older one is replaced when this one is finished.
         """
         self._path = path
         self._sums: dict[str, str] = {}
@@ -101,11 +100,8 @@ class PackageDraft:
         Raises:
             OSError: If the folder cannot be written.
         """
-        descriptor, temporary = tempfile.mkstemp(
-            dir=self._path.parent, prefix=f".{self._path.name}."
-        )
-        self._temporary: Path | None = Path(temporary)
-        self._file = os.fdopen(descriptor, "wb")
+        self._draft = Draft(self._path)
+        self._file = self._draft.part.open("wb")
         self._archive = zipfile.ZipFile(self._file, "w")
         return self
 
@@ -123,7 +119,6 @@ class PackageDraft:
         Returns:
             Its size in bytes.
         """
-        assert self._temporary is not None
         for tier, graph in package.graphs.items():
             self._add(graph_entry(tier), graph)
         self._add(PREVIEW, package.preview)
@@ -132,25 +127,18 @@ class PackageDraft:
         manifest = replace(package.manifest, sha256=dict(self._sums))
         self._add(MANIFEST, manifest.to_json().encode())
         self._archive.close()
-        self._file.flush()
-        os.fsync(self._file.fileno())
         size = self._file.tell()
         self._file.close()
-        self._temporary.chmod(0o644)
-        self._temporary.replace(self._path)
-        self._temporary = None
+        self._draft.finish()
         return size
 
     def __exit__(self, *_: object) -> None:
         """Removes what was not finished."""
-        if self._temporary is None:
-            return
         with suppress(OSError, ValueError):  # a full disk fails again when the rest is flushed
             self._archive.close()
         with suppress(OSError):
             self._file.close()
-        with suppress(FileNotFoundError):
-            self._temporary.unlink()
+        self._draft.discard()
 
     def _add(self, name: str, content: bytes) -> None:
         self._sums[name] = hashlib.sha256(content).hexdigest()

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from apps.checking.examine import Examined
-from apps.terminal.whole import check_place, whole_folder
+from apps.terminal.places import check_place
+from capture.atomic_files import whole_folder
 from capture.errors import BadInput
 from capture.images import list_images
 from preprocess.doctor.claim import Claim, step_of
@@ -46,7 +47,7 @@ def write_mended(examined: Examined, out: Path) -> None:
         raise BadInput("No mistake was found that could be mended, so --fix writes nothing.")
     check_new_folder(out)
     recording, healed = examined.recording, examined.diagnosis.healed
-    with whole_folder(out) as part:
+    with whole_folder(out, listed=False) as part:
         if recording.source.path.is_dir():
             _linked(list_images(recording.source.path), part / "images")
         else:

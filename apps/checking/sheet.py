@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from apps.checking.examine import Examined
-from apps.terminal.whole import whole_file
+from capture.atomic_files import whole_file
+from capture.file_list import FileList
 from capture.frame import Frame
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import Evidence, Witness
@@ -25,10 +26,18 @@ LABEL_PX = 26
 Rgb = UInt8[np.ndarray, "height width 3"]
 
 
-def write_sheet(path: Path, examined: Examined) -> bool:
+def write_sheet(
+    path: Path, examined: Examined, *, replace: bool | None = None, listed: bool = False
+) -> bool:
     """Draws a few frames: white the mask's outline, orange the body's, and their agreement.
 
     The second row, if there is one, is what the named cures would make of it.
+
+    Args:
+        path: Where to.
+        examined: What is drawn.
+        replace: Whether a file that is there already may go, as of `whole_file`.
+        listed: Whether the folder gets a list, by which a later sheet may replace this one.
 
     Returns:
         Whether there was anything to draw.
@@ -46,7 +55,10 @@ def write_sheet(path: Path, examined: Examined) -> bool:
     if examined.diagnosis.cures:
         rows.append(_row(shown, examined.diagnosis.healed, evidence, "mended"))
     sheet = np.concatenate(rows)
-    with whole_file(path) as part:
+    if listed:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        FileList(path.parent).make()
+    with whole_file(path, replace=replace) as part:
         _, code = cv2.imencode(
             path.suffix.lower() or ".png", np.ascontiguousarray(sheet[..., ::-1])
         )

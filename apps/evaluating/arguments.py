@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.ingest_arguments import parsed_frames
 from apps.recording.wanted import RecordingPaths
-from apps.terminal.whole import check_file_place
+from apps.terminal.places import check_file_place
 from capture.errors import BadInput
 
 
@@ -70,6 +70,8 @@ class EvaluateArguments:
     """Write all figures to this file, of every frame."""
     markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the table to this file as well."""
+    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    """Replace the files that --json and --markdown name, if they are there."""
 
     def check(self) -> None:
         """Refuses what cannot be meant.
@@ -95,10 +97,17 @@ class EvaluateArguments:
             raise BadInput(f"{', '.join(told)} belong to a capture: name it with --on.")
         for flag, place in (("--json", self.json), ("--markdown", self.markdown)):
             if place is not None:
-                check_file_place(place, flag)
+                check_file_place(place, flag, self._inputs(), overwrite=self.overwrite)
         for path in self.what:
             if not path.exists():
                 raise BadInput(f"{path} does not exist; a run's folder or a package was expected.")
+
+    def _inputs(self) -> list[Path]:
+        """What is read and must not be written to."""
+        packages = [path for path in self.what if path.is_file()]
+        if self.on is not None:
+            return [*packages, *self.wanted(self.on).inputs()]
+        return packages if self.body is None else [*packages, self.body]
 
     def wanted(self, video: Path) -> RecordingPaths:
         """What is to be opened of --on."""

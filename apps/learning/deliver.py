@@ -25,10 +25,10 @@ from apps.reporting.report import (
     TrainingNote,
 )
 from apps.terminal.console import Console
-from apps.terminal.whole import write_text
 from avatar.hold import on_white, spread, truth_on_white
 from avatar.render import render
 from avatar.sharpness import verdict_of
+from capture.atomic_files import write_text
 from capture.memory import peak_memory_mb
 from export.build import ExportReport
 from export.player import Player
@@ -91,7 +91,7 @@ def deliver(
     """
     refused, package = taken.refused, None
     if taken.exported is None:
-        run.package.unlink(missing_ok=True)  # a resumed run's older avatar would contradict
+        run.remove(run.package)  # a resumed run's older avatar would contradict
     else:
         for warning in taken.exported.warnings:
             console.warn(warning)

@@ -21,7 +21,6 @@ from apps.reporting.curve import CurvePoint
 from apps.reporting.meter import Meter
 from apps.reporting.report import decibels, mean, percent
 from apps.terminal.console import Bar, Console, duration
-from apps.terminal.whole import whole_file
 from avatar import checkpoint
 from avatar.advice import advice
 from avatar.config import HOLD_EVERY, TrainConfig
@@ -34,6 +33,7 @@ from avatar.rig import Rig
 from avatar.sharpness import verdict_of
 from avatar.train import train
 from avatar.trainer import Trainer
+from capture.atomic_files import whole_file
 from capture.inbox import Inbox
 from capture.playback import Playback
 from preprocess.person_file import write_person

@@ -1,17 +1,30 @@
-"""Where a run lies on disk, and whether there is one already."""
+"""Where a run lies on disk, which of its files are ours, and whether there is one already."""
 
-import shutil
-from contextlib import suppress
+import difflib
+import json
+import os
+import shlex
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from apps.terminal.whole import check_place
+from apps.learning.run_lock import locked
+from apps.terminal.console import Console
+from apps.terminal.places import check_apart, check_place, free_name
 from capture.errors import BadInput
+from capture.file_list import FileList
+
+STATE = "state.pt"
+CHECKPOINT_FILES = (STATE, "person.npz", "frames.tensors", "earlier.tensors")
+"""What ia-ingest writes into checkpoint/."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder:
     """A folder that holds one run of ia-ingest.
+
+    Other files may lie in it; those that a run would have to replace must be its own.
 
     Attributes:
         path: The folder.
@@ -54,45 +67,105 @@ class RunFolder:
         """The poses in the world of the solved cameras."""
         return self.path / "poses.npz"
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that a run may write, except for the stages of solved cameras."""
+        top = (self.package, self.report, self.page, self.cameras, self.poses)
+        return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
+
     def holds_a_run(self) -> bool:
         """Whether any part of a run is there."""
-        return any(p.exists() for p in (self.package, self.report, self.page, self.checkpoint))
+        return any(path.exists() for path in self.files)
 
     def has_checkpoint(self) -> bool:
         """Whether training can go on from here."""
-        return self.checkpoint.is_dir() and any(self.checkpoint.glob("*.pt"))
+        return (self.checkpoint / STATE).is_file()
 
-    def check(self, *, resume: bool, overwrite: bool) -> None:
-        """Whether a run may be written here.
+    def check(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
+        """Whether the folder is a place for a run; nothing is made yet.
+
+        Args:
+            inputs: What the run reads.
+            resume: Whether it goes on with a run that is there.
+            overwrite: Whether it replaces one.
 
         Raises:
-            BadInput: If the path is no folder, or another run would be lost.
+            BadInput: If the path is no folder, has to do with an input, holds files that are not
+                ours where a run's would go, or cannot be written to.
         """
         if resume and overwrite:
             raise BadInput("--resume goes on with a run, --overwrite removes it: give one of them.")
         if self.path.exists() and not self.path.is_dir():
             raise BadInput(f"{self.path} is a file; --out names the folder that holds the run.")
-        check_place(self.path, "--out")
-        if self.holds_a_run() and not (resume or overwrite):
+        check_apart(self.path, "--out", inputs)
+        stranger = self._stranger()
+        if stranger is not None:
+            free = shlex.quote(str(free_name(self.path)))
             raise BadInput(
-                f"{self.path} already holds a run. Go on with it (--resume), replace it "
-                "(--overwrite), or name another folder (--out)."
+                f"{stranger} is not what ia-ingest wrote there, and a run in {self.path} would "
+                f"have to replace it. Move it elsewhere, or name another folder: --out {free}"
             )
+        if resume and not self.has_checkpoint() and not FileList(self.path).exists():
+            raise BadInput(self._nothing_to_resume())
+        check_place(self.path, "--out")
+
+    @contextmanager
+    def claimed(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
+        """Makes the folder and keeps other runs out of it; if it stays empty, it goes again.
+
+        Args:
+            console: Where warnings are shown.
+            resume: Whether a run goes on with what is there.
+            overwrite: Whether it replaces what is there.
+
+        Raises:
+            BadInput: If there is a run that would be lost.
+            Stop: If another run is writing there.
+        """
+        made = [p for p in (self.path, *self.path.parents) if not p.exists()]
+        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            with locked(self.path, console):
+                if self.holds_a_run() and not (resume or overwrite):
+                    raise BadInput(
+                        f"{self.path} already holds a run. Go on with it (--resume), replace it "
+                        "(--overwrite), or name another folder (--out)."
+                    )
+                try:
+                    yield
+                finally:
+                    self.tidy()
+        finally:
+            for folder in made:
+                with suppress(OSError):  # it is not empty
+                    folder.rmdir()
 
     def begin(self, *, resume: bool) -> None:
-        """Makes the folder; unless the run is resumed, an older run in it is removed.
+        """Starts the lists of what is ours; unless the run is resumed, an older one is removed.
 
         Call it when nothing can be wrong with the input any more.
+
+        Raises:
+            BadInput: If files came meanwhile that are not ours.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
-        for half in self.path.glob(f".{self.package.name}.*"):  # of a run that was killed
-            half.unlink(missing_ok=True)
-        if resume:
-            return
-        for file in (self.package, self.report, self.page, self.cameras, self.poses):
-            file.unlink(missing_ok=True)
-        if self.checkpoint.is_dir():
-            shutil.rmtree(self.checkpoint)
+        older = self._older_run()
+        self.checkpoint.mkdir(parents=True, exist_ok=True)
+        for folder in (self.path, self.checkpoint):
+            listing = FileList(folder)
+            listing.make()
+            listing.add_all({path.name: path for path in older if path.parent == folder})
+            listing.remove_unfinished()
+        for path in () if resume else self.files:
+            self.remove(path)
+
+    def remove(self, path: Path) -> None:
+        """Removes one of the run's files.
+
+        Raises:
+            BadInput: If a file is there that is not ours.
+        """
+        if not FileList(path.parent).remove(path.name):
+            raise BadInput(f"{path} is not what ia-ingest wrote there; it was left alone.")
 
     def what_is_kept(self) -> str:
         """What is there after a run has failed half-way, and what a user can do."""
@@ -111,5 +184,51 @@ class RunFolder:
     def tidy(self) -> None:
         """Removes folders that nothing was written to."""
         for folder in (self.checkpoint, self.path):
+            FileList(folder).tidy()
             with suppress(OSError):  # it is not empty, or not there
                 folder.rmdir()
+
+    def _stranger(self) -> Path | None:
+        """A file that is not ours where a run's would go."""
+        older = self._older_run()
+        for path in self.files:
+            there = os.path.lexists(path)
+            if there and path not in older and not FileList(path.parent).holds(path.name):
+                return path
+        for folder in (self.checkpoint, self.path / "cameras"):
+            if os.path.lexists(folder) and not folder.is_dir():
+                return folder
+        lists = (FileList(self.path), FileList(self.checkpoint))
+        return next((listing.path for listing in lists if listing.is_foreign()), None)
+
+    def _older_run(self) -> list[Path]:
+        """The files of a run that was made before there were lists, known by its report."""
+        if FileList(self.path).exists() or not is_report(self.report):
+            return []
+        solved = json.loads(self.report.read_text(encoding="utf-8")).get("cameras") or {}
+        ours = set(self.files)
+        if solved.get("verdict") != "solved":
+            ours -= {self.cameras, self.poses}
+        return [path for path in self.files if path in ours and path.is_file()]
+
+    def _nothing_to_resume(self) -> str:
+        """That there is no run to go on with, and which one may have been meant."""
+        beside = self.path.absolute().parent
+        runs = [p.parent.parent.name for p in sorted(beside.glob(f"*/checkpoint/{STATE}"))]
+        near = difflib.get_close_matches(self.path.absolute().name, runs, n=1, cutoff=0.5)
+        meant = [shlex.quote(str(self.path.with_name(name))) for name in near]
+        return (
+            f"There is no run in {self.path}, so there is nothing to --resume."
+            + "".join(f" Did you mean --out {path}?" for path in meant)
+            + " To begin a new run, leave --resume out."
+        )
+
+
+def is_report(path: Path) -> bool:
+    """Whether a file is a report.json that ia-ingest wrote."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    keys = {"format", "command", "recipe", "machine", "training", "held_out"}
+    return isinstance(content, dict) and keys <= content.keys()

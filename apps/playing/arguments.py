@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.playing.viewpoint import CLOSE_UP, Viewpoint
-from apps.terminal.whole import check_file_place
+from apps.terminal.places import check_file_place
 from capture.errors import BadInput
 
 WEB_PORT = 8010
@@ -100,6 +100,9 @@ class PlayArguments:
     Exit code 2 if they differ."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """With --bench or --verify: write the figures to this file too."""
+    overwrite: Flag = False
+    """Replace the file that --out or --json names, if there is one. Without it a file is replaced
+    only in a run's folder, and only if it is one of ours."""
 
     def check(self) -> None:
         """Whether the wishes fit together.
@@ -111,7 +114,7 @@ class PlayArguments:
         if self.json is not None and not (self.bench or self.verify):
             raise BadInput("--json writes the figures of --bench or --verify; give one of them.")
         if self.json is not None:
-            check_file_place(self.json, "--json")
+            check_file_place(self.json, "--json", self.inputs, overwrite=self.overwrite)
         if self.fps is not None and not 0.1 <= self.fps <= 240.0:
             raise BadInput(f"--fps is {self.fps}; 0.1 to 240 pictures a second were expected.")
         if not 0.01 <= self.speed <= 100.0:
@@ -165,6 +168,14 @@ class PlayArguments:
         )
 
     @property
+    def inputs(self) -> list[Path]:
+        """What is read and must not be written to."""
+        given = [self.avatar, self.poses, self.camera]
+        if self.background is not None and Path(self.background).is_file():
+            given.append(Path(self.background))
+        return [path for path in given if path is not None]
+
+    @property
     def threads(self) -> int:
         """How many pictures are drawn at the same time."""
         if self.workers is not None:
@@ -184,7 +195,10 @@ class PlayArguments:
 
 ALL = frozenset(field.name for field in fields(PlayArguments))
 MODES = {
-    "verify": ("draws the golden frames as they were drawn", frozenset({"provider", "json"})),
+    "verify": (
+        "draws the golden frames as they were drawn",
+        frozenset({"provider", "json", "overwrite"}),
+    ),
     "web": (
         "shows a page that has a camera, a size and a choice of tiers of its own",
         frozenset({"poses", "person", "out", "fps", "speed"}),

@@ -1,6 +1,5 @@
 """Pictures to a clip, a moving picture, one picture or a folder of frames, whole or not at all."""
 
-import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -10,7 +9,8 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from apps.playing.encoders import Encoder, video_encoder
-from apps.terminal.whole import check_place, whole_file, whole_folder
+from apps.terminal.places import check_file_place, check_folder_place
+from capture.atomic_files import whole_file, whole_folder
 from capture.errors import BadInput
 
 CLIPS = (".webm", ".mp4", ".gif", ".webp", ".png")
@@ -23,11 +23,16 @@ Blend = Callable[[Rgba], Rgb]
 """Puts a picture with straight alpha on a background."""
 
 
-def check_clip(path: Path) -> None:
+def check_clip(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
     """Whether something can be written there.
 
+    Args:
+        path: A clip, a picture, or a folder for frames.
+        inputs: What is read and must not be written to.
+        overwrite: Whether a file that is there already may go.
+
     Raises:
-        BadInput: If the suffix is unknown, or a folder holds something other than frames.
+        BadInput: If the suffix is unknown, or something is there that must stay.
     """
     if path.suffix and path.suffix.lower() not in CLIPS and not path.is_dir():
         raise BadInput(
@@ -37,15 +42,12 @@ def check_clip(path: Path) -> None:
     if path.is_dir():
         if path.suffix.lower() in CLIPS:
             raise BadInput(f"{path} is a folder, but its name is that of a clip. Name another.")
-        others = [f.name for f in path.iterdir() if not re.fullmatch(r"\d{4,}\.png", f.name)]
-        if others:
-            raise BadInput(
-                f"{path} holds {others[0]} and would be replaced by frames. Name an empty or a new "
-                "folder."
-            )
     elif path.exists() and path.suffix.lower() not in CLIPS:
         raise BadInput(f"{path} is a file; a folder for PNG frames was expected.")
-    check_place(path, "--out")
+    if path.suffix.lower() in CLIPS:
+        check_file_place(path, "--out", inputs, overwrite=overwrite)
+    else:
+        check_folder_place(path, "--out", inputs)
 
 
 def encoder_of(path: Path, blend: Blend | None) -> Encoder:
@@ -72,7 +74,13 @@ def encoder_of(path: Path, blend: Blend | None) -> Encoder:
 
 
 def write_clip(
-    path: Path, pictures: Iterable[Rgba], *, fps: float, blend: Blend | None, encoder: Encoder
+    path: Path,
+    pictures: Iterable[Rgba],
+    *,
+    fps: float,
+    blend: Blend | None,
+    encoder: Encoder,
+    replace: bool | None = None,
 ) -> int:
     """Writes pictures as the encoder does.
 
@@ -82,6 +90,7 @@ def write_clip(
         fps: Pictures a second.
         blend: The background; None keeps alpha.
         encoder: From `encoder_of`.
+        replace: Whether a file that is there already may go, as of `whole_file`.
 
     Returns:
         How many pictures were written.
@@ -89,8 +98,8 @@ def write_clip(
     Raises:
         OSError: If the disk is full; then nothing is written.
     """
-    place = whole_file if path.suffix.lower() in CLIPS else whole_folder
-    with place(path) as part:
+    is_file = path.suffix.lower() in CLIPS
+    with whole_file(path, replace=replace) if is_file else whole_folder(path) as part:
         shown = (picture if blend is None else blend(picture) for picture in pictures)
         return encoder.write(part, iter(shown), fps)
 

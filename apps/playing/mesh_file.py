@@ -10,7 +10,7 @@ from apps.playing.driving import driving_motion
 from apps.playing.novel import novel_motion
 from apps.playing.rate import poses_a_second
 from apps.terminal.console import Console
-from apps.terminal.whole import whole_file
+from capture.atomic_files import whole_file
 from export.gltf import Animation, glb
 from export.manifest import Manifest
 from export.mesh import SkinnedMesh, mesh_of
@@ -26,6 +26,7 @@ def write_mesh(
     poses: Path | None,
     name: str,
     person: str | None = None,
+    replace: bool | None = None,
 ) -> None:
     """Writes the mesh by the suffix of its name, whole or not at all.
 
@@ -36,6 +37,7 @@ def write_mesh(
         poses: What the .glb does; without it, a turn.
         name: Of the avatar.
         person: Whose poses, where the file holds several people's.
+        replace: Whether a file that is there already may go, as of `whole_file`.
 
     Raises:
         BadInput: If the package is not sound, or no pose is valid.
@@ -50,7 +52,7 @@ def write_mesh(
     with console.waiting("taking the surface"):
         mesh = mesh_of(held.tables["hq"])
         content = write(mesh)
-    with whole_file(out) as part:
+    with whole_file(out, replace=replace) as part:
         part.write_bytes(content)
     console.say(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
 

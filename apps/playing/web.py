@@ -12,7 +12,7 @@ import numpy as np
 from apps.playing.follow import FollowingCamera
 from apps.terminal.console import Console
 from apps.terminal.interrupt import ended_by_ctrl_c
-from apps.terminal.whole import check_place, whole_folder
+from capture.atomic_files import whole_folder
 from capture.errors import BadInput
 from export.player import Player
 from export.web.site import Clip, Look, pose_row
@@ -29,8 +29,6 @@ KINDS = {
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
 }
-OURS = frozenset({"index.html", "avatar.json"})
-"""A folder that holds these is an older page, which a newer one may replace."""
 
 
 def clip_of(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -> Clip:
@@ -41,24 +39,6 @@ def clip_of(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -
         fps=fps,
         look=Look(axes=camera.axes, height_m=camera.height_m, middle_m=camera.middle_m),
     )
-
-
-def check_folder(path: Path) -> None:
-    """Refuses to replace anything but an older page.
-
-    Raises:
-        BadInput: If something else is there.
-    """
-    if path.is_dir():
-        held = {file.name for file in path.iterdir()}
-        if held and not held >= OURS:
-            raise BadInput(
-                f"{path} holds {min(held)} and would be replaced by the page. Name an empty or a "
-                "new folder."
-            )
-    elif path.exists():
-        raise BadInput(f"{path} is a file; --web --out takes a folder.")
-    check_place(path, "--out")
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from capture.camera_device import camera_address
 from capture.growing import IDLE_S
+from preprocess.masks.segmenter import segmenter_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,3 +37,14 @@ class RecordingPaths:
     person: str | None = None
     idle_s: float = IDLE_S
     height_m: float | None = None
+
+    def inputs(self) -> list[Path]:
+        """The files and folders that were named, which no output may touch."""
+        named = [self.poses, self.body]
+        if camera_address(self.video) is None:
+            named.append(self.video)
+        if segmenter_name(self.masks) is None:
+            named.append(self.masks)
+        if self.cameras not in (None, "static", "solve"):
+            named.append(Path(self.cameras))
+        return [path for path in named if path is not None]

@@ -5,7 +5,7 @@ from typing import Any
 
 from apps.learning.run_folder import RunFolder
 from apps.recording.recording import Recording
-from apps.terminal.whole import whole_file
+from capture.atomic_files import whole_file
 from capture.camera import Camera
 from preprocess.camera_file import ASSUMED, write_cameras
 from preprocess.pose_file import write_motion

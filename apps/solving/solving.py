@@ -18,6 +18,7 @@ from apps.terminal.console import Console
 from capture.errors import BadInput
 from preprocess.solve.mapping import check_installed
 from preprocess.solve.solved import Solved
+from preprocess.solve.stages import NOTES
 
 SHARES = {
     "key frames": 0.05, "features": 0.4, "matches": 0.1, "global mapping": 0.25,
@@ -153,10 +154,12 @@ class Solving:
         )
 
     def _tidy(self) -> None:
-        """Removes what only the way there needed."""
-        for path in self.folder.iterdir():
+        """Removes the results of stages, which only the way there needed."""
+        notes = self.folder / NOTES
+        stages = json.loads(notes.read_text(encoding="utf-8")) if notes.exists() else {}
+        for path in (self.folder / name for name in stages):
             if path.name not in KEPT:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _count(done: dict[str, float], stage: str, share: float) -> None:

@@ -18,7 +18,8 @@ from apps.studio.roughen import roughened
 from apps.studio.shoot_config import ShootConfig as ShootConfig
 from apps.studio.stage import Stage
 from apps.studio.tracker import in_cameras, tracked
-from apps.terminal.whole import check_place, whole_folder
+from apps.terminal.places import check_folder_place
+from capture.atomic_files import whole_folder
 from capture.camera import Camera
 from capture.errors import BadInput
 from capture.quiet import silence_opencv
@@ -39,7 +40,7 @@ def shoot(
             in truth/), poses.npz, dance.npz and truth/.
         config: What is filmed.
         progress: Told after each picture; may raise to stop the shoot.
-        overwrite: Whether an older capture in `out` gives way.
+        overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
 
     Raises:
         BadInput: If `out` is in the way, or a number of `config` is out of its range.
@@ -47,23 +48,14 @@ def shoot(
     """
     config.check()
     _check_free(out, overwrite=overwrite)
-    check_place(out, "OUT")
     with whole_folder(out) as unfinished:
         _film(unfinished, config, progress or (lambda done, total: None))
 
 
 def _check_free(out: Path, *, overwrite: bool) -> None:
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
-    if not out.is_dir():
-        raise BadInput(f"{out} is a file, but a folder is to be written. Choose another OUT.")
-    if not overwrite:
+    check_folder_place(out, "OUT")
+    if not overwrite and out.exists() and any(out.iterdir()):
         raise BadInput(f"{out} already exists. Choose another OUT, or give --overwrite.")
-    if not (out / "poses.npz").exists():
-        raise BadInput(
-            f"{out} is no capture folder (it holds no poses.npz), so --overwrite leaves it alone. "
-            "Choose another OUT, or delete it yourself."
-        )
 
 
 def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:

@@ -9,6 +9,7 @@ import tarfile
 from importlib import resources
 from pathlib import Path
 
+from capture.atomic_files import whole_file
 from capture.errors import BadInput
 
 VERSION = "1.30.0"
@@ -54,10 +55,12 @@ def install(tarball: bytes, folder: Path | None = None) -> None:
         for name, member in MEMBERS.items():
             file = archive.extractfile(member)
             assert file is not None
-            (folder / name).write_bytes(file.read())
+            with whole_file(folder / name) as part:
+                part.write_bytes(file.read())
     for name in NOTICES:
         notice = resources.files("onnxruntime").joinpath(name)
-        (folder / name).write_bytes(notice.read_bytes())
+        with whole_file(folder / name) as part:
+            part.write_bytes(notice.read_bytes())
 
 
 def runtime_files(folder: Path | None = None) -> dict[str, bytes]:

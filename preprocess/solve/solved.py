@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.atomic_files import write_text
 from capture.camera import Camera
 from preprocess.solve.gates import Gate
 from preprocess.solve.model import Model
@@ -56,9 +57,7 @@ class Solved:
             "still": self.still, "moved": self.moved, "keys": self.keys, "costs": self.costs,
             "gates": [asdict(gate) for gate in self.gates],
         }  # fmt: skip
-        part = folder / "part.solved.json"
-        part.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        part.replace(folder / "solved.json")  # whoever finds it finds the rest
+        write_text(folder / "solved.json", json.dumps(content, indent=1))  # last: the rest is there
 
     @classmethod
     def load(cls, folder: Path) -> "Solved":

@@ -8,8 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, final
 
+from capture.atomic_files import write_text
 from capture.memory import peak_memory_mb
 
+NOTES = "stages.json"
+"""What the folder's stages have cost, by name."""
 Told = Callable[[str, float], None]
 """Called now and then with a stage's name and how much of it is done, in [0, 1]."""
 
@@ -29,7 +32,7 @@ class Stages:
         """Takes up what lies in the folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self._told = folder, told
-        self._notes = folder / "stages.json"
+        self._notes = folder / NOTES
         self.costs: dict[str, dict[str, float]] = {}
         if self._notes.exists():
             self.costs = json.loads(self._notes.read_text(encoding="utf-8"))
@@ -63,9 +66,7 @@ class Stages:
             "cpu_seconds": time.process_time() - core,
             "peak_memory_mb": peak_memory_mb(),
         }
-        part = self._notes.with_name("part.stages.json")
-        part.write_text(json.dumps(self.costs, indent=1), encoding="utf-8")
-        part.replace(self._notes)
+        write_text(self._notes, json.dumps(self.costs, indent=1))
 
     def totals(self) -> dict[str, Any]:
         """Of all stages, for the report."""

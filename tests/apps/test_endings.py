@@ -6,18 +6,15 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.learning.run_folder import RunFolder
 from apps.playing.background import background
 from apps.terminal.console import MOST_WARNINGS, Console, duration
 from apps.terminal.exit_codes import Stop, exit_code
 from apps.terminal.interrupt import asked_to_stop
-from apps.terminal.whole import check_file_place, check_place, whole_file, whole_folder, write_text
 from capture.errors import BadInput
 from capture.images import read_image
 
@@ -150,141 +147,6 @@ def test_work_goes_on_when_nobody_listens_any_more():
         process.stderr.close()
         assert process.stdout.read() == b"done\n"
         assert process.wait(timeout=50) == 2
-
-
-def test_a_file_appears_when_it_is_whole(tmp_path):
-    path = tmp_path / "deep" / "report.json"
-    write_text(path, "old")
-    with whole_file(path) as part:
-        part.write_text("new")
-        assert path.read_text() == "old"
-        assert part.suffix == path.suffix
-    assert path.read_text() == "new"
-    assert [file.name for file in path.parent.iterdir()] == ["report.json"]
-
-
-def test_a_file_that_fails_leaves_the_older_one(tmp_path):
-    path = tmp_path / "report.json"
-    write_text(path, "old")
-
-    def fails():
-        with whole_file(path) as part:
-            part.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fails()
-    assert path.read_text() == "old"
-    assert [file.name for file in tmp_path.iterdir()] == ["report.json"]
-
-
-def test_a_folder_that_fails_leaves_the_older_one(tmp_path):
-    path = tmp_path / "frames"
-    with whole_folder(path) as part:
-        (part / "0000.png").write_bytes(b"old")
-
-    def fails():
-        with whole_folder(path) as part:
-            (part / "0000.png").write_bytes(b"half")
-            raise OSError("full")
-
-    with pytest.raises(OSError, match="full"):
-        fails()
-    assert (path / "0000.png").read_bytes() == b"old"
-    assert [file.name for file in tmp_path.iterdir()] == ["frames"]
-
-
-def test_a_link_stays_and_what_it_points_to_is_replaced(tmp_path):
-    (tmp_path / "far").mkdir()
-    (tmp_path / "far" / "old.png").write_text("old")
-    (tmp_path / "frames").symlink_to(tmp_path / "far")
-    with whole_folder(tmp_path / "frames") as part:
-        (part / "new.png").write_text("new")
-    assert (tmp_path / "frames").is_symlink()
-    assert [file.name for file in (tmp_path / "far").iterdir()] == ["new.png"]
-    (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
-    write_text(tmp_path / "a.json", "{}")
-    assert (tmp_path / "a.json").is_symlink()
-    assert (tmp_path / "b.json").read_text() == "{}"
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.json", "b.json", "far", "frames"]
-
-
-def test_figures_can_go_to_stdout_and_no_device_is_ever_replaced(capfd, tmp_path):
-    stdout = Path("/dev/stdout")
-    if not stdout.exists():
-        pytest.skip("there is no /dev/stdout here")
-    write_text(stdout, "figures\n")
-    assert capfd.readouterr().out == "figures\n"
-    os.mkfifo(tmp_path / "pipe.png")
-    for device in (Path(os.devnull), stdout, tmp_path / "pipe.png"):
-        with pytest.raises(BadInput, match="device or a pipe"), whole_file(device):
-            pass
-    assert [file.name for file in tmp_path.iterdir()] == ["pipe.png"]
-
-
-def test_a_place_that_cannot_be_written_to_is_named_before_any_work(tmp_path):
-    check_place(tmp_path / "new" / "run", "--out")
-    (tmp_path / "report.json").write_text("{}")
-    check_place(tmp_path / "report.json", "--json")
-    with pytest.raises(BadInput, match=r"--out is .*report\.json is a file"):
-        check_place(tmp_path / "report.json" / "run", "--out")
-
-
-def test_a_folder_where_a_file_should_be_is_named_before_any_work(tmp_path):
-    check_file_place(tmp_path / "new" / "report.json", "--json")
-    with pytest.raises(BadInput, match=r"--json is .* a folder"):
-        check_file_place(tmp_path, "--json")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_for_reading_alone_is_named_before_any_work(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(BadInput, match="cannot be written to"):
-        check_place(tmp_path / "new" / "run", "--out")
-    tmp_path.chmod(0o700)
-
-
-def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):
-    run = RunFolder(path=tmp_path / "run")
-    run.begin(resume=False)
-    assert not run.holds_a_run()
-    run.checkpoint.mkdir()
-    (run.checkpoint / "state.pt").write_bytes(b"learnt")
-    (run.path / "notes.txt").write_text("mine")
-    run.begin(resume=True)
-    assert run.has_checkpoint()
-    assert "--resume" in run.what_is_kept()
-    assert "cameras.npz" not in run.what_is_kept()
-    run.cameras.write_bytes(b"solved")
-    assert f"{run.path} holds cameras.npz." in run.what_is_kept()
-    run.begin(resume=False)
-    assert [file.name for file in run.path.iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.parametrize("resume", [False, True])
-def test_what_a_killed_run_left_half_written_goes(tmp_path, resume):
-    run = RunFolder(path=tmp_path)
-    (tmp_path / ".avatar.iavatar.k2j3h4").write_bytes(b"half")
-    (tmp_path / ".avatar.txt").write_bytes(b"mine")
-    run.begin(resume=resume)
-    assert [file.name for file in tmp_path.iterdir()] == [".avatar.txt"]
-
-
-def test_a_run_folder_that_stayed_empty_goes(tmp_path):
-    run = RunFolder(path=tmp_path / "run")
-    run.begin(resume=False)
-    run.checkpoint.mkdir()
-    run.tidy()
-    assert not run.path.exists()
-
-
-def test_resuming_and_overwriting_contradict(tmp_path):
-    with pytest.raises(BadInput, match="one of them"):
-        RunFolder(path=tmp_path).check(resume=True, overwrite=True)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(BadInput, match="is a file"):
-        RunFolder(path=tmp_path / "file").check(resume=False, overwrite=False)
 
 
 def test_warnings_are_said_once_and_not_for_ever():

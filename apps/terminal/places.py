@@ -1,0 +1,162 @@
+"""Where a command may write: asked before any work is done for what goes there."""
+
+import os
+import shlex
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from capture.atomic_files import check_replaceable_folder, is_stream, replaceable
+from capture.errors import BadInput
+from capture.file_list import PREFIX
+
+
+def check_place(path: Path, flag: str) -> None:
+    """Whether something can be written there; tried out, and nothing is left behind.
+
+    Args:
+        path: A file or a folder; it and folders above it need not be there yet.
+        flag: Which argument named it.
+
+    Raises:
+        BadInput: If that cannot be.
+    """
+    place = Path(os.path.abspath(path))
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if place.is_file() and place.absolute() != Path(os.path.abspath(path)):
+        raise BadInput(f"{flag} is {path}, but {place} is a file and holds nothing.")
+    folder = place.parent if place.is_file() else place  # a file is replaced, not written into
+    try:
+        os.rmdir(tempfile.mkdtemp(prefix=PREFIX, dir=folder))
+    except OSError as error:
+        raise BadInput(
+            f"{flag} is {path}, but {folder} cannot be written to ({error.strerror}). Name another "
+            "place."
+        ) from None
+
+
+def check_file_place(
+    path: Path, flag: str, inputs: Iterable[Path] = (), *, overwrite: bool | None = None
+) -> None:
+    """Whether a file may be written there.
+
+    Args:
+        path: Where to.
+        flag: Which argument named it.
+        inputs: What the command reads; no output is one of them, nor lies in one.
+        overwrite: Whether a file that is there already may go; None: where no list of the folder
+            says otherwise.
+
+    Raises:
+        BadInput: If not.
+    """
+    if path.is_dir():
+        raise BadInput(f"{flag} is {path}, which is a folder; the name of a file was expected.")
+    if is_stream(path):
+        return
+    for given in inputs:
+        if _same(path, given):
+            raise BadInput(
+                f"{flag} is {path}, which is an input of this command ({given}); inputs are never "
+                f"written to. Name another file: {flag} {shlex.quote(str(free_name(path)))}"
+            )
+        if _same(path.parent, given):
+            other = Path(os.path.relpath(given.resolve().parent)) / f"{_name(given)}-{path.name}"
+            raise BadInput(
+                f"{flag} is {path}, which lies in an input of this command ({given}): what lies "
+                f"there is read as a part of it. Name another file: {flag} "
+                f"{shlex.quote(str(free_name(other)))}"
+            )
+    if not replaceable(path, overwrite):
+        raise BadInput(
+            f"{flag} is {path}, which is there already. Replace it with --overwrite, or name "
+            f"another file: {flag} {shlex.quote(str(free_name(path)))}"
+        )
+    check_place(path, flag)
+
+
+def check_folder_place(path: Path, flag: str, inputs: Iterable[Path] = ()) -> None:
+    """Whether a folder may be written there; an older one gives way if all of it is ours.
+
+    Args:
+        path: Where to.
+        flag: Which argument named it.
+        inputs: What the command reads.
+
+    Raises:
+        BadInput: If not.
+    """
+    check_apart(path, flag, inputs)
+    check_replaceable_folder(path)
+    check_place(path, flag)
+
+
+def check_apart(folder: Path, flag: str, inputs: Iterable[Path]) -> None:
+    """Refuses an output folder that is an input, holds one, or lies in one.
+
+    Args:
+        folder: Where a command will write.
+        flag: Which argument named it.
+        inputs: What it reads: files and folders.
+
+    Raises:
+        BadInput: With the name of a folder that may be used.
+    """
+    inputs = list(inputs)
+    for given in inputs:
+        clash = _clash(folder, given)
+        if clash is not None:
+            raise BadInput(
+                f"{flag} is {folder}, which {clash} {given}, an input of this command; a folder "
+                f"of its own was expected, as nothing may be written over inputs. Name one: {flag} "
+                f"{shlex.quote(str(_apart_from(given, inputs)))}"
+            )
+
+
+def free_name(path: Path) -> Path:
+    """The path, or one with a number behind its name: the first that is not taken."""
+    number, free = 1, path
+    while os.path.lexists(free):
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
+
+
+def _clash(folder: Path, given: Path) -> str | None:
+    """How an output folder and an input get in each other's way."""
+    if _same(folder, given):
+        return "is"
+    if given.is_dir() and any(_same(above, given) for above in _real(folder).parents):
+        return "lies in"
+    if any(_same(above, folder) for above in _real(given).parents):
+        return "holds"
+    return None
+
+
+def _apart_from(given: Path, inputs: list[Path]) -> Path:
+    """A folder that is not there yet, beside an input and outside of all."""
+    place = _real(given)
+    while True:
+        free = free_name(place.with_name(f"{place.stem}-run"))
+        if place == place.parent or not any(_clash(free, other) for other in inputs):
+            return Path(os.path.relpath(free)) if not given.is_absolute() else free
+        place = place.parent
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two paths are one file, also by a link, or in another case where case is nothing."""
+    if _real(one) == _real(other):
+        return True
+    try:
+        return one.samefile(other)
+    except OSError:  # one is not there
+        return False
+
+
+def _real(path: Path) -> Path:
+    return Path(os.path.realpath(path))
+
+
+def _name(path: Path) -> str:
+    return path.resolve().name
