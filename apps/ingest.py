@@ -52,25 +52,17 @@ def ingest(given: IngestArguments, console: Console) -> int:
     started = time.perf_counter()
     given.check()
     run = given.run_folder()
-    run.check(given.inputs(), resume=given.resume, overwrite=given.overwrite)
+    run.check(given.wanted().inputs(), resume=given.resume, overwrite=given.overwrite)
     with run.claimed(console, resume=given.resume, overwrite=given.overwrite):
-        return _opened_and_learnt(given, run, console, started)
-
-
-def _opened_and_learnt(
-    given: IngestArguments, run: RunFolder, console: Console, started: float
-) -> int:
-    """All that is done while no other run may write into the folder."""
-    with console.waiting("opening video and poses"):
-        recording = _opened(given)
-    run.check(given.inputs(recording), resume=given.resume, overwrite=given.overwrite)
-    console.say(_described(recording))
-    for note in recording.notes:
-        console.warn(note)
-    if not (given.resume and run.has_checkpoint()):
-        first_look(recording, console, force=given.force)
-    with attempted(given.solve_job(recording), recording, run) as attempt:
-        return _learnt_and_delivered(given, recording, run, console, attempt, started)
+        with console.waiting("opening video and poses"):
+            recording = _opened(given)
+        console.say(_described(recording))
+        for note in recording.notes:
+            console.warn(note)
+        if not (given.resume and run.has_checkpoint()):
+            first_look(recording, console, force=given.force)
+        with attempted(given.solve_job(recording), recording, run) as attempt:
+            return _learnt_and_delivered(given, recording, run, console, attempt, started)
 
 
 def _learnt_and_delivered(
@@ -82,7 +74,7 @@ def _learnt_and_delivered(
     started: float,
 ) -> int:
     """All that comes once the input was found good."""
-    with nothing_to_save(console, PROGRAM):
+    with nothing_to_save(console, PROGRAM, run.abandon):
         with console.waiting("loading torch"):
             from apps.learning.deliver import RunNote, deliver
             from apps.learning.learn import Lesson
@@ -98,7 +90,7 @@ def _learnt_and_delivered(
             console.warn(SLOW_ON_CUDA)
     if attempt is not None:
         recording = attempt.before(recording, console)
-    with nothing_to_save(console, PROGRAM):
+    with nothing_to_save(console, PROGRAM, run.abandon):
         trainer, recall, notes = _trainer(given, recording, run, console)
         _warm_up(trainer, console)
         _announce(given, recording, trainer, console)

@@ -162,7 +162,9 @@ class IngestArguments:
         if self.seed < 0:
             raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
         if self.json is not None:
-            check_file_place(self.json, "--json", self.inputs(), overwrite=self.replaces_json)
+            check_file_place(
+                self.json, "--json", self.wanted().inputs(), overwrite=self.replaces_json
+            )
         polarity(dark=self.mask_invert, bright=self.no_mask_invert)
         if self.view is not None and not 0 <= self.view < 1 << 16:
             raise BadInput(f"--view is {self.view}; a port from 0 to 65535 was expected.")
@@ -177,14 +179,6 @@ class IngestArguments:
     def replaces_json(self) -> bool:
         """Whether --json may replace the file there: as told, or because it is a report of ours."""
         return self.overwrite or (self.json is not None and is_report(self.json))
-
-    def inputs(self, recording: Recording | None = None) -> list[Path]:
-        """What is read and must not be written to: what was named, and what was found."""
-        if recording is None:
-            return self.wanted().inputs()
-        paths = recording.paths
-        found = (paths.poses, paths.masks, paths.cameras)
-        return [*self.wanted().inputs(), *(path for path in found if path is not None)]
 
     def run_folder(self) -> RunFolder:
         """Where the run lies."""

@@ -1,5 +1,6 @@
 """Where the parts of a capture lie: what was named, what lies in its folder, what lies beside."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,12 @@ class CapturePaths:
     poses: Path
     masks: Path | None
     cameras: Path | None
+
+
+def parts_in(folders: Iterable[Path]) -> list[Path]:
+    """What lies in some folders under the names of a capture's parts."""
+    names = [*POSES, *MASKS, *CAMERAS, "images"]
+    return [path for folder in folders for name in names if (path := folder / name).exists()]
 
 
 def poses_in(path: Path) -> Path:

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from apps.learning.run_lock import NAME as LOCK
 from apps.learning.run_lock import locked
 from apps.terminal.console import Console
 from apps.terminal.places import check_apart, check_place, free_name
@@ -180,6 +181,11 @@ class RunFolder:
             f"{there} The newest checkpoint is kept in {self.checkpoint}: run the same command "
             "with --resume, in place of any --overwrite, to go on from it."
         ).lstrip()
+
+    def abandon(self) -> None:
+        """Gives up a folder that this process has claimed, where the process ends at once."""
+        (self.path / LOCK).unlink(missing_ok=True)
+        self.tidy()
 
     def tidy(self) -> None:
         """Removes folders that nothing was written to."""

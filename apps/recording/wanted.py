@@ -5,6 +5,7 @@ from pathlib import Path
 
 from capture.camera_device import camera_address
 from capture.growing import IDLE_S
+from preprocess.capture_folder import parts_in
 from preprocess.masks.segmenter import segmenter_name
 
 
@@ -39,7 +40,7 @@ class RecordingPaths:
     height_m: float | None = None
 
     def inputs(self) -> list[Path]:
-        """The files and folders that were named, which no output may touch."""
+        """What no output may touch: files and folders that were named, and that may be found."""
         named = [self.poses, self.body]
         if camera_address(self.video) is None:
             named.append(self.video)
@@ -47,4 +48,6 @@ class RecordingPaths:
             named.append(self.masks)
         if self.cameras not in (None, "static", "solve"):
             named.append(Path(self.cameras))
-        return [path for path in named if path is not None]
+        given = [path for path in named if path is not None]
+        near = {path if path.is_dir() else path.parent for path in (self.video, self.poses) if path}
+        return [*given, *parts_in(sorted(near))]

@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from apps.terminal.console import Console
@@ -42,7 +42,9 @@ def asked_to_stop(
 
 
 @contextmanager
-def nothing_to_save(console: Console, program: str) -> Iterator[None]:
+def nothing_to_save(
+    console: Console, program: str, tidy: Callable[[], None] = lambda: None
+) -> Iterator[None]:
     """Ctrl-C ends the process where it stands.
 
     For the time in which libraries are loaded, kernels compiled and trees searched by threads of
@@ -51,9 +53,11 @@ def nothing_to_save(console: Console, program: str) -> Iterator[None]:
     Args:
         console: Gives the terminal back.
         program: The command's name, in front of the message.
+        tidy: Called before the process ends.
     """
 
     def leave(signal_number: int, frame: object) -> None:
+        tidy()
         console.say_last(f"{program}: stopped by Ctrl-C.")
         os._exit(INTERRUPTED)
 

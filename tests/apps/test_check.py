@@ -59,7 +59,9 @@ def call_check(capsys, tmp_path):
     def call(*arguments):
         wanted = tmp_path / "found.json"
         words = [str(a) for a in arguments]
-        code = check.main([*words, "--json", str(wanted), "--sheet", str(tmp_path / "sheet.png")])
+        code = check.main(
+            [*words, "--json", str(wanted), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
+        )
         found = json.loads(wanted.read_text()) if wanted.exists() else {}
         return code, " ".join(capsys.readouterr().err.split()), found
 

@@ -173,8 +173,10 @@ def test_a_png_is_one_picture_exactly(tmp_path):
 
 
 def test_nothing_but_frames_is_replaced(tmp_path):
-    (tmp_path / "0000.png").write_bytes(b"")
-    check_clip(tmp_path)
-    (tmp_path / "mine.txt").write_text("")
-    with pytest.raises(BadInput, match=r"mine\.txt"):
-        check_clip(tmp_path)
+    out = tmp_path / "frames"
+    write_clip(out, disc(1), fps=30.0, blend=None, encoder=encoder_of(out, None))
+    check_clip(out, [], overwrite=False)
+    (out / "0001.png").write_bytes(b"mine")
+    for overwrite in (False, True):
+        with pytest.raises(BadInput, match=r"holds 0001\.png"):
+            check_clip(out, [], overwrite=overwrite)

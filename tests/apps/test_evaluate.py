@@ -102,7 +102,7 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     place, out = dataset / "male-3-casual", tmp_path / "evaluation"
 
     def call(steps):
-        words = ("--out", out, "--size", 64, "--no-player", "--json", tmp_path / "t")
+        words = ("--out", out, "--size", 64, "--no-player", "--json", tmp_path / "t", "--overwrite")
         return call_evaluate(place, *words, "--steps", steps)
 
     ended = call(10)

@@ -13,9 +13,12 @@ import pytest
 import torch
 
 from apps.learning import deliver, learn
+from apps.learning.run_folder import RunFolder
 from apps.reporting.failure import failure_of
 from avatar import checkpoint
 from avatar.advice import EVERYTHING
+from capture.atomic_files import write_text
+from capture.file_list import NAME as LIST
 from export.player import Player
 
 KEYS = {
@@ -42,7 +45,7 @@ def report(run):
 
 
 def test_a_run_leaves_four_things(run):
-    assert sorted(file.name for file in run.iterdir()) == [
+    assert sorted(file.name for file in run.iterdir() if file.name != LIST) == [
         "avatar.iavatar",
         "checkpoint",
         "report.html",
@@ -172,17 +175,19 @@ def test_nothing_is_written_outside_the_run(capture, call_ingest, without_baking
 
 
 def test_an_older_run_is_not_lost_by_accident(capture, call_ingest, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "report.json").write_text("{}")
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    run = RunFolder(path=tmp_path / "run")
+    run.begin(resume=False)
+    write_text(run.report, "{}")
+    outcome = call_ingest(capture, *FEW, "--out", run.path)
     assert outcome.code == 2
     assert "--overwrite" in outcome.complaint()
-    assert (tmp_path / "run" / "report.json").read_text() == "{}"
+    assert run.report.read_text() == "{}"
 
 
 def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "report.json").write_text("{}")
+    run = RunFolder(path=tmp_path / "run")
+    run.begin(resume=False)
+    write_text(run.report, "{}")
     copy = tmp_path / "copy.json"
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", "--overwrite", "--json", copy)
     assert outcome.code == 0
@@ -192,6 +197,7 @@ def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path)
 
 def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
     out = tmp_path / "run"
+    RunFolder(path=out).begin(resume=False)  # as of a run that was killed at its start
     assert "no checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
     first = json.loads((out / "report.json").read_text())
     outcome = call_ingest(capture, *FEW, "--out", out, "--resume", steps=15)
@@ -219,8 +225,8 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "--resume" in outcome.complaint()
-    left = [file.name for file in (tmp_path / "run").rglob("*") if file.is_file()]
-    assert left == ["person.npz", "state.pt"]
+    left = {file.name for file in (tmp_path / "run").rglob("*") if file.is_file()}
+    assert left == {"person.npz", "state.pt", LIST}
     trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint", torch.device("cpu"))
     assert trainer.steps == 1
 
@@ -235,7 +241,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_found_roo
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "can be played" in outcome.complaint()
-    assert [file.name for file in (tmp_path / "run").rglob("*")] == ["avatar.iavatar"]
+    assert {file.name for file in (tmp_path / "run").rglob("*")} == {"avatar.iavatar", LIST}
 
 
 def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(

@@ -37,7 +37,9 @@ def diagnosed(capture, tmp_path, capsys):
     def call(*arguments):
         found = tmp_path / "found.json"
         words = [str(capture), *map(str, arguments)]
-        code = check.main([*words, "--json", str(found), "--sheet", str(tmp_path / "sheet.png")])
+        code = check.main(
+            [*words, "--json", str(found), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
+        )
         return code, " ".join(capsys.readouterr().err.split()), json.loads(found.read_text())
 
     return call

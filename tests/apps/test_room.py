@@ -14,6 +14,7 @@ from apps.studio.pattern import leaves, repeated
 from apps.studio.room import GRAIN, Room
 from apps.studio.writer import ShootConfig, shoot
 from capture.errors import BadInput
+from capture.file_list import NAME as LIST
 from preprocess.camera_file import read_cameras
 from preprocess.observation import Observation
 from preprocess.pose_file import read_motion
@@ -166,7 +167,7 @@ def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
 
 def test_the_cameras_are_told_only_by_the_truth(capture):
     assert {path.name for path in capture.iterdir()} == {
-        "video.mp4", "preview.webm", "masks", "poses.npz", "dance.npz", "truth"
+        "video.mp4", "preview.webm", "masks", "poses.npz", "dance.npz", "truth", LIST
     }  # fmt: skip
     with np.load(capture / "poses.npz") as poses:
         assert "camera" not in poses

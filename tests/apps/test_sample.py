@@ -36,9 +36,11 @@ def test_numbers_out_of_range_are_named(tmp_path, capsys, option, value):
 
 
 def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
-    (tmp_path / "poses.npz").write_bytes(b"")
-    assert run(tmp_path, "--frames", 1, "--size", 32) == 2
+    small = ("--frames", 1, "--size", 32)
+    assert run(tmp_path / "c", *small) == 0
+    assert run(tmp_path / "c", *small) == 2
     assert "--overwrite" in " ".join(capsys.readouterr().err.split())
+    assert run(tmp_path / "c", *small, "--overwrite") == 0
 
 
 def test_unknown_subjects_are_bad_input(tmp_path):

@@ -123,9 +123,14 @@ def test_a_write_that_fails_half_way_leaves_the_old_one(trainer, saved, monkeypa
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
-def test_a_disk_that_really_is_full_is_called_so(trainer, saved):
-    before = saved.read_bytes()
-    saved.with_name(saved.name + ".part").symlink_to("/dev/full")
+def test_a_disk_that_really_is_full_is_called_so(trainer, saved, monkeypatch):
+    before, save = saved.read_bytes(), torch.save
+
+    def on_a_full_disk(state, file):
+        with open("/dev/full", "wb") as full:
+            save(state, full)
+
+    monkeypatch.setattr(torch, "save", on_a_full_disk)
     with pytest.raises(OSError, match="No space") as caught:
         checkpoint.save(trainer, saved.parent)
     assert caught.value.errno == errno.ENOSPC
