@@ -50,8 +50,8 @@ class IngestArguments:
 
     Exit codes: 0 done; 1 learnt, but the result is no usable avatar (verdict "failed"
     in the report; the package is written all the same if there is anything to draw); 2 bad input;
-    3 full disk or busy device, the checkpoint is kept; 130 Ctrl-C, after checkpoint and package
-    were written.
+    3 full disk, busy device or busy run folder, the checkpoint is kept; 130 Ctrl-C, after
+    checkpoint and package were written.
     """
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
@@ -86,7 +86,8 @@ class IngestArguments:
     resume: Flag = False
     """Go on with the run in --out: with the same video after an interruption, or with another."""
     overwrite: Flag = False
-    """Replace the run in --out."""
+    """Replace the run in --out, and the file that --json names. Files that ia-ingest did not write
+    stay."""
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """How long you will wait: seconds of training, after start-up. Without it 60; with --realtime
     as long as the clip lasts."""

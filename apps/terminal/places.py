@@ -108,9 +108,9 @@ def check_apart(folder: Path, flag: str, inputs: Iterable[Path]) -> None:
         clash = _clash(folder, given)
         if clash is not None:
             raise BadInput(
-                f"{flag} is {folder}, which {clash} {given}, an input of this command; a folder "
-                f"of its own was expected, as nothing may be written over inputs. Name one: {flag} "
-                f"{shlex.quote(str(_apart_from(given, inputs)))}"
+                f"{flag} {folder} {clash} an input of this command ({given.absolute()}): nothing "
+                "is written where inputs lie. Name a folder of its own: "
+                f"{flag} {shlex.quote(str(_apart_from(given, inputs)))}"
             )
 
 

@@ -15,6 +15,7 @@ from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
 from avatar import warm
 from avatar.rig import Rig
+from capture.atomic_files import write_text
 from export import bake
 from export.build import ExportReport
 
@@ -121,7 +122,7 @@ def without_baking(monkeypatch) -> None:
     """
 
     def export_nothing(avatar, path, *, views, metrics, hasty, fine_tuned, progress):
-        path.write_bytes(b"stand-in")
+        write_text(path, "stand-in")
         return ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
             largest_difference=0.0, tuning=None, warnings=(),

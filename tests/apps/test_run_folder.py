@@ -74,7 +74,7 @@ def test_an_output_folder_is_no_input_and_none_lies_in_the_other(tmp_path, out, 
     capture = tmp_path / "capture"
     (capture / "masks").mkdir(parents=True)
     (tmp_path / "link").symlink_to(capture)
-    with pytest.raises(BadInput, match=f"which {clash} ") as caught:
+    with pytest.raises(BadInput, match=f" {clash} an input ") as caught:
         check_apart(tmp_path / out, "--out", [capture])
     advised = shlex.split(re.search(r"--out (\S+)$", str(caught.value))[1])[0]
     check_apart(Path(advised), "--out", [capture])
@@ -92,7 +92,7 @@ def test_what_is_advised_can_be_pasted_where_one_stands(tmp_path, monkeypatch):
 def test_a_folder_beside_an_input_file_is_apart(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"film")
     check_apart(tmp_path / "run", "--out", [tmp_path / "video.mp4"])
-    with pytest.raises(BadInput, match="holds"):
+    with pytest.raises(BadInput, match="holds an input"):
         check_apart(tmp_path, "--out", [tmp_path / "video.mp4"])
 
 
