@@ -225,7 +225,16 @@ def test_mask_noise_moves_the_border_by_what_is_asked():
 
 
 def test_the_folder_is_a_native_capture(capture):
-    top = {"video.mp4", "preview.webm", "masks", "cameras.npz", "poses.npz", "dance.npz", "truth", LIST}
+    top = {
+        "video.mp4",
+        "preview.webm",
+        "masks",
+        "cameras.npz",
+        "poses.npz",
+        "dance.npz",
+        "truth",
+        LIST,
+    }
     assert {path.name for path in capture.iterdir()} == top
     assert len(list((capture / "masks").glob("*.png"))) == SMALL.frames
     with np.load(capture / "cameras.npz") as cameras:
