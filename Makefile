@@ -6,7 +6,7 @@ BIN = $(VENV)/bin
 
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: install demo web test check
+.PHONY: install demo web test test-all check
 
 install: $(VENV)/installed
 
@@ -24,6 +24,9 @@ web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m apps.fetch_runtime
 
 test: install
+	$(BIN)/python -m pytest -q -m "not slow"
+
+test-all: install # the slow ones, too: long trainings, the browser, a fresh installation
 	-$(BIN)/python -m apps.fetch_runtime # without it the browser's tests are skipped
 	$(BIN)/python -m pytest -q
 

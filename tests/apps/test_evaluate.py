@@ -121,6 +121,7 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     assert "was learnt before" not in longer.err
 
 
+@pytest.mark.slow
 def test_a_stopped_lesson_leaves_the_table_of_those_before(
     dataset, call_evaluate, without_baking, tmp_path, monkeypatch
 ):

@@ -39,6 +39,7 @@ def test_what_is_missing_is_one_line(file, tmp_path, monkeypatch):
         runpy.run_path(str(file), run_name="__main__")
 
 
+@pytest.mark.slow
 def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):
     example = load("1_learn_from_python.py")
     monkeypatch.setattr(example, "STEPS", 150)

@@ -65,6 +65,7 @@ def test_each_frame_is_seen_by_its_own_camera(walk):
         np.testing.assert_allclose(joints[0], joints[1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_avatar_is_learnt_and_scored_through_a_moving_camera(
     walk, call_ingest, without_baking, tmp_path
 ):

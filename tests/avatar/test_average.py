@@ -54,6 +54,7 @@ def test_later_it_is_the_exponential_mean_over_the_horizon(field):
         torch.testing.assert_close(parameter, torch.full_like(parameter, expected))
 
 
+@pytest.mark.slow
 def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_last_step(rig, clip):
     config = TrainConfig(
         rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False

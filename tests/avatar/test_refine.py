@@ -192,6 +192,7 @@ def jittered(clip):
     ]
 
 
+@pytest.mark.slow
 def test_refining_poses_makes_up_for_a_trackers_jitter(rig, clip, jittered):
     """Scored in true poses: the canonical body itself must have become sharper."""
     config = TrainConfig(rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14)
