@@ -197,6 +197,7 @@ def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune,
     assert tune(tables, as_asked, deepens=True).rules == RULES
 
 
+@pytest.mark.slow
 def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
     stand_in, renderer, coarse, views, tables, tmp_path
 ):
