@@ -76,7 +76,7 @@ def killed(capture: Path, run: Path, after_s: float) -> Survivor:
                 json.loads(path.read_text())
         except Exception as error:  # whatever it is, it must not be
             unreadable.append(f"{path.name}: {error}")
-    code, psnr, _ = finished(capture, run, "--resume")
+    code, psnr, _ = finished(capture, run, *(["--resume"] if run.exists() else []))
     return Survivor(tuple(unreadable), code, psnr, had_s)
 
 

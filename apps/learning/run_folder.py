@@ -106,7 +106,7 @@ class RunFolder:
                 f"{stranger} is not what ia-ingest wrote there, and a run in {self.path} would "
                 f"have to replace it. Move it elsewhere, or name another folder: --out {free}"
             )
-        if resume and not self.has_checkpoint() and not FileList(self.path).exists():
+        if resume and not (self.has_checkpoint() or self._began()):
             raise BadInput(self._nothing_to_resume())
         check_place(self.path, "--out")
 
@@ -193,6 +193,10 @@ class RunFolder:
             FileList(folder).tidy()
             with suppress(OSError):  # it is not empty, or not there
                 folder.rmdir()
+
+    def _began(self) -> bool:
+        """Whether a run was here that was killed, perhaps before it had written anything."""
+        return FileList(self.path).exists() or (self.path / LOCK).is_file()
 
     def _stranger(self) -> Path | None:
         """A file that is not ours where a run's would go."""

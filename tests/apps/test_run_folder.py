@@ -228,6 +228,9 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path):
     run = RunFolder(path=tmp_path / "killed")
     run.begin(resume=False)  # and killed before its first checkpoint
     run.check([], resume=True, overwrite=False)
+    run = RunFolder(path=tmp_path / "killed earlier")
+    with run.claimed(Console(), resume=False, overwrite=False):
+        run.check([], resume=True, overwrite=False)
 
 
 def test_resuming_a_name_that_was_mistyped_is_an_error(film, tmp_path, capsys):
