@@ -1,7 +1,6 @@
 """ia-check: says in seconds what is wrong with a capture, and how to mend it."""
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,8 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.checking.examine import GOOD_EDGES, Examined, examine, share
+from apps.checking.command import check_command
+from apps.checking.examine import GOOD_EDGES, UNEXPLAINED, Examined, examine, share
 from apps.checking.mended import check_new_folder, write_mended
 from apps.checking.sheet import write_sheet
 from apps.ingest_arguments import parsed_frames, polarity
@@ -36,19 +36,21 @@ class CheckArguments:
 
     The body is drawn where poses and camera say, and held against the masks. Where they disagree,
     the usual mistakes are undone one after another: poses late or early, of another frame rate or
-    backwards, OpenGL's axes, pictures turned for the tracker, degrees, world and camera mixed up, a
-    wrong focal length, left for right, EasyMocap's root, another size or unit, masks of the
-    background. Without masks it is told how well the body's outline meets the pictures' edges.
-    The one that mends it is named, with the agreement it would bring (intersection over union,
-    0 to 1; 0.75 to 0.9 is what good poses reach, as clothes are wider than bodies).
+    backwards, OpenGL's axes, pictures rotated for the tracker, degrees, world and camera mixed up,
+    a wrong focal length, left for right, EasyMocap's root, another size or unit, masks of the
+    background or of a second person. Then the masks' outlines are held against edges in the
+    pictures: was the film alone rotated, mirrored, cropped or cut afterwards? Without masks the
+    body's outline is. The mistake is named, with the agreement that correcting it would bring
+    (intersection over union, 0 to 1; 0.75 to 0.9 is what good poses reach, as clothes are wider
+    than bodies).
 
     Try it:
 
         ia-check capture/
 
-        ia-check video.mp4 --poses poses.npz --fix mended/
+        ia-check video.mp4 --poses poses.npz --fix corrected/
 
-    Look at the sheet it draws: white is the mask, orange the body.
+    Look at the sheet it draws: white is the mask (if there is one), orange the body.
 
     Exit codes: 0 good, or not so good but usable (with --fix: once mended); 2 unusable or
     unreadable; 3 disk full; 130 Ctrl-C.
@@ -155,12 +157,14 @@ def check(given: CheckArguments, console: Console) -> int:
     path, ours = given.sheet_path(), given.sheet is None
     if write_sheet(path, examined, replace=given.overwrite, listed=ours):
         console.made("look at it", path)
+    else:
+        console.warn(f"{path} was not written: no frame with a pose could be decoded.")
     if given.fix is not None:
         write_mended(examined, given.fix)
-        console.made("mended", given.fix)
+        console.made("corrected", given.fix)
         return DONE if examined.after >= USABLE else BAD_INPUT
-    if examined.causes and not _mends_itself(examined):
-        console.say(f"Mend it:  ia-check {shlex.quote(str(given.video))} … --fix OUT")
+    if examined.causes and not examined.mends_itself:
+        console.say(f"To correct it:  {check_command(wanted)}")
     return BAD_INPUT if examined.verdict == "unusable" else DONE
 
 
@@ -169,6 +173,7 @@ def as_json(examined: Examined) -> dict[str, Any]:
     diagnosis = examined.diagnosis
     cures = diagnosis.cures if diagnosis else ()
     tried = diagnosis.tried if diagnosis else ()
+    film = diagnosis.film if diagnosis else None
     return {
         "format": 1,
         "verdict": examined.verdict,
@@ -178,6 +183,16 @@ def as_json(examined: Examined) -> dict[str, Any]:
             {"cause": guess.cure.cause, "iou": share(guess.iou), "words": guess.cure.words}
             for guess in tried
         ],
+        "film": None
+        if film is None
+        else {
+            "now": share(film.now),
+            "after_fix": share(film.after),
+            "tried": [
+                {"cause": guess.cure.cause, "score": share(guess.iou), "words": guess.cure.words}
+                for guess in film.tried
+            ],
+        },
         "cures": [{"cause": cure.cause, "words": cure.words} for cure in cures],
         "odd": list(examined.odd),
         "refused": examined.refused,
@@ -190,7 +205,7 @@ def unreadable(why: str) -> dict[str, Any]:
     return {
         "format": 1, "verdict": "unusable", "cause": None,
         "iou": {"now": None, "after_fix": None}, "tried": [], "cures": [], "odd": [],
-        "refused": why, "edges": None,
+        "refused": why, "edges": None, "film": None,
     }  # fmt: skip
 
 
@@ -204,17 +219,23 @@ def _say(examined: Examined, console: Console) -> None:
     if examined.diagnosis is None:
         console.say(_without_masks(examined))
         return
-    console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1).")
+    if examined.mends_itself:
+        console.say(
+            f"{examined.verdict}: body and masks agree by {examined.after:.2f} (0 to 1). The masks "
+            "show the background in white (mask_polarity); ia-ingest inverts such masks by itself, "
+            "so nothing needs to be done."
+        )
+        return
+    but = ", but not with the pictures" if examined.film_errs else ""
+    console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1){but}.")
     for cure in examined.diagnosis.cures:
         console.say(f"It looks as if {cure.words} ({cure.cause}).")
     if examined.causes:
-        console.say(f"Undone, they would agree by {examined.after:.2f}.")
+        console.say(examined.promise)
     elif examined.verdict != "good" and examined.now >= GOOD:
-        console.say("So they fit where there are both; what is wrong is said above.")
+        console.say("They fit in the frames that have both; the warnings above name the problem.")
     elif examined.verdict != "good":
-        console.say("None of the usual mistakes explains it.")
-    if _mends_itself(examined):
-        console.say("ia-ingest turns such masks by itself: nothing needs to be done.")
+        console.say(UNEXPLAINED)
 
 
 def _without_masks(examined: Examined) -> str:
@@ -224,17 +245,15 @@ def _without_masks(examined: Examined) -> str:
     fits = examined.edges >= GOOD_EDGES
     return (
         f"{examined.verdict}: there are no masks (ia-ingest estimates some from poses and "
-        f"pictures); edges in the pictures are {examined.edges:.1f} times as strong across the "
-        f"body's outline as beside it, so the poses {'' if fits else 'hardly '}fit (2 to 5 times "
-        f"where they do, about 1 where nobody stands)."
-        + ("" if fits else " With --masks it could be told what is wrong.")
+        f"pictures), so the pictures' own edges were compared with the body's outline: along it "
+        f"the picture changes {examined.edges:.1f} times as much as beside it. The poses "
+        + (
+            "fit (2 to 5 times where they do, about 1 where they do not)."
+            if fits
+            else "hardly fit (2 to 5 times was expected, about 1 is chance). Give --masks to find "
+            "out what is wrong."
+        )
     )
-
-
-def _mends_itself(examined: Examined) -> bool:
-    """Whether all that is wrong is what ia-ingest undoes without being asked."""
-    masks = examined.recording.masks
-    return examined.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def ingest(given: IngestArguments, console: Console) -> int:
         for note in recording.notes:
             console.warn(note)
         if not (given.resume and run.has_checkpoint()):
-            first_look(recording, console, force=given.force)
+            first_look(recording, given.wanted(), console, force=given.force)
         with attempted(given.solve_job(recording), recording, run) as attempt:
             return _learnt_and_delivered(given, recording, run, console, attempt, started)
 

@@ -1,4 +1,4 @@
-"""Whether the doctor names what is wrong: 30 spoilt copies of samples, and 10 good ones.
+"""Whether the doctor names what is wrong: 44 spoilt copies of samples, and 10 good ones.
 
     python -m benchmarks.doctor [--keep DIR]
 
@@ -74,6 +74,23 @@ SPOILT = (
         film="turn",
         spoils=(("body_scale", spoils.in_units(100.0)), ("frame_rate", spoils.resampled(0.5))),
     ),
+    Case(film="turn", spoils=(("root_rotation", spoils.z_up_about_the_origin),)),
+    Case(film="small", spoils=(("frame_offset", spoils.unnumbered_end(30)),)),
+    Case(film="dance", spoils=(("second_person", spoils.second_person),)),
+    Case(film="turn", spoils=(("film_rotation", spoils.rotated_film(1)),)),
+    Case(film="rough", spoils=(("film_rotation", spoils.rotated_film(2)),)),
+    Case(film="dance", spoils=(("film_rotation", spoils.rotated_film(3)),)),
+    Case(film="turn", spoils=(("film_mirrored", spoils.mirrored_film),)),
+    Case(film="noisy", spoils=(("film_mirrored", spoils.mirrored_film),)),
+    Case(film="dance", spoils=(("film_crop", spoils.cropped_film(0.05, 0.08, 0.87)),)),
+    Case(film="rough", spoils=(("film_crop", spoils.cropped_film(-0.15, -0.15, 1.3)),)),
+    Case(film="turn", spoils=(("film_offset", spoils.trimmed_film(12)),)),
+    Case(film="noisy", spoils=(("film_offset", spoils.delayed_film(4)),)),
+    Case(film="small", spoils=(("film_offset", spoils.reversed_film),)),
+    Case(
+        film="dance",
+        spoils=(("frame_offset", spoils.late(5)), ("film_mirrored", spoils.mirrored_film)),
+    ),
 )
 
 GOOD = (
@@ -82,7 +99,8 @@ GOOD = (
 )
 """As filmed, and told in the camera's own frame."""
 
-MOST_SECONDS = 10.0
+ASKED, MOST_SECONDS = 40, 10.0
+"""Right first causes, and core seconds of the slowest."""
 
 
 def films(folder: Path) -> Path:
@@ -127,10 +145,10 @@ def main() -> None:
             wanted = " + ".join(cause for cause, _ in case.spoils if cause) or "good"
             mark = " " if right else "✗"
             print(f"{mark} {case.film:<6} {wanted:<30} {seconds:4.1f} s  {said}", flush=True)
-    print(f"right cause first: {found} of {len(SPOILT)} (asked: 27); all causes: {whole}")
+    print(f"right cause first: {found} of {len(SPOILT)} (asked: {ASKED}); all causes: {whole}")
     print(f"good ones called good: {quiet} of {len(GOOD)} (asked: all)")
     print(f"slowest: {slowest:.1f} core-s (asked: {MOST_SECONDS:.0f})")
-    sys.exit(0 if found >= 27 and quiet == len(GOOD) and slowest <= MOST_SECONDS else 1)
+    sys.exit(0 if found >= ASKED and quiet == len(GOOD) and slowest <= MOST_SECONDS else 1)
 
 
 def _made(folder: Path) -> Path:

@@ -277,6 +277,95 @@ def in_units(factor: float) -> Spoil:
     return spoil
 
 
+def z_up_about_the_origin(folder: Path) -> None:
+    """As `z_up`, converted without the pelvis's offset: translations are rotated by themselves."""
+    turn = Rotation.from_euler("x", 90, degrees=True)
+
+    def change(m: Motion) -> Motion:
+        roots = turn * Rotation.from_rotvec(m.root_rotations)
+        places = turn.apply(m.root_translations)
+        return replace(m, root_rotations=roots.as_rotvec(), root_translations=places)
+
+    _poses(folder, change)
+
+
+def unnumbered_end(frames: int) -> Spoil:
+    """The last frames' poses only, with no frame numbers and no times."""
+
+    def spoil(folder: Path) -> None:
+        def change(m: Motion) -> Motion:
+            last = m.taken(np.arange(len(m) - frames, len(m)))
+            return replace(last, frames=None, times_s=None)
+
+        _poses(folder, change)
+
+    return spoil
+
+
+def second_person(folder: Path) -> None:
+    """Somebody else stands at the left side of every mask."""
+    for path in sorted((folder / "masks").iterdir()):
+        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert mask is not None
+        path.unlink()
+        height, width = mask.shape[:2]
+        mask[height // 4 : -height // 8, width // 40 : width // 10] = 255
+        cv2.imwrite(str(path), mask)
+
+
+def changed_film(folder: Path, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> None:
+    """Writes the film's pictures anew, losslessly; masks and poses stay."""
+    path = folder / "video.mp4"
+    reader = cv2.VideoCapture(str(path))
+    fps, pictures = reader.get(cv2.CAP_PROP_FPS), []
+    while (read := reader.read())[0]:
+        pictures.append(read[1])
+    reader.release()
+    path.unlink()
+    pictures = change(pictures)
+    code = cv2.VideoWriter.fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, pictures[0].shape[1::-1])
+    for picture in pictures:
+        writer.write(np.ascontiguousarray(picture))
+    writer.release()
+
+
+def rotated_film(quarter_turns: int) -> Spoil:
+    """The film alone rotated counter-clockwise; its pictures must be square."""
+    return lambda folder: changed_film(
+        folder, lambda film: [np.rot90(p, quarter_turns) for p in film]
+    )
+
+
+def mirrored_film(folder: Path) -> None:
+    changed_film(folder, lambda pictures: [picture[:, ::-1] for picture in pictures])
+
+
+def cropped_film(left: float, top: float, size: float) -> Spoil:
+    """A part of the film alone, scaled up to the old size; a size above 1 adds black borders."""
+
+    def crop(picture: np.ndarray) -> np.ndarray:
+        height, width = picture.shape[:2]
+        affine = np.array([[1.0, 0.0, -left * width], [0.0, 1.0, -top * height]]) / size
+        return np.asarray(cv2.warpAffine(picture, affine, (width, height)))
+
+    return lambda folder: changed_film(folder, lambda pictures: [crop(p) for p in pictures])
+
+
+def trimmed_film(frames: int) -> Spoil:
+    """The film's beginning is cut off; masks and poses are still those of all frames."""
+    return lambda folder: changed_film(folder, lambda pictures: pictures[frames:])
+
+
+def delayed_film(frames: int) -> Spoil:
+    """The film's first picture stands still at first, and the end is cut off."""
+    return lambda folder: changed_film(folder, lambda film: [film[0]] * frames + film[:-frames])
+
+
+def reversed_film(folder: Path) -> None:
+    changed_film(folder, lambda pictures: pictures[::-1])
+
+
 def inverted_masks(folder: Path) -> None:
     for path in sorted((folder / "masks").iterdir()):
         mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)

@@ -1,4 +1,4 @@
-"""A sheet of pictures to look at: mask and body drawn over frames, as they are and as mended."""
+"""A sheet of pictures to look at: mask and body drawn over frames, as they are and corrected."""
 
 import time
 from collections.abc import Sequence
@@ -10,16 +10,18 @@ from jaxtyping import Bool, UInt8
 
 from apps.checking.examine import Examined
 from capture.atomic_files import whole_file
+from capture.camera import same_shape
 from capture.file_list import FileList
 from capture.frame import Frame
 from preprocess.doctor.claim import Claim
-from preprocess.doctor.evidence import Evidence, Witness
-from preprocess.silhouette import silhouette
+from preprocess.doctor.diagnosis import mean
+from preprocess.doctor.evidence import spread
+from preprocess.silhouette import SkinPoints, silhouette
 
 COLUMNS = 6
 CELL_PX = 300
 PATIENCE_S = 4.0
-"""So long frames are decoded for the sheet; of a long video it shows the beginning."""
+"""Seconds for which frames are decoded for the sheet; of a long video it shows the beginning."""
 MASK, BODY, PAPER, INK = (255, 255, 255), (255, 120, 0), (245, 245, 245), (40, 40, 40)
 LABEL_PX = 26
 
@@ -31,7 +33,8 @@ def write_sheet(
 ) -> bool:
     """Draws a few frames: white the mask's outline, orange the body's, and their agreement.
 
-    The second row, if there is one, is what the named cures would make of it.
+    The second row, if there is one, is what the named cures would make of it. Without masks only
+    the body's outline is drawn.
 
     Args:
         path: Where to.
@@ -45,16 +48,19 @@ def write_sheet(
     Raises:
         OSError: If it cannot be written.
     """
-    evidence = examined.evidence
-    if evidence is None or examined.diagnosis is None:
+    numbers, diagnosis = _numbers(examined), examined.diagnosis
+    healed = diagnosis.healed if diagnosis and diagnosis.cures else None
+    # A cured film shows the masks' frames under numbers of its own.
+    also = [healed.film.frame(number) for number in numbers] if healed else []
+    frames = _decoded(examined, {*numbers, *also})
+    rows = [_row(examined, numbers, frames, examined.claim, "as it is")]
+    if healed is not None:
+        rows.append(_row(examined, numbers, frames, healed, "corrected"))
+    rows = [row for row in rows if row is not None]
+    if not rows:
         return False
-    shown = _shown(examined, evidence)
-    if not shown:
-        return False
-    rows = [_row(shown, examined.claim, evidence, "as it is")]
-    if examined.diagnosis.cures:
-        rows.append(_row(shown, examined.diagnosis.healed, evidence, "mended"))
-    sheet = np.concatenate(rows)
+    width = max(row.shape[1] for row in rows)
+    sheet = np.concatenate([_widened(row, width) for row in rows])
     if listed:
         path.parent.mkdir(parents=True, exist_ok=True)
         FileList(path.parent).make()
@@ -66,43 +72,83 @@ def write_sheet(
     return True
 
 
-def _shown(examined: Examined, evidence: Evidence) -> list[tuple[Frame, Witness]]:
-    """Frames that were looked at, spread over what can be decoded in a few seconds."""
-    wanted = {witness.index: witness for witness in evidence.some(COLUMNS).witnesses}
-    began, found = time.perf_counter(), []
+def _numbers(examined: Examined) -> list[int]:
+    """Numbers of the frames that are shown: those of masks, else of poses."""
+    if examined.evidence is not None:
+        return [witness.index for witness in examined.evidence.some(COLUMNS).witnesses]
+    source = examined.recording.source
+    chosen = range(source.frames_in_file)[source.selection.start :: source.selection.step]
+    posed = [
+        n for n in chosen if source.selection.wants(n) and examined.claim.row_of(n) is not None
+    ]
+    return [posed[place] for place in spread(len(posed), COLUMNS)] if posed else []
+
+
+def _decoded(examined: Examined, wanted: set[int]) -> dict[int, Frame]:
+    """The wanted frames by their numbers, as far as they are decoded in a few seconds."""
+    began, found = time.perf_counter(), {}
     for frame in examined.recording.source.frames():
         if frame.index in wanted:
-            found.append((frame, wanted.pop(frame.index)))
-        if not wanted or time.perf_counter() - began > PATIENCE_S:
+            found[frame.index] = frame
+        if len(found) == len(wanted) or time.perf_counter() - began > PATIENCE_S:
             break
     return found
 
 
 def _row(
-    shown: Sequence[tuple[Frame, Witness]], claim: Claim, evidence: Evidence, title: str
-) -> Rgb:
-    cells = [_cell(frame, witness, claim, evidence) for frame, witness in shown]
+    examined: Examined, numbers: Sequence[int], frames: dict[int, Frame], claim: Claim, title: str
+) -> Rgb | None:
+    """A row of the frames that are there; None if none is."""
+    shown = [(n, frames.get(claim.film.frame(n))) for n in numbers]
+    cells = [_cell(frame, n, examined, claim) for n, frame in shown if frame is not None]
+    if not cells:
+        return None
     label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER, np.uint8)
-    scores = [evidence.score(claim, witness) for _, witness in shown]
-    known = [score for score in scores if np.isfinite(score)]
-    _write(label, f"{title}: agreement {np.mean(known) if known else 0.0:.2f}", 6)
+    if examined.evidence is None:
+        _write(label, f"{title}: the body's outline; there are no masks", 6)
+    else:
+        scores = examined.evidence.some(COLUMNS).scores(claim)
+        _write(label, f"{title}: agreement {mean(scores):.2f}", 6)
     return np.concatenate([label, np.concatenate(cells, axis=1)])
 
 
-def _cell(frame: Frame, witness: Witness, claim: Claim, evidence: Evidence) -> Rgb:
-    """One frame with both outlines."""
-    width, height = frame.size_px
+def _widened(row: Rgb, width: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    """A row with paper on its right."""
+    return np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=PAPER[0])
+
+
+def _cell(frame: Frame, number: int, examined: Examined, claim: Claim) -> Rgb:
+    """One frame with both outlines.
+
+    Args:
+        frame: The film's picture.
+        number: The frame number that its mask and pose have.
+        examined: The masks.
+        claim: Poses, cameras and film.
+    """
+    picture, _ = claim.film.on_mask(frame.rgb)
+    height, width = picture.shape[:2]
     size = max(1, round(CELL_PX * width / height)), CELL_PX
-    picture = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     picture = (0.6 * picture + 0.4 * picture.mean()).astype(np.uint8)
-    alpha = np.float32(1.0) - witness.alpha if claim.inverted else witness.alpha
-    _outline(picture, alpha > 0.5, MASK)
-    row = claim.row_of(witness.index)
-    if row is not None:
-        camera = claim.camera(witness.camera_row, evidence.size_px)
-        _outline(picture, silhouette(evidence.posed(claim.motion, row), camera), BODY)
-    score = "no pose" if row is None else f"{evidence.score(claim, witness):.2f}"
-    _write(picture, f"{witness.index}: {score}", 4)
+    evidence, row = examined.evidence, claim.row_of(number)
+    score = "" if row is not None else ": no pose"
+    if not same_shape((width, height), examined.recording.source.size_px):
+        score = ""  # rotated by a quarter turn: outlines belong to pictures of another shape
+    elif evidence is None:
+        if row is not None:
+            skin, camera = SkinPoints.of(examined.recording.shaped), claim.camera(number, size)
+            _outline(picture, silhouette(skin.posed(claim.motion[row]), camera), BODY)
+    else:
+        witness = next(w for w in evidence.witnesses if w.index == number)
+        alpha = np.float32(1.0) - witness.alpha if claim.inverted else witness.alpha
+        alpha = evidence.person_of(claim, number, alpha) if claim.alone else alpha
+        _outline(picture, alpha > 0.5, MASK)
+        if row is not None:
+            camera = claim.camera(witness.camera_row, evidence.size_px)
+            _outline(picture, silhouette(evidence.posed(claim.motion, row), camera), BODY)
+            score = f": {evidence.score(claim, witness):.2f}"
+    _write(picture, f"{frame.index}{score}", 4)
     return picture
 
 

@@ -54,7 +54,7 @@ def notes_of(
     if choice.alpha:
         yield "The pictures' own alpha channel is used as their masks."
     if masks is not None and masks.inverted:
-        yield f"The masks in {masks.path} show the background; they were turned."
+        yield f"The masks in {masks.path} show the background (white); they were inverted."
     if motion.model != family:
         yield (
             f"The poses were made for the body model {motion.model!r}, but {family!r} is used "
@@ -64,4 +64,7 @@ def notes_of(
         yield fit.words
     lost = len(motion) - int(motion.valid.sum())
     if lost:
-        yield f"{lost} of {len(motion)} poses are not valid; their frames are left out."
+        yield (
+            f"{lost} of {len(motion)} poses are NaN or marked as not valid; their frames are left "
+            "out."
+        )

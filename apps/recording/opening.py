@@ -12,6 +12,7 @@ from capture.errors import BadInput
 from capture.opening import open_live, open_source
 from capture.pace import Pace
 from capture.source import Source
+from capture.transposed import Transposed
 from capture.video import VideoFile
 from preprocess.body import ShapedBody
 from preprocess.body_file import load_body
@@ -63,6 +64,7 @@ def _recorded(
 ) -> Recording:
     paths = find_capture(wanted.video, wanted.poses, _file(wanted.masks), wanted.cameras)
     source, body = open_source(paths.video, frames=wanted.frames), load_body(wanted.body)
+    source = Transposed(source) if wanted.transposed else source
     motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
     doubts: tuple[str, ...] = ()
     if not doubtful:  # ia-check wants the numbers as they are, and says what is odd by itself

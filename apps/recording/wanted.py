@@ -25,6 +25,8 @@ class RecordingPaths:
         person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Of a live source: how long nothing new may come.
         height_m: How tall the person is; None if only the poses tell.
+        transposed: Whether the film's width and height are exchanged before masks and cameras are
+            compared with it; only to find out whether it was rotated.
     """
 
     video: Path
@@ -38,6 +40,7 @@ class RecordingPaths:
     person: str | None = None
     idle_s: float = IDLE_S
     height_m: float | None = None
+    transposed: bool = False
 
     def inputs(self) -> list[Path]:
         """What no output may touch: files and folders that were named, and that may be found."""

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from capture.camera import Camera
 from capture.source import Source
 from preprocess.camera_file import CameraTrack
+from preprocess.doctor.film import AS_FILMED, FilmView
 from preprocess.pose import Motion
 
 SPARSEST = 6.0
@@ -24,7 +25,9 @@ class Claim:
         intrinsics, extrinsics: K and camera-from-world, one for all frames or one for each.
         size_px: Width and height that K belongs to.
         distortion: OpenCV's coefficients, of all cameras.
-        inverted: Whether masks are to be turned before they are used.
+        inverted: Whether masks are to be inverted before they are used.
+        alone: Whether of each mask only the parts are used that the body touches.
+        film: How pictures are to be changed before masks and poses belong to them.
     """
 
     motion: Motion
@@ -34,6 +37,8 @@ class Claim:
     size_px: tuple[int, int]
     distortion: tuple[float, ...] = ()
     inverted: bool = False
+    alone: bool = False
+    film: FilmView = AS_FILMED
 
     @classmethod
     def of(cls, motion: Motion, cameras: CameraTrack, source: Source) -> "Claim":

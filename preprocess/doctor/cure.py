@@ -9,8 +9,9 @@ from jaxtyping import Float
 from preprocess.doctor.claim import Claim
 
 CAUSES = (
-    "mask_polarity", "world_frame", "opengl_axes", "root_rotation", "frame_offset", "frame_rate",
-    "left_right", "root_origin", "focal", "body_scale",
+    "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
+    "frame_rate", "left_right", "root_origin", "focal", "body_scale", "film_rotation",
+    "film_mirrored", "film_offset", "film_crop",
 )  # fmt: skip
 """By these names mistakes are called, in commands and files."""
 
@@ -24,12 +25,14 @@ class Cure:
         words: What was wrong, for people: ends the sentence "It looks as if …".
         undo: From the claim to what it should have been.
         factor: Of a fitted cure, the number that was fitted.
+        frames: Of an offset, the number of frames.
     """
 
     cause: str
     words: str
     undo: Callable[[Claim], Claim]
     factor: float | None = None
+    frames: int | None = None
 
 
 def shifted(frames: int) -> Cure:
@@ -40,6 +43,84 @@ def shifted(frames: int) -> Cure:
         words=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late} "
         f"(or the masks too {other})",
         undo=lambda c: replace(c, places=c.places - frames),
+        frames=frames,
+    )
+
+
+def film_turned(quarter_turns: int) -> Cure:
+    """Pictures rotated counter-clockwise by this many quarter turns, unlike masks and poses."""
+    degrees = 90 * (quarter_turns % 4)
+    way = "" if degrees == 180 else " counter-clockwise" if degrees == 90 else " clockwise"
+
+    def undo(claim: Claim) -> Claim:
+        turns = (claim.film.quarter_turns - quarter_turns) % 4
+        return replace(claim, film=replace(claim.film, quarter_turns=turns))
+
+    return Cure(
+        cause="film_rotation",
+        words=f"the film alone is rotated by {min(degrees, 360 - degrees)}°{way}; its masks and "
+        "poses belong to pictures that are not",
+        undo=undo,
+    )
+
+
+def film_mirrored(quarter_turns: int) -> Cure:
+    """Pictures with left and right exchanged, and rotated, unlike masks and poses."""
+
+    def undo(claim: Claim) -> Claim:
+        film = claim.film
+        turns = (film.quarter_turns - quarter_turns) % 4
+        return replace(claim, film=replace(film, quarter_turns=turns, mirrored=not film.mirrored))
+
+    also = f" and rotated by {90 * quarter_turns}°" if quarter_turns else ""
+    return Cure(
+        cause="film_mirrored",
+        words=f"the film alone is mirrored{also}; its masks and poses belong to pictures that "
+        "are not",
+        undo=undo,
+    )
+
+
+def film_shifted(frames: int) -> Cure:
+    """A film whose frame 0 has the masks and poses of another frame number."""
+    count = f"{abs(frames)} frame{'s' if abs(frames) > 1 else ''}"
+    words = (
+        f"the film starts {count} later than its masks and poses; was its beginning cut off?"
+        if frames > 0
+        else f"the film starts {count} earlier than its masks and poses"
+    )
+    return Cure(
+        cause="film_offset",
+        words=words,
+        undo=lambda c: replace(c, film=replace(c.film, first=c.film.first + frames)),
+        frames=frames,
+    )
+
+
+def film_reversed(frames: int) -> Cure:
+    """A film of some frames that runs backwards against masks and poses."""
+    return Cure(
+        cause="film_offset",
+        words="the film runs backwards against its masks and poses",
+        undo=lambda c: replace(c, film=replace(c.film, first=frames - 1, backwards=True)),
+    )
+
+
+def film_cropped(window: tuple[float, float, float, float]) -> Cure:
+    """A film that shows only a part of the masks' picture, or has borders added around it.
+
+    Args:
+        window: Left, top, right and bottom of the film's picture in the mask's, as fractions.
+    """
+    left, top, right, bottom = window
+    inside = right - left < 1.0 and bottom - top < 1.0
+    kind = "was cropped" if inside else "has borders, or was scaled down"
+    return Cure(
+        cause="film_crop",
+        words=f"the film {kind} after its masks and poses were made: it shows {left:.0%} to "
+        f"{right:.0%} of their width and {top:.0%} to {bottom:.0%} of their height",
+        undo=lambda c: replace(c, film=replace(c.film, window=window)),
+        factor=right - left,
     )
 
 
@@ -72,10 +153,10 @@ def recentred(right_px: float, down_px: float) -> Cure:
         f"{abs(right_px):.0f} px too far {'left' if right_px > 0.0 else 'right'}",
         f"{abs(down_px):.0f} px too far {'up' if down_px > 0.0 else 'down'}",
     )
-    told = [s for s, px in zip(sides, (right_px, down_px), strict=True) if abs(px) >= 1.0]
+    shown = [s for s, px in zip(sides, (right_px, down_px), strict=True) if abs(px) >= 1.0]
     return Cure(
         cause="focal",
-        words=f"the principal point is {' and '.join(told) or 'elsewhere'}; was the video cropped "
+        words=f"the principal point is {' and '.join(shown) or 'elsewhere'}; was the video cropped "
         "after its poses or its camera were made?",
         undo=undo,
     )

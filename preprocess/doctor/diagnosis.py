@@ -1,15 +1,25 @@
-"""Finds the mistake that, undone, makes body and masks agree."""
+"""Finds the mistakes that, undone, make body, masks and pictures agree."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from preprocess.doctor.claim import Claim
-from preprocess.doctor.cure import CAUSES, Cure, refocused, rescaled, shifted
+from preprocess.doctor.cure import (
+    CAUSES,
+    Cure,
+    film_cropped,
+    film_shifted,
+    refocused,
+    rescaled,
+    shifted,
+)  # fmt: skip
 from preprocess.doctor.evidence import Evidence
-from preprocess.doctor.mistakes import cures
+from preprocess.doctor.film_evidence import FilmEvidence
+from preprocess.doctor.mistakes import cures, film_cures
 from preprocess.doctor.soundness import jumps
 from preprocess.doctor.view import centring, standing
 
@@ -23,26 +33,77 @@ GAIN = 0.02
 FITTED_GAIN, FITTED_CHANGE = 0.04, 0.06
 """What a fitted one must win and change (relatively): clothes make everybody a little larger."""
 FITTED = ("focal", "body_scale")
+FILM_GAIN, FILM_FITTED_GAIN, FILM_FITS = 0.03, 0.04, 0.6
+"""What a change of the film must win of the edges' score, and what it must reach to be named."""
+FILM_FITTED_CHANGE = 0.02
+"""Fraction of the picture by which a side must be cut off, or added, to be named."""
+FILM_CLEAR = 0.66
+"""Score of the edges from which only offsets of a few frames are tried."""
 CERTAIN = 3.0
 """By how many standard errors, over the frames, a gain must be above nothing."""
 LOST = 0.3
-"""Share of the frames with poses that a cure may leave without one before they count as missed."""
+"""Share of the frames with poses by which a cure may leave fewer before they count as missed."""
 MOST_CURES = 3
 QUICK = 6
 """Frames of the first look; guesses among the best `KEPT` there are looked at in all frames."""
 KEPT = 8
 """Guesses that are looked at in all frames."""
+NEAR_SHIFT = 2
+"""Offsets of a film, in frames, that are tried even where it seems well."""
 TIE = 0.004
 """Gains this close are equal; then the cause that stands first in `CAUSES` is named."""
 
 
+@runtime_checkable
+class Scored(Protocol):
+    """What says how well a claim fits each of a few frames, in [0, 1]."""
+
+    def scores(self, claim: Claim) -> Float[np.ndarray, "witnesses"]:
+        """The score of each frame; NaN where nothing can be compared."""
+        ...
+
+    def some(self, count: int) -> "Scored":
+        """At most `count` of the frames."""
+        ...
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tried:
-    """A guess, and the agreement it would bring: in the mean, and in each frame."""
+    """A guess, and the agreement it would bring: in the mean, and in each frame.
+
+    The agreement is that of body and masks (intersection over union), or of masks and pictures
+    (the edges' score of `FilmEvidence`).
+    """
 
     cure: Cure
     iou: float
     scores: Float[np.ndarray, "witnesses"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Search:
+    """What is tried, against what, and when it is worth naming.
+
+    Attributes:
+        evidence: What every guess is held against.
+        listed: Every discrete mistake that a claim may have.
+        fitted: Those with a size, as it fits a claim and a few frames best.
+        shift: Makes the cure of an offset; its neighbors are tried around the best one.
+        gain, fitted_gain: What a discrete and a fitted cure must win to be named.
+        fitted_change: By how much a fitted cure must change its number, relatively.
+        fits: What the result must reach, too.
+        polish: What fits a fitted cure again after others were applied; None leaves it.
+    """
+
+    evidence: Scored
+    listed: Callable[[Claim], Iterable[Cure]]
+    fitted: Callable[[Claim, Any], list[Cure]]
+    shift: Callable[[int], Cure]
+    gain: float = GAIN
+    fitted_gain: float = FITTED_GAIN
+    fitted_change: float = FITTED_CHANGE
+    fits: float = 0.0
+    polish: Callable[[Cure, Claim], Cure] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +117,7 @@ class Diagnosis:
         tried: The best guess of each cause in the first round, best first.
         scores: Each frame's agreement as the files are; NaN where a frame has no pose.
         healed: The claim with all cures.
+        film: How the pictures' edges follow the masks; None if no picture was looked at.
     """
 
     now: float
@@ -64,6 +126,22 @@ class Diagnosis:
     tried: tuple[Tried, ...]
     scores: Float[np.ndarray, "witnesses"]
     healed: Claim
+    film: "FilmFit | None" = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FilmFit:
+    """How the pictures' edges follow the masks' outlines: about 0.5 by chance, 0.65 and more well.
+
+    Attributes:
+        now: Mean score as the files are.
+        after: Mean score with all named cures.
+        tried: The best guess of each cause that concerns the film alone, best first.
+    """
+
+    now: float
+    after: float
+    tried: tuple[Tried, ...]
 
 
 def mean(scores: Float[np.ndarray, "witnesses"]) -> float:
@@ -72,16 +150,33 @@ def mean(scores: Float[np.ndarray, "witnesses"]) -> float:
     return float(known.mean()) if len(known) else 0.0
 
 
-def diagnose(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
+def diagnose(
+    claim: Claim, evidence: Evidence, frames: int, film: FilmEvidence | None = None
+) -> Diagnosis:
     """Tries the usual mistakes, and again with the best one undone, while that helps.
+
+    Then the same with mistakes of the film alone, which body and masks cannot tell.
 
     Args:
         claim: What the files say.
         evidence: Masks of a few frames.
         frames: How many frames the capture has.
+        film: A few of its pictures; None if pictures and masks cannot disagree.
     """
+    found = _of_body(claim, evidence, frames)
+    if film is None or evidence.boxes or not film.pictures:
+        return found
+    search = film_search(found.healed, film, frames)
+    named, healed, tried = _mended(found.healed, search)
+    fit = FilmFit(now=mean(film.scores(claim)), after=mean(film.scores(healed)), tried=tried)
+    return replace(found, cures=(*found.cures, *named), healed=healed, film=fit)
+
+
+def _of_body(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
+    """What is wrong between body and masks."""
     first = evidence.scores(claim)
-    named, healed, tried = _mended(claim, evidence, frames)
+    search = _body_search(evidence, frames)
+    named, healed, tried = _mended(claim, search)
     for sought in (centring,) if jumps(claim)[0] else (centring, standing):
         so_far = mean(evidence.scores(healed))
         if (so_far >= DOUBTFUL and len(named) < MOST_CURES) or evidence.boxes:
@@ -89,7 +184,7 @@ def diagnose(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
         found = sought(claim, evidence)
         if found is None:
             continue
-        others, better, _ = _mended(found.undo(claim), evidence, frames)
+        others, better, _ = _mended(found.undo(claim), search)
         least, scores = GOOD if sought is centring else USABLE, evidence.scores(better)
         gained = mean(scores) > max(least, so_far + SURER)
         if gained and np.nanpercentile(scores, 10) > USABLE:  # or it is a bargain between two
@@ -101,17 +196,69 @@ def diagnose(claim: Claim, evidence: Evidence, frames: int) -> Diagnosis:
     )  # fmt: skip
 
 
-def _mended(
-    claim: Claim, evidence: Evidence, frames: int
-) -> tuple[list[Cure], Claim, tuple[Tried, ...]]:
+def _body_search(evidence: Evidence, frames: int) -> Search:
+    """The search for mistakes between body and masks."""
+    pelvis = evidence.skin.shaped.joints[0]
+
+    def polished(cure: Cure, claim: Claim) -> Cure:
+        make = _maker(cure.cause, pelvis)
+        again = fit_factor(make, claim, evidence, near=True).factor or 1.0
+        return make((cure.factor or 1.0) * again)
+
+    return Search(
+        evidence=evidence,
+        listed=lambda claim: cures(claim, pelvis, frames),
+        fitted=_fitted,
+        shift=shifted,
+        polish=polished,
+    )
+
+
+def film_search(claim: Claim, film: FilmEvidence, frames: int, *, quick: bool = False) -> Search:
+    """The search for mistakes of the film alone.
+
+    Args:
+        claim: Poses, masks and film as they are.
+        film: A few pictures and all masks.
+        frames: How many frames the film has.
+        quick: Leaves out what takes long: distant offsets and crops.
+    """
+    clear = quick or mean(film.scores(claim)) >= FILM_CLEAR
+    reach = NEAR_SHIFT if clear else max(frames, film.masks)
+
+    def windows(tried: Claim, few: FilmEvidence) -> list[Cure]:
+        return [] if quick else [film_cropped(few.window(tried))]
+
+    return Search(
+        evidence=film,
+        listed=lambda tried: film_cures(frames, film.masks, reach),
+        fitted=windows,
+        shift=film_shifted,
+        gain=FILM_GAIN,
+        fitted_gain=FILM_FITTED_GAIN,
+        fitted_change=FILM_FITTED_CHANGE,
+        fits=FILM_FITS,
+    )
+
+
+def film_errs(claim: Claim, film: FilmEvidence, frames: int) -> bool:
+    """Whether one of the likeliest mistakes of the film alone is worth naming; a quick look."""
+    search = film_search(claim, film, frames, quick=True)
+    scores = film.scores(claim)
+    guesses = _looked_at(search.listed(claim), claim, film)
+    return any(_is_worth_it(guess, claim, scores, search) for guess in guesses)
+
+
+def _mended(claim: Claim, search: Search) -> tuple[list[Cure], Claim, tuple[Tried, ...]]:
     """Undoes what helps most, again and again: the cures, the result, the first round's guesses."""
+    evidence = search.evidence
     scores = evidence.scores(claim)
     named: list[Cure] = []
     tried: tuple[Tried, ...] = ()
     healed = claim
     while len(named) < MOST_CURES:
-        guesses = _best_guesses(healed, evidence, frames)
-        worth = [guess for guess in guesses if _is_worth_it(guess, healed, scores)]
+        guesses = _best_guesses(healed, search)
+        worth = [guess for guess in guesses if _is_worth_it(guess, healed, scores, search)]
         if not named:
             tried = _best_of_each_cause(guesses)
         if not worth:
@@ -122,19 +269,16 @@ def _mended(
         named.append(chosen)
         healed = chosen.undo(healed)
         scores = evidence.scores(healed)
-    return *_polished(named, claim, healed, evidence), tried
+    return *_polished(named, claim, healed, search), tried
 
 
 def _polished(
-    named: list[Cure], claim: Claim, healed: Claim, evidence: Evidence
+    named: list[Cure], claim: Claim, healed: Claim, search: Search
 ) -> tuple[list[Cure], Claim]:
     """Fits again what was fitted before other mistakes were undone."""
-    pelvis = evidence.skin.shaped.joints[0]
     for place, cure in enumerate(named[:-1]):
-        if cure.factor is not None:
-            make = _maker(cure.cause, pelvis)
-            again = fit_factor(make, healed, evidence, near=True).factor or 1.0
-            named[place] = make(cure.factor * again)
+        if cure.factor is not None and search.polish is not None:
+            named[place] = search.polish(cure, healed)
             healed = claim
             for each in named:
                 healed = each.undo(healed)
@@ -146,19 +290,19 @@ def _maker(cause: str, pelvis: Float[np.ndarray, "3"]) -> Callable[[float], Cure
     return refocused if cause == "focal" else lambda factor: rescaled(factor, pelvis)
 
 
-def _best_guesses(claim: Claim, evidence: Evidence, frames: int) -> list[Tried]:
+def _best_guesses(claim: Claim, search: Search) -> list[Tried]:
     """The most promising guesses, looked at in all frames."""
-    few, pelvis = evidence.some(QUICK), evidence.skin.shaped.joints[0]
-    guesses = _looked_at(cures(claim, pelvis, frames), claim, few)
-    shifts = [guess for guess in guesses if guess.cure.cause == "frame_offset"]
-    guesses += _looked_at(_nearer_shifts(shifts, claim), claim, few)
-    guesses += _looked_at(_fitted(claim, few), claim, few)
+    few = search.evidence.some(QUICK)
+    guesses = _looked_at(search.listed(claim), claim, few)
+    shifts = [guess for guess in guesses if guess.cure.frames is not None]
+    guesses += _looked_at(_nearer_shifts(shifts, search.shift), claim, few)
+    guesses += _looked_at(search.fitted(claim, few), claim, few)
     guesses.sort(key=lambda guess: -guess.iou)
     kept = guesses[:KEPT] + list(_best_of_each_cause(guesses[KEPT:]))
-    return _looked_at([guess.cure for guess in kept], claim, evidence)
+    return _looked_at([guess.cure for guess in kept], claim, search.evidence)
 
 
-def _looked_at(some: Iterable[Cure], claim: Claim, evidence: Evidence) -> list[Tried]:
+def _looked_at(some: Iterable[Cure], claim: Claim, evidence: Scored) -> list[Tried]:
     looked = [(cure, evidence.scores(cure.undo(claim))) for cure in some]
     return [Tried(cure=cure, iou=_worth(scores), scores=scores) for cure, scores in looked]
 
@@ -170,15 +314,14 @@ def _worth(scores: Float[np.ndarray, "witnesses"]) -> float:
     return float(np.nansum(scores)) / len(scores)
 
 
-def _nearer_shifts(shifts: list[Tried], claim: Claim) -> list[Cure]:
+def _nearer_shifts(shifts: list[Tried], make: Callable[[int], Cure]) -> list[Cure]:
     """Offsets around the best of the coarse ones."""
     if not shifts:
         return []
-    best = max(shifts, key=lambda guess: guess.iou).cure.undo(claim)
-    center = round(float(np.median(claim.places - best.places)))
+    center = max(shifts, key=lambda guess: guess.iou).cure.frames or 0
     reach = max(1, abs(center) // 5)
     around = range(center - reach, center + reach + 1)
-    return [shifted(k) for k in around if k not in (0, center)]
+    return [make(k) for k in around if k not in (0, center)]
 
 
 def _fitted(claim: Claim, evidence: Evidence) -> list[Cure]:
@@ -224,25 +367,30 @@ def _best_of_each_cause(guesses: list[Tried]) -> tuple[Tried, ...]:
     return tuple(sorted(best.values(), key=lambda guess: -guess.iou))
 
 
-def _is_worth_it(guess: Tried, claim: Claim, scores: Float[np.ndarray, "witnesses"]) -> bool:
+def _is_worth_it(
+    guess: Tried, claim: Claim, scores: Float[np.ndarray, "witnesses"], search: Search
+) -> bool:
     """Whether a guess wins enough, in frame after frame."""
     gains = guess.scores - np.nan_to_num(scores)
-    had, lost = np.isfinite(scores), np.isfinite(scores) & ~np.isfinite(guess.scores)
-    if lost.sum() > LOST * had.sum():  # it explains the rest, and gives these away
-        gains = np.where(lost, -np.nan_to_num(scores), gains)
+    had, has = np.isfinite(scores), np.isfinite(guess.scores)
+    if had.sum() - has.sum() > LOST * had.sum():  # it explains the rest, and gives these away
+        gains = np.where(had & ~has, -np.nan_to_num(scores), gains)
     gains = gains[np.isfinite(gains)]
-    if 2 * len(gains) < len(scores):
+    if 2 * len(gains) < len(scores) or mean(guess.scores) < search.fits:
         return False
     fitted = guess.cure.factor is not None
-    if fitted and _change(claim, guess.cure.undo(claim)) < FITTED_CHANGE:
+    if fitted and _change(claim, guess.cure.undo(claim)) < search.fitted_change:
         return False
     error = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else 0.0
-    return bool(gains.mean() > (FITTED_GAIN if fitted else GAIN) and gains.mean() > CERTAIN * error)
+    least = search.fitted_gain if fitted else search.gain
+    return bool(gains.mean() > least and gains.mean() > CERTAIN * error)
 
 
 def _change(before: Claim, after: Claim) -> float:
     """How far a fitted cure moves its number, relatively."""
     focal = after.intrinsics[0, 0, 0] / before.intrinsics[0, 0, 0]
-    places = np.linalg.norm(after.motion.root_translations - before.motion.root_translations)
-    size = places / max(float(np.linalg.norm(before.motion.root_translations)), 1e-9)
-    return max(abs(float(np.log(focal))), float(size))
+    there, valid = before.motion.root_translations, before.motion.valid
+    moved = np.linalg.norm((after.motion.root_translations - there)[valid])
+    size = moved / max(float(np.linalg.norm(there[valid])), 1e-9)
+    film = np.abs(np.subtract(after.film.window, before.film.window)).max()
+    return max(abs(float(np.log(focal))), float(size), float(film))

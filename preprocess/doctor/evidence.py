@@ -23,6 +23,8 @@ FIRST_LOOK_PX = 256.0
 """Longer side of the masks in which the person's height is measured."""
 BOX = 0.95
 """Share of its bounding box that no person's outline fills."""
+PART = 0.1
+"""Fraction of a mask's connected part that the body must cover to be of the same person."""
 MOST_KEPT = 256
 """Posed skins that are kept: 25 MB."""
 
@@ -84,7 +86,37 @@ class Evidence:
             return float("nan")
         camera = claim.camera(witness.camera_row, self.size_px)
         alpha = np.float32(1.0) - witness.alpha if claim.inverted else witness.alpha
-        return agreement(silhouette(self.posed(claim.motion, row), camera), alpha)
+        drawn = silhouette(self.posed(claim.motion, row), camera)
+        return agreement(drawn, touched(alpha, drawn) if claim.alone else alpha)
+
+    def person_of(
+        self, claim: Claim, frame: int, alpha: Float32[np.ndarray, "height width"]
+    ) -> Float32[np.ndarray, "height width"]:
+        """Those parts of a frame's mask, of any size, that the posed body touches.
+
+        Unchanged where the claim has no pose for the frame.
+        """
+        row = claim.row_of(frame)
+        if row is None:
+            return alpha
+        camera = claim.camera(int(claim.camera_rows()[row]), self.size_px)
+        drawn = silhouette(self.posed(claim.motion, row), camera).astype(np.uint8)
+        large = cv2.resize(drawn, alpha.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        return touched(alpha, large > 0)
+
+    def areas(self, claim: Claim) -> Float[np.ndarray, "witnesses"]:
+        """Area of each mask over that of the posed body; NaN where there is no body."""
+        found = []
+        for witness in self.witnesses:
+            row = claim.row_of(witness.index)
+            alpha = np.float32(1.0) - witness.alpha if claim.inverted else witness.alpha
+            if row is None:
+                found.append(np.nan)
+                continue
+            camera = claim.camera(witness.camera_row, self.size_px)
+            drawn = int(silhouette(self.posed(claim.motion, row), camera).sum())
+            found.append(float(alpha.sum()) / drawn if drawn else np.nan)
+        return np.array(found)
 
     def posed(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
         """The skin in one of a motion's poses; the last ones are kept, as guesses share them."""
@@ -93,6 +125,23 @@ class Evidence:
                 self._posed.clear()
             self._posed[motion, row] = self.skin.posed(motion[row])
         return self._posed[motion, row]
+
+
+def touched(
+    alpha: Float32[np.ndarray, "height width"], body: Bool[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width"]:
+    """The connected parts of a mask that a body covers in part; the others become 0.
+
+    Unchanged where the body touches none.
+    """
+    count, labels = cv2.connectedComponents((alpha > 0.1).astype(np.uint8), connectivity=8)
+    covered = np.bincount(labels[body], minlength=count)
+    areas = np.bincount(labels.ravel(), minlength=count)
+    own = covered > PART * areas
+    own[0] = False
+    if not own.any():
+        return alpha
+    return np.where(np.isin(labels, np.flatnonzero(own)), alpha, np.float32(0.0))
 
 
 def _filled(alpha: Bool[np.ndarray, "height width"]) -> float:

@@ -8,13 +8,22 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from preprocess.doctor.claim import Claim
-from preprocess.doctor.cure import Cure, shifted
+from preprocess.doctor.cure import (
+    Cure,
+    film_mirrored,
+    film_reversed,
+    film_shifted,
+    film_turned,
+    shifted,
+)  # fmt: skip
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import Motion
 from preprocess.skeleton import JOINT_NAMES
 
-OFFSETS = (1, 2, 3, 4, 5, 7, 9, 12, 15, 18, 21, 25, 30, 35, 40, 50, 60)
+OFFSETS = (*range(1, 13), 15, 18, 21, 25, 30, 35, 40, 50, 60)
 """Frames by which poses may be late or early, at first look."""
+MOST_SLACK = 24
+"""Offsets that are tried, at most, where there are fewer poses than frames."""
 RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 """Frames a second that are mistaken for one another."""
 UNITS = {0.001: "millimetres", 0.01: "centimetres"}
@@ -45,15 +54,47 @@ def cures(claim: Claim, pelvis: Float[np.ndarray, "3"], frames: int) -> Iterator
         words="the masks are 1 where the person is not",
         undo=lambda c: replace(c, inverted=not c.inverted),
     )
+    yield Cure(
+        cause="second_person",
+        words="the masks show somebody else, too, apart from the person whose poses are given",
+        undo=lambda c: replace(c, alone=True),
+    )
     yield from _wrong_world(claim)
     yield from _wrong_axes(claim)
     yield from _wrong_angles(claim)
     yield from _wrong_rotation()
     yield from (shifted(k) for near in OFFSETS if near < frames // 2 for k in (near, -near))
+    rows = len(claim.places)
+    if (
+        rows < frames and np.ptp(claim.places) + 1 == rows
+    ):  # the last frames' poses, or some between
+        yield from (shifted(-k) for k in _slack(frames - rows))
     yield from _wrong_rate(claim, frames)
     yield from _wrong_side()
     yield from _wrong_origin(pelvis)
     yield from _wrong_units()
+
+
+def film_cures(frames: int, masks: int, reach: int) -> Iterator[Cure]:
+    """Every discrete mistake of a film whose masks and poses agree; crops are fitted instead.
+
+    Args:
+        frames: How many frames the film has.
+        masks: How many masks there are.
+        reach: Frames by which it may be late or early.
+    """
+    yield from (film_turned(turns) for turns in (1, 2, 3))
+    yield from (film_mirrored(turns) for turns in range(4))
+    yield from (film_shifted(k) for near in OFFSETS if near <= reach for k in (near, -near))
+    yield from (film_shifted(k) for k in _slack(masks - frames))
+    yield film_reversed(frames)
+
+
+def _slack(most: int) -> list[int]:
+    """Offsets from 1 to `most`, all of them or `MOST_SLACK`, evenly spread, the last one too."""
+    return (
+        sorted({round(k) for k in np.linspace(1, most, min(most, MOST_SLACK))}) if most > 0 else []
+    )
 
 
 def _wrong_units() -> Iterator[Cure]:
@@ -61,7 +102,7 @@ def _wrong_units() -> Iterator[Cure]:
     for factor, unit in UNITS.items():
         yield Cure(
             cause="body_scale",
-            words=f"the places of the poses are in {unit}, not in metres",
+            words=f"the poses' translations are in {unit}, not in metres",
             undo=lambda c, factor=factor: replace(
                 c,
                 motion=replace(c.motion, root_translations=c.motion.root_translations * factor),
@@ -102,17 +143,17 @@ def _wrong_world(claim: Claim) -> Iterator[Cure]:
     if not np.allclose(claim.extrinsics, np.eye(4), atol=1e-6):
         yield Cure(
             cause="world_frame",
-            words="the poses are in the camera's own frame, and its place is counted twice",
+            words="the poses are in the camera's own frame, and its position is applied twice",
             undo=lambda c: replace(c, extrinsics=np.broadcast_to(np.eye(4), c.extrinsics.shape)),
         )
         yield Cure(
             cause="world_frame",
-            words="the cameras are told as world-from-camera, not as camera-from-world",
+            words="the camera matrices are world-from-camera, not camera-from-world",
             undo=lambda c: replace(c, extrinsics=np.linalg.inv(c.extrinsics)),
         )
         yield Cure(
             cause="opengl_axes",
-            words="the cameras are told as world-from-camera with OpenGL's axes (y up, z back)",
+            words="the camera matrices are world-from-camera with OpenGL's axes (y up, z back)",
             undo=lambda c: replace(c, extrinsics=_rigid(OPENGL) @ np.linalg.inv(c.extrinsics)),
         )
 
@@ -132,18 +173,19 @@ def _wrong_axes(claim: Claim) -> Iterator[Cure]:
         )
     yield Cure(
         cause="opengl_axes",
-        words="the root's rotation has OpenGL's axes, its place OpenCV's",
+        words="the roots' rotations and translations have y and z the other way round",
+        undo=lambda c: _turned_about_the_origin(c, OPENGL),
+    )
+    yield Cure(
+        cause="opengl_axes",
+        words="the root's rotation has OpenGL's axes, its translation OpenCV's",
         undo=lambda c: _turned_in_place(c, OPENGL),
     )
-    for signs, which in (
-        ((1, -1, 1), "y has"),
-        ((1, -1, -1), "y and z have"),
-        ((1, 1, -1), "z has"),
-    ):
+    for which, signs in FLIPS.items():
         flip = np.diag(np.array(signs, dtype=np.float64))
         yield Cure(
             cause="opengl_axes",
-            words=f"of the root's place {which} the wrong sign",
+            words=f"in the root's translation {which} the wrong sign",
             undo=lambda c, flip=flip: _placed(c, flip),
         )
 
@@ -177,6 +219,12 @@ def _wrong_rotation() -> Iterator[Cure]:
             cause="root_rotation",
             words="the poses' world has z up where the camera's has y, or the other way round",
             undo=lambda c, turn=turn: replace(c, extrinsics=c.extrinsics @ _rigid(turn)),
+        )
+        yield Cure(
+            cause="root_rotation",
+            words="the poses' world has z up where the camera's has y, or the other way round "
+            "(rotations and translations were converted without the pelvis's offset)",
+            undo=lambda c, turn=turn: _turned_about_the_origin(c, turn),
         )
 
 
@@ -238,7 +286,7 @@ def _wrong_origin(pelvis: Float[np.ndarray, "3"]) -> Iterator[Cure]:
     )
     yield Cure(
         cause="root_origin",
-        words="the root's place was already changed from the origin's to the pelvis's",
+        words="the root's translation was already converted from the origin to the pelvis",
         undo=lambda c: undo(c, -1.0),
     )
 
@@ -267,6 +315,16 @@ def _turned_in_place(claim: Claim, turn: Rotation3) -> Claim:
     """The root turned in the camera's axes, about the pelvis, which stays."""
     cameras = _camera_turns(claim)
     return _with_root(claim, np.swapaxes(cameras, 1, 2) @ turn @ cameras @ _roots(claim.motion))
+
+
+def _turned_about_the_origin(claim: Claim, turn: Rotation3) -> Claim:
+    """Root rotations and translations in another world, as converters write them that forget J0.
+
+    A pose's pelvis is at J0 + translation, so a correct conversion rotates that sum.
+    """
+    motion = claim.motion
+    moved = replace(motion, root_translations=motion.root_translations @ turn.T)
+    return _with_root(replace(claim, motion=moved), turn @ _roots(motion))
 
 
 def _placed(claim: Claim, change: Rotation3) -> Claim:

@@ -61,7 +61,10 @@ def _gaps(claim: Claim, frames: list[int]) -> Iterator[str]:
     valid = claim.motion.valid
     lost = int((~valid).sum())
     if lost:
-        yield f"{lost} of {len(valid)} poses are NaN or marked as lost."
+        yield (
+            f"{lost} of {len(valid)} poses are NaN or marked as not valid; their frames are left "
+            "out."
+        )
     bare = [frame for frame in frames if claim.row_of(frame) is None]
     if len(bare) > lost:
         yield f"{len(bare)} of {len(frames)} frames have no pose{_named(bare)}."

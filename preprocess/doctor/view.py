@@ -111,8 +111,8 @@ def standing(claim: Claim, evidence: Evidence) -> Cure | None:
     extrinsic = max((_refined(scene, start) for start in starts[:BEST]), key=scene.score)
     return Cure(
         cause="world_frame",
-        words="the poses are in a world in which nobody says where the camera stood; "
-        "it was found from the masks",
+        words="the poses are in world coordinates and no file gives the camera's position; "
+        "one that fits was found from the masks",
         undo=lambda c: replace(c, extrinsics=extrinsic[None]),
     )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
 from capture.errors import BadInput
@@ -15,6 +15,7 @@ from capture.source import Source
 from preprocess.camera_file import CameraTrack
 from preprocess.doctor.claim import Claim
 from preprocess.doctor.evidence import spread
+from preprocess.edges import outside, outward, slope_across
 from preprocess.observe import check_cameras
 from preprocess.pose import BodyPose
 from preprocess.silhouette import NEAR_M, SkinPoints, silhouette
@@ -27,7 +28,6 @@ PATIENCE_S = 8.0
 """So long pictures are decoded; of a long video the beginning is looked at."""
 CLOTHES_M, BESIDE_M, FAR_M = 0.03, 0.04, 0.1
 """Clothes end within the first outside a body; beside its outline is between the others."""
-BLUR_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,14 +129,6 @@ def drawn(claim: Claim, skin: SkinPoints, picture: Picture) -> Drawn | None:
     return Drawn(away_m=away, px_per_m=px_per_m)
 
 
-def outside(shape: Bool[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
-    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
-    hard = shape.astype(np.uint8)
-    away = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
-    away -= cv2.distanceTransform(hard, cv2.DIST_L2, 5)
-    return np.asarray(away + np.where(shape, 0.5, -0.5), dtype=np.float32)
-
-
 def edges(claim: Claim, skin: SkinPoints, pictures: Sequence[Picture]) -> float:
     """How many times as strong edges across the body's outline are as such edges beside it.
 
@@ -150,7 +142,8 @@ def edges(claim: Claim, skin: SkinPoints, pictures: Sequence[Picture]) -> float:
         body = drawn(claim, skin, picture)
         if body is None:
             continue
-        across, away = _across(picture.rgb, body.away_m), body.away_m
+        away = body.away_m
+        across = slope_across(picture.rgb, outward(away))
         near = (away > 0.0) & (away < CLOTHES_M)
         off = (np.abs(away) > BESIDE_M) & (np.abs(away) < FAR_M)
         along, along_px = along + float(across[near].sum()), along_px + int(near.sum())
@@ -158,15 +151,3 @@ def edges(claim: Claim, skin: SkinPoints, pictures: Sequence[Picture]) -> float:
     if not along_px or not beside_px or beside <= 0.0:
         return 0.0
     return (along / along_px) / (beside / beside_px)
-
-
-def _across(
-    rgb: UInt8[np.ndarray, "height width 3"], away: Float32[np.ndarray, "height width"]
-) -> Float32[np.ndarray, "height width"]:
-    """The colours' slope in the direction in which the distance from a shape grows."""
-    smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), BLUR_PX)
-    x, y = cv2.Sobel(away, cv2.CV_32F, 1, 0), cv2.Sobel(away, cv2.CV_32F, 0, 1)
-    length = np.sqrt(x**2 + y**2) + np.float32(1e-6)
-    slope = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) * (x / length)[..., None]
-    slope += cv2.Sobel(smooth, cv2.CV_32F, 0, 1) * (y / length)[..., None]
-    return np.asarray(np.abs(slope).max(axis=-1), dtype=np.float32)

@@ -1,6 +1,7 @@
 """Tests for ia-check on films that were spoilt on purpose, and for what ia-ingest makes of it."""
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from apps import check, ingest
-from apps.checking.examine import looks_well
+from apps.checking.examine import examined, looks_well
 from apps.recording.opening import open_recording
 from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
@@ -105,11 +106,98 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
         assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
 
 
-def test_masks_that_are_turned_anyway_need_no_mending(spoilt, call_check):
+def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
     _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
-    assert found["cause"] == "mask_polarity"
+    assert (found["verdict"], found["cause"]) == ("good", "mask_polarity")
+    assert f"agree by {found['iou']['after_fix']:.2f}" in said
     assert "nothing needs to be done" in said
-    assert "Mend it" not in said
+    assert "To correct it" not in said
+
+
+FILM_SPOILS = {
+    "film_rotation": spoils.rotated_film(1),
+    "film_mirrored": spoils.mirrored_film,
+    "film_crop": spoils.cropped_film(0.05, 0.05, 0.85),
+    "film_offset": spoils.trimmed_film(4),
+}
+
+
+@pytest.mark.parametrize("cause", FILM_SPOILS)
+def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
+    folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
+    code, said, found = call_check(folder, "--fix", out)
+    assert code == 0
+    assert [cure["cause"] for cure in found["cures"]] == [cause]
+    assert found["iou"]["now"] > 0.75
+    assert found["film"]["now"] + 0.05 < found["film"]["after_fix"] > 0.7
+    assert "but not with the pictures" in said
+    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+    recording = open_recording(RecordingPaths(video=out))
+    examined_again = examined(recording)
+    assert examined_again.causes == ()
+    assert examined_again.diagnosis.film.now > found["film"]["after_fix"] - 0.03
+    assert recording.source.frames_in_file == (36 if cause == "film_offset" else 40)
+
+
+def narrowed(folder: Path) -> None:
+    """Takes 16 columns from each side of film and masks, so that they are no longer square."""
+    spoils.changed_film(folder, lambda pictures: [picture[:, 16:-16] for picture in pictures])
+    for path in (folder / "masks").iterdir():
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        cv2.imwrite(str(path), mask[:, 16:-16])
+    with np.load(folder / "cameras.npz") as archive:
+        camera = dict(archive)
+    camera["intrinsic"][0, 2] -= 16.0
+    np.savez(folder / "cameras.npz", **{**camera, "width": 64})
+
+
+def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path, call_check):
+    folder, out = spoilt(narrowed, spoils.rotated_film(3)), tmp_path / "corrected"
+    code, said, found = call_check(folder, "--fix", out)
+    assert code == 0
+    assert "expected the same shape" in found["refused"]
+    assert [cure["cause"] for cure in found["cures"]] == ["film_rotation"]
+    assert "rotated by 90° clockwise" in said
+    recording = open_recording(RecordingPaths(video=out))
+    assert recording.source.size_px == (64, 96)
+    assert looks_well(recording)
+
+
+def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_path, call_check):
+    folder, out = spoilt(spoils.second_person), tmp_path / "corrected"
+    _, _, found = call_check(folder, "--fix", out)
+    assert [cure["cause"] for cure in found["cures"]] == ["second_person"]
+    assert found["iou"]["after_fix"] > 0.75
+    masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (out / "masks").iterdir()]
+    masks = [mask for mask in masks if mask is not None and mask.any()]
+    assert len(masks) == 40
+    alone = [mask for mask in masks if not mask[:, :6].any()]
+    assert len(alone) > 35  # an arm that touches the other person makes one part of both
+
+
+def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call_check):
+    _, _, found = call_check(spoilt(spoils.unnumbered_end(22)))
+    assert found["cause"] == "frame_offset"
+    assert "18 frames too early" in found["cures"][0]["words"]
+    assert found["iou"]["after_fix"] > 0.75
+
+
+def test_a_world_with_z_up_is_one_mistake_however_it_was_converted(spoilt, call_check):
+    _, _, found = call_check(spoilt(spoils.z_up_about_the_origin))
+    assert [cure["cause"] for cure in found["cures"]] == ["root_rotation"]
+    assert found["iou"]["after_fix"] > 0.8
+
+
+def test_without_masks_the_sheet_shows_the_body(spoilt, call_check, tmp_path):
+    folder = spoilt(lambda folder: shutil.rmtree(folder / "masks"))
+    _, said, found = call_check(folder)
+    assert found["iou"]["now"] is None
+    assert "times as much as beside it" in said
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    orange = (sheet[..., 2] > 200) & (sheet[..., 0] < 60)
+    assert orange.mean() > 0.005
 
 
 def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call_check, changed):
@@ -122,13 +210,20 @@ def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call
     _, said, found = call_check(folder)
     assert found["verdict"] == "warn"
     assert "12 of" in said
-    assert "they fit where there are both" in said
+    assert "They fit in the frames that have both" in said
 
 
-def test_what_is_to_be_typed_may_be_typed(spoilt, call_check, tmp_path):
+def test_the_command_that_corrects_can_be_pasted(spoilt, call_check, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # the sheet goes to runs/ there
     folder = spoilt(SPOILS["left_right"]).rename(tmp_path / "my film")
-    _, said, _ = call_check(folder)
-    assert f"Mend it: ia-check '{folder}'" in said
+    _, said, _ = call_check(folder, "--poses", folder / "poses.npz", "--no-mask-invert")
+    command = said[said.index("To correct it: ") :].removeprefix("To correct it: ")
+    words = shlex.split(command)
+    assert words[:4] == ["ia-check", str(folder), "--poses", str(folder / "poses.npz")]
+    assert words[4:6] == ["--no-mask-invert", "--fix"]
+    assert words[6] == f"{folder}-corrected"
+    assert check.main(words[1:]) == 0
+    assert looks_well(open_recording(RecordingPaths(video=tmp_path / "my film-corrected")))
 
 
 def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
@@ -171,14 +266,17 @@ def test_what_cannot_be_read_is_said_in_the_json_too(tmp_path, call_check):
     assert found["refused"] in said
 
 
+@pytest.mark.filterwarnings("error")
 def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
     folder = spoilt()
     motion = read_motion(folder / "poses.npz")
     orient, moved = motion.root_rotations.copy(), motion.root_translations.copy()
     orient[3] = np.nan
     moved[20:22] += [0.9, 0.0, 0.0]
+    moved[3] = np.nan
     changed(folder / "poses.npz", global_orient=orient, transl=moved)
-    code, _, found = call_check(folder)
+    code, said, found = call_check(folder)
+    assert said.count("1 of 40 poses") == 1
     assert code == 0
     assert found["verdict"] == "warn"
     assert any("1 of 40 poses" in odd for odd in found["odd"])
@@ -188,6 +286,10 @@ def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
 def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, spoilt):
     assert looks_well(open_recording(RecordingPaths(video=dancing)))
     assert not looks_well(open_recording(RecordingPaths(video=spoilt(spoils.late(1)))))
+
+
+def test_a_glance_notices_a_mirrored_film(spoilt):
+    assert not looks_well(open_recording(RecordingPaths(video=spoilt(spoils.mirrored_film))))
 
 
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
