@@ -15,7 +15,7 @@ from export.rules import DrawingRules
 from preprocess.pose import BodyPose
 
 FORMAT = 3
-LATER = {"sheet_gap_m"}
+LATER = {"sheet_gap_m", "squash_limit", "fold_volume", "fold_setback_m"}
 """What the first packages of this format do not have: then it is as it always was."""
 GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""

@@ -65,9 +65,10 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
     """
     graph, rules = scene.graph, scene.rules
     usual = rules.span_m / scene.samples.cast(np.float32)
+    shortened = unsquashed(scene, segment.direction)
     scale = (scene.samples + (rules.samples - 1)) // rules.samples  # more samples, more blocks
     blocks, steady = (scale * count for count in (rules.blocks, rules.steady))
-    block = sampled(scene, segment, segment.begin * 0.0 + 1.0, rules.block, usual)
+    block = sampled(scene, segment, segment.begin * 0.0 + 1.0, rules.block, usual * shortened)
     number = graph.range(graph.size(segment.begin).cast(np.int32))
     start = [block.light, *block.color, *_going_on(scene, number, segment, block)]
 
@@ -76,7 +77,8 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
         segment = _led_back(scene, posed, _segment(values))
         doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
         last = turn > blocks - 3
-        longest = graph.where(last, rules.longest_m, usual * doublings.exp2())
+        shortened = unsquashed(scene, segment.direction)
+        longest = graph.where(last, rules.longest_m, usual * doublings.exp2() * shortened)
         block = sampled(scene, segment, before, rules.block, longest)
         light = light.scattered(number, block.light)
         color = [
@@ -88,6 +90,11 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
 
     light, *color = graph.loop_while(blocks - 1, start, once)[:4]
     return color, light
+
+
+def unsquashed(scene: Scene, direction: Vector) -> Value:
+    """The share of a usual length that is gone where the pose squashes canonical space."""
+    return (scene.rules.squash_limit / dot(direction, direction).sqrt()).minimum(1.0)
 
 
 def _going_on(scene: Scene, number: Value, segment: Segment, block: Block) -> list[Value]:

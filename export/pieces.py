@@ -119,7 +119,7 @@ def _blocks(
             rest = led_back(rules, posed, rest)
         step_m = np.minimum(
             (rest.end - rest.begin) / np.float32(rules.block),
-            np.float32(longest(rules, rules.samples, turn)),
+            longest(rules, rules.samples, turn, rest),
         )
         yield number, rest, step_m
         way = step_m * np.float32(rules.block)

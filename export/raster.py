@@ -85,7 +85,7 @@ def splat(scene: Scene, surfels: Surfels) -> Splats:
         window=window,
         side=side,
         cell=graph.where(seen, cell, window.cells.cast(np.int32)),
-        key=_depth_code(scene, depth) * (1 << SURFEL_BITS) + number,
+        key=_set_back(scene, _depth_code(scene, depth), surfels) * (1 << SURFEL_BITS) + number,
         depth=depth,
     )
 
@@ -124,6 +124,16 @@ def _depth_code(scene: Scene, depth: Value) -> Value:
     near = pelvis - tables.reach_m
     steps = (depth - near) * ((DEPTH_STEPS - 1) / (2.0 * tables.reach_m))
     return steps.clipped(0.0, DEPTH_STEPS - 1.0).cast(np.int32)
+
+
+def _set_back(scene: Scene, code: Value, surfels: Surfels) -> Value:
+    """Depth codes in which squashed surfels stand behind their neighbours."""
+    rules = scene.rules
+    if rules.fold_setback_m == 0.0:
+        return code
+    steps = int(rules.fold_setback_m / (2.0 * scene.tables.reach_m) * DEPTH_STEPS)
+    behind = (code + steps).minimum(DEPTH_STEPS - 1)
+    return scene.graph.where(surfels.squashed, behind, code)
 
 
 def _footprint(scene: Scene, nearest: Value) -> Value:

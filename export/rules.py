@@ -19,6 +19,8 @@ class DrawingRules:
         blocks: At most so many; the last one takes what is left of a ray. Where the player asks for
             more samples, steady and other blocks are so many times more.
         second_block: Samples of a ray in each further layer, all at once.
+        squash_limit: Where a pose squashes canonical space along a ray by more than this factor,
+            steps and `most_lead_m` are shorter by what is more; the last block's are not.
         longest_correction_m: No correction is longer than this.
         ended: A ray ends where less than this share of the light is left.
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
@@ -32,6 +34,9 @@ class DrawingRules:
         longest_m: Longest segment, metres.
         stretch: Where the derivative's determinant is outside of (1/stretch, stretch), the skin is
             folded: surfels are looked at along their normals, and paths not corrected.
+        fold_volume: Where the derivative's determinant in a surfel's tetrahedron is below this, the
+            surfel is squashed or inside out, and one of its neighbours shows the place better.
+        fold_setback_m: Such surfels count as this much deeper in the z-buffer; 0 turns it off.
         hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
             filled.
         gap_m: Surfels of a further layer lie at least this far behind those of the one before it.
@@ -51,7 +56,7 @@ class DrawingRules:
     block: int = 3
     steady: int = 3
     nodes_per_step: int = 2
-    blocks: int = 5
+    blocks: int = 6
     second_block: int = 6
     longest_correction_m: float = 0.01
     ended: float = 0.01
@@ -73,3 +78,6 @@ class DrawingRules:
     transmitted: float = 0.02
     nearest_m: float = 0.1
     sheet_gap_m: float = 0.01
+    squash_limit: float = 1e9
+    fold_volume: float = 0.3
+    fold_setback_m: float = 0.0

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from export.columns import Vector, adjugate, dot, taken
-from export.march import Segment, march, sampled
+from export.march import Segment, march, sampled, unsquashed
 from export.nodes import Value
 from export.posing import Place, Posed, carried, inverse_of
 from export.raster import Window
@@ -128,9 +128,10 @@ def _extent(
     hit = graph.where(falling < shallow, hit, 0.0).clipped(-rules.slack_m, rules.slack_m)
     enter = along + hit
     cosine = (-falling).maximum(rules.steepest)
-    lead = (rules.lead_m / cosine).minimum(rules.most_lead_m)
+    lead = (rules.lead_m / cosine).minimum(unsquashed(scene, direction) * rules.most_lead_m)
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
-    times = ((sine * rules.grazing + 1.0) / cosine).minimum(rules.lengthened)
+    bent = cosine.minimum(rules.squash_limit)  # cloth is seldom squashed as much all the way
+    times = ((sine * rules.grazing + 1.0) / bent).minimum(rules.lengthened)
     length = (thickness * times + lead).minimum(rules.longest_m)
     begin = enter - lead
     return enter, begin, begin + length

@@ -4,10 +4,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32, Int, Int32
 
 from capture.errors import BadInput
 from export.tables import Skin
+
+
+NOWHERE_M = 1e6
+"""Canonical place of nodes that are not stored, metres. A derivative that looks at one of them is so
+large that it is never trusted: beyond the stored skin a ray goes straight on."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -21,10 +26,11 @@ class SkinNodes:
     Attributes:
         low: Corner of the grid, canonical metres.
         step_m: Distance between nodes along x, y, z.
-        index: Which row belongs to each node, 0 for none. Rows are numbered in C order: where a
-            whole cell is there, the row of the next node along z is the next one. There is one row
-            more than nodes, so that there always is a next one.
-        positions: Canonical metres.
+        index: Which row belongs to each node, 0 where it or the next one along z is not stored.
+            Rows are numbered in C order: the row of the next node along z is the next one. There is
+            one row more than nodes, so that there always is a next one.
+        positions: Canonical metres; those of the first and the last row, which are no nodes, are
+            `NOWHERE_M`.
         weights: Of the joints.
     """
 
@@ -56,12 +62,11 @@ def stored_nodes(skin: Skin) -> SkinNodes:
     weights = np.zeros((24, len(place) + 2), dtype=np.float32)
     weights[:, :-1] = skin.weights.T
     weights[0, -1] = 1.0
-    positions = np.pad(place, [(1, 1), (0, 0)]) * skin.step_m + skin.low
     return SkinNodes(
         low=skin.low,
         step_m=skin.step_m,
-        index=skin.index,
-        positions=positions.astype(np.float32),
+        index=_with_next(skin.index),
+        positions=_positions(place, skin.low, skin.step_m),
         weights=weights,
     )
 
@@ -86,14 +91,30 @@ def finer_nodes(skin: Skin) -> SkinNodes:
         sums = total.sum(axis=1, keepdims=True, dtype=np.float32)
         weights[:, chosen + 1] = (total / np.maximum(sums, np.float32(1.0))).T
     step_m = skin.step_m * np.float32(0.5)
-    positions = np.pad(place, [(1, 1), (0, 0)]) * step_m + skin.low
     return SkinNodes(
         low=skin.low,
         step_m=step_m,
-        index=index,
-        positions=positions.astype(np.float32),
+        index=_with_next(index),
+        positions=_positions(place, skin.low, step_m),
         weights=weights,
     )
+
+
+def _with_next(index: Int32[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
+    """The rows of those nodes alone whose next one along z is there."""
+    kept = np.zeros_like(index)
+    kept[..., :-1] = np.where(index[..., 1:] > 0, index[..., :-1], 0)
+    return kept
+
+
+def _positions(
+    place: Int[np.ndarray, "nodes 3"],
+    low: Float32[np.ndarray, "3"],
+    step_m: Float32[np.ndarray, "3"],
+) -> Float32[np.ndarray, "rows 3"]:
+    """Positions of nodes, and of a row before and behind them that are nowhere."""
+    positions = (place * step_m + low).astype(np.float32)
+    return np.pad(positions, [(1, 1), (0, 0)], constant_values=NOWHERE_M)
 
 
 def _inside(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:

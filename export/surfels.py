@@ -1,7 +1,10 @@
 """Nodes that carry the hull's surfels into the camera's frame, cheaply: most are never seen."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+
+import numpy as np
 
 from export.columns import Vector, cross, dot, taken
 from export.nodes import Value
@@ -18,12 +21,15 @@ class Surfels:
         rows: Of the four nodes about each, and
         normal: its normal per step along the edges between these, also the same in all poses.
         camera: Positions in the camera's frame, linear in tetrahedra.
+        squashed: Where the posed tetrahedron has less than `fold_volume` of its canonical volume
+            (below 0: it is inside out).
     """
 
     place: Place
     rows: list[Value]
     normal: Vector
     camera: Vector
+    squashed: Value
 
 
 def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
@@ -33,16 +39,21 @@ def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
     """
     columns = scene.columns
     place = place_of(scene, [columns[f"position_{letter}"] for letter in "xyz"])
-    rows, shares, normal = _tetrahedra(scene, place)
+    rows, shares, normal, handed = _tetrahedra(scene, place)
+    corners = [taken(posed.camera, row) for row in rows]
     camera = []
-    for table in posed.camera:
-        total = None
-        for row, share in zip(rows, shares, strict=True):
-            part = table.take(row) * share
-            total = part if total is None else total + part
-        assert total is not None
-        camera.append(total)
-    return Surfels(place=place, rows=rows, normal=normal, camera=camera)
+    for axis in range(3):
+        parts = [corner[axis] * share for corner, share in zip(corners, shares, strict=True)]
+        camera.append(parts[0] + parts[1] + parts[2] + parts[3])
+    edges = _edges(corners)
+    volume = dot(edges[0], cross(edges[1], edges[2])) * handed
+    least = scene.rules.fold_volume / float(np.prod(nodes_per_m(scene)))
+    return Surfels(place=place, rows=rows, normal=normal, camera=camera, squashed=volume < least)
+
+
+def _edges(corners: Sequence[Vector]) -> list[Vector]:
+    """The way through four corners."""
+    return [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
 
 
 def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) -> Value:
@@ -51,8 +62,7 @@ def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) ->
     J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
     """
     rules, rows = scene.rules, taken(surfels.rows, number)
-    corners = [[table.take(row) for table in posed.camera] for row in rows]
-    edges = [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
+    edges = _edges([taken(posed.camera, row) for row in rows])
     across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
     volume = dot(edges[0], across[0])
     camera = taken(surfels.camera, number)
@@ -61,8 +71,10 @@ def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) ->
     return facing * volume < camera[2] * volume * volume * -rules.facing
 
 
-def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], Vector]:
+def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], Vector, Value]:
     """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
+
+    Last, 1 where these edges form a right-handed frame in canonical space, and -1 elsewhere.
 
     The way from the lower to the upper corner of a cell takes the axis of the largest fraction
     first (as `lookup.Cell`).
@@ -88,4 +100,10 @@ def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], V
     one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
     three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))
     normal = [one, (nx + ny + nz) - one - three, three]
-    return [low, first, second, along_both + 1], shares, normal
+    right, left = (graph.constant(np.float32(sign)) for sign in (1.0, -1.0))
+    handed = graph.where(
+        x_over_y,
+        graph.where(x_over_z, graph.where(y_over_z, right, left), right),
+        graph.where(y_over_z, graph.where(x_over_z, left, right), left),
+    )
+    return [low, first, second, along_both + 1], shares, normal, handed

@@ -2,13 +2,16 @@
 
 from export.rules import DrawingRules
 
+SQUASHED = {"squash_limit": 1.0, "fold_setback_m": 0.02}
+"""Rules for armpits and the like, where a raised or twisted arm squashes cloth."""
 TIERS = {
-    "hq": DrawingRules(),
+    "hq": DrawingRules(**SQUASHED),
     "lite": DrawingRules(
+        **SQUASHED,
         samples=5,
         block=2,
         steady=1,
-        blocks=2,
+        blocks=3,
         nodes_per_step=1,
         lead_m=0.001,
         ended=0.05,

@@ -14,7 +14,15 @@ from jaxtyping import Bool, Float32, Int64
 from export.rules import DrawingRules
 from export.skin import nodes_of
 from export.tables import DEPTH_STEPS, SURFEL_BITS, Tables
-from export.twin_march import PosedNodes, Rays, carried, carried_in_tetrahedra, march, sampled
+from export.twin_march import (
+    PosedNodes,
+    Rays,
+    carried,
+    carried_in_tetrahedra,
+    march,
+    sampled,
+    unsquashed,
+)
 
 FAR = 2**31 - 1
 
@@ -45,12 +53,13 @@ class _Posed:
     """The skin and, linear in tetrahedra, the hull in the camera's frame.
 
     `facing` is the ray to each surfel along its normal in canonical space, negative where it faces
-    the camera.
+    the camera; `volume` what becomes of a unit of canonical volume, negative if it is inside out.
     """
 
     nodes: PosedNodes
     splatted: Float32[np.ndarray, "surfels 3"]
     facing: Float32[np.ndarray, "surfels"]
+    volume: Float32[np.ndarray, "surfels"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -183,13 +192,15 @@ def _pose(tables: Tables, rules: DrawingRules, shot: Shot) -> _Posed:
     node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
     there = PosedNodes(nodes, node_camera)
     splatted, edges = carried_in_tetrahedra(there, tables.surfels.positions)
-    flat = np.abs(np.linalg.det(edges)) < 1e-12
+    volume = np.linalg.det(edges)
+    flat = np.abs(volume) < 1e-12
     from_eye = np.linalg.solve(np.where(flat[:, None, None], np.eye(3), edges), splatted[..., None])
     facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye[..., 0])
     return _Posed(
         nodes=there,
         splatted=splatted,
         facing=np.where(flat, 0.0, facing).astype(np.float32),
+        volume=volume,
     )
 
 
@@ -247,7 +258,11 @@ def _footprints(
     faces = posed.facing[surfel] < -depth * rules.facing
     near = shot.bones[0, 2, :3] @ tables.pelvis + shot.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_STEPS - 1)
-    key = (np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64) << SURFEL_BITS) | surfel
+    code = np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64)
+    steps = int(rules.fold_setback_m / (2.0 * tables.reach_m) * DEPTH_STEPS)
+    squashed = posed.volume[surfel] < rules.fold_volume
+    code = np.where(squashed, np.minimum(code + steps, DEPTH_STEPS - 1), code)
+    key = (code << SURFEL_BITS) | surfel
     deep_enough = np.where(faces, depth, np.float32(0.0))
 
     first = np.floor(place - np.float32((side - 1) / 2)).astype(np.int64)
@@ -301,10 +316,12 @@ def _entering(
     hit = np.where(falling < shallow, hit, 0.0)
     enter = along + np.clip(hit, -rules.slack_m, rules.slack_m)
     cosine = np.maximum(-falling, rules.steepest)
-    lead = np.minimum(rules.lead_m / cosine, rules.most_lead_m)
+    most_lead = rules.most_lead_m * unsquashed(rules, direction)
+    lead = np.minimum(rules.lead_m / cosine, most_lead)
     begin = enter - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
-    length = thickness * np.minimum((1.0 + rules.grazing * sine) / cosine, rules.lengthened)
+    bent = np.minimum(cosine, np.float32(rules.squash_limit))
+    length = thickness * np.minimum((1.0 + rules.grazing * sine) / bent, rules.lengthened)
     end = begin + np.minimum(length + lead, rules.longest_m)
     if before is not None:
         first = surfels.positions[before.surfel]

@@ -102,7 +102,11 @@ class Block(NamedTuple):
 
 
 def sampled(
-    bricks: Bricks, rays: Rays, light: Float[np.ndarray, "rays"], count: int, longest: float
+    bricks: Bricks,
+    rays: Rays,
+    light: Float[np.ndarray, "rays"],
+    count: int,
+    longest: Float32[np.ndarray, "rays"] | float,
 ) -> Block:
     """So many samples of density, at most `longest` apart, and one of colour at their mean."""
     step = np.minimum((rays.end - rays.begin) / count, longest).astype(np.float32)
@@ -128,7 +132,8 @@ def march(
     for turn in range(rules.blocks * scale):
         if turn > 0:
             rest = led_back(rules, posed, rest)
-        block = sampled(bricks, rest, light[alive], rules.block, longest(rules, samples, turn))
+        most = longest(rules, samples, turn, rest)
+        block = sampled(bricks, rest, light[alive], rules.block, most)
         colors[alive] += block.colors
         light[alive] = block.light
         rest = rest._replace(
@@ -139,12 +144,23 @@ def march(
     return colors
 
 
-def longest(rules: DrawingRules, samples: int, turn: int) -> float:
-    """How far apart the samples of a ray's `turn`-th block may be, metres."""
+def longest(
+    rules: DrawingRules, samples: int, turn: int, rays: Rays
+) -> Float32[np.ndarray, "rays"]:
+    """How far apart the samples of rays' `turn`-th block may be, metres."""
     scale = -(-samples // rules.samples)
     if turn > 0 and turn == rules.blocks * scale - 1:
-        return rules.longest_m
-    return rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
+        return np.full(len(rays.begin), rules.longest_m, dtype=np.float32)
+    usual = rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
+    return np.float32(usual) * unsquashed(rules, rays.direction)
+
+
+def unsquashed(
+    rules: DrawingRules, direction: Float32[np.ndarray, "rays 3"]
+) -> Float32[np.ndarray, "rays"]:
+    """The share of a usual length that is gone where the pose squashes canonical space."""
+    canonical_per_m = np.linalg.norm(direction, axis=1)
+    return np.minimum(np.float32(rules.squash_limit) / canonical_per_m, np.float32(1.0))
 
 
 def led_back(rules: DrawingRules, posed: PosedNodes, rays: Rays) -> Rays:

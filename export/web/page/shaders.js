@@ -189,6 +189,8 @@ void main() {
   float side = footprint_side(near);
   bool seen = s.seen && all(greaterThan(s.uv, vec2(-0.5 * side))) && all(lessThan(s.uv, vec2(size) + 0.5 * side));
   float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
+  bool squashed = determinant(s.derivative) < fold_volume; // then a neighbour shows the place better
+  if (squashed) code = min(code + floor(fold_setback_m / (2.0 * reach_m) * float(DEPTH_STEPS)), float(DEPTH_STEPS - 1));
   key = (int(code) << SURFEL_BITS) | gl_VertexID;
 #ifdef BEHIND
   deep_enough = faces(gl_VertexID, s) ? depth : 0.0;
@@ -261,6 +263,9 @@ vec4 read_bricks(vec3 lattice) {
 `;
 
 const MARCH = `
+/** The share of a usual length that is gone where the pose squashes canonical space. */
+float unsquashed(vec3 direction) { return min(squash_limit / length(direction), 1.0); }
+
 /** Premultiplied colour and the light that is left of it after a block of samples. */
 vec4 sampled(vec3 point, vec3 direction, float stride, float light, int count) {
   vec3 start = (point - brick_low) / voxel_m, slope = direction * (stride / voxel_m);
@@ -291,7 +296,7 @@ vec4 march(vec3 ray, float begin, float end, vec3 point, vec3 direction) {
         direction = back * ray;
       }
     }
-    float longest = span_m / samples * exp2(max(float(turn + 1 - steady * scale), 0.0));
+    float longest = span_m / samples * exp2(max(float(turn + 1 - steady * scale), 0.0)) * unsquashed(direction);
     if (turn > 0 && turn == most - 1) longest = longest_m;
     float stride = min((end - place) / float(block), longest);
     vec4 found = sampled(point, direction, stride, light, block);
@@ -332,10 +337,11 @@ Entry entry_of(int surfel, vec3 ray) {
   float hit = -dot(normal, e.beside) / min(falling, shallow);
   e.enter = e.along + clamp(falling < shallow ? hit : 0.0, -slack_m, slack_m);
   float cosine = max(-falling, steepest);
-  float lead = min(lead_m / cosine, most_lead_m);
+  float lead = min(lead_m / cosine, most_lead_m * unsquashed(e.direction));
   float sine = 1.0 - falling * falling / max(dot(e.direction, e.direction), 1e-12);
   e.begin = e.enter - lead;
-  e.end = e.begin + min(table.w * min((sine * grazing + 1.0) / cosine, lengthened) + lead, longest_m);
+  float bent = min(cosine, squash_limit);
+  e.end = e.begin + min(table.w * min((sine * grazing + 1.0) / bent, lengthened) + lead, longest_m);
   return e;
 }
 
