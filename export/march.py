@@ -93,7 +93,7 @@ def march(scene: Scene, posed: Posed, segment: Segment) -> tuple[Vector, Value]:
 
 
 def unsquashed(scene: Scene, direction: Vector) -> Value:
-    """The share of a usual length that is gone where the pose squashes canonical space."""
+    """Factor by which lengths along rays shrink where the pose compresses canonical space."""
     return (scene.rules.squash_limit / dot(direction, direction).sqrt()).minimum(1.0)
 
 

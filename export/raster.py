@@ -127,13 +127,13 @@ def _depth_code(scene: Scene, depth: Value) -> Value:
 
 
 def _set_back(scene: Scene, code: Value, surfels: Surfels) -> Value:
-    """Depth codes in which squashed surfels stand behind their neighbours."""
+    """Depth codes, with folded surfels moved behind their neighbours."""
     rules = scene.rules
     if rules.fold_setback_m == 0.0:
         return code
     steps = int(rules.fold_setback_m / (2.0 * scene.tables.reach_m) * DEPTH_STEPS)
     behind = (code + steps).minimum(DEPTH_STEPS - 1)
-    return scene.graph.where(surfels.squashed, behind, code)
+    return scene.graph.where(surfels.folded, behind, code)
 
 
 def _footprint(scene: Scene, nearest: Value) -> Value:

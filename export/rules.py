@@ -19,8 +19,9 @@ class DrawingRules:
         blocks: At most so many; the last one takes what is left of a ray. Where the player asks for
             more samples, steady and other blocks are so many times more.
         second_block: Samples of a ray in each further layer, all at once.
-        squash_limit: Where a pose squashes canonical space along a ray by more than this factor,
-            steps and `most_lead_m` are shorter by what is more; the last block's are not.
+        squash_limit: Compression of canonical space along a ray (canonical metres a metre) up to
+            which steps and `most_lead_m` are as stated; beyond it both shrink in proportion, except
+            in the last block, and a segment is not shortened any further.
         longest_correction_m: No correction is longer than this.
         ended: A ray ends where less than this share of the light is left.
         largest_footprint_px: Surfels cover at most so many pixels along x and y.
@@ -34,9 +35,10 @@ class DrawingRules:
         longest_m: Longest segment, metres.
         stretch: Where the derivative's determinant is outside of (1/stretch, stretch), the skin is
             folded: surfels are looked at along their normals, and paths not corrected.
-        fold_volume: Where the derivative's determinant in a surfel's tetrahedron is below this, the
-            surfel is squashed or inside out, and one of its neighbours shows the place better.
-        fold_setback_m: Such surfels count as this much deeper in the z-buffer; 0 turns it off.
+        fold_volume: Ratio of posed to canonical volume about a surfel below which the surfel counts
+            as folded; negative ratios are inside out.
+        fold_setback_m: Folded surfels are put this much deeper into the z-buffer, so that a
+            neighbour, whose inverse is better conditioned, is drawn instead; 0 turns it off.
         hole_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
             filled.
         gap_m: Surfels of a further layer lie at least this far behind those of the one before it.

@@ -130,7 +130,7 @@ def _extent(
     cosine = (-falling).maximum(rules.steepest)
     lead = (rules.lead_m / cosine).minimum(unsquashed(scene, direction) * rules.most_lead_m)
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
-    bent = cosine.minimum(rules.squash_limit)  # cloth is seldom squashed as much all the way
+    bent = cosine.minimum(rules.squash_limit)  # compression at the surfel seldom lasts
     times = ((sine * rules.grazing + 1.0) / bent).minimum(rules.lengthened)
     length = (thickness * times + lead).minimum(rules.longest_m)
     begin = enter - lead

@@ -9,10 +9,9 @@ from jaxtyping import Bool, Float32, Int, Int32
 from capture.errors import BadInput
 from export.tables import Skin
 
-
 NOWHERE_M = 1e6
-"""Canonical place of nodes that are not stored, metres. A derivative that looks at one of them is so
-large that it is never trusted: beyond the stored skin a ray goes straight on."""
+"""Canonical coordinates of nodes that are not stored, metres. They make the derivative so
+large that it is never inverted: beyond the stored skin a ray keeps its direction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -21,15 +21,15 @@ class Surfels:
         rows: Of the four nodes about each, and
         normal: its normal per step along the edges between these, also the same in all poses.
         camera: Positions in the camera's frame, linear in tetrahedra.
-        squashed: Where the posed tetrahedron has less than `fold_volume` of its canonical volume
-            (below 0: it is inside out).
+        folded: Whether the posed tetrahedron has less than `fold_volume` of its canonical volume;
+            inside out counts as negative.
     """
 
     place: Place
     rows: list[Value]
     normal: Vector
     camera: Vector
-    squashed: Value
+    folded: Value
 
 
 def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
@@ -48,11 +48,11 @@ def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
     edges = _edges(corners)
     volume = dot(edges[0], cross(edges[1], edges[2])) * handed
     least = scene.rules.fold_volume / float(np.prod(nodes_per_m(scene)))
-    return Surfels(place=place, rows=rows, normal=normal, camera=camera, squashed=volume < least)
+    return Surfels(place=place, rows=rows, normal=normal, camera=camera, folded=volume < least)
 
 
 def _edges(corners: Sequence[Vector]) -> list[Vector]:
-    """The way through four corners."""
+    """The three edges from each corner to the next."""
     return [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
 
 
@@ -74,7 +74,7 @@ def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) ->
 def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], Vector, Value]:
     """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
 
-    Last, 1 where these edges form a right-handed frame in canonical space, and -1 elsewhere.
+    The last value is 1 where these edges are right-handed in canonical space, and -1 elsewhere.
 
     The way from the lower to the upper corner of a cell takes the axis of the largest fraction
     first (as `lookup.Cell`).

@@ -1,13 +1,14 @@
 """The qualities in which one set of tables is drawn."""
 
+from dataclasses import replace
+
 from export.rules import DrawingRules
 
-SQUASHED = {"squash_limit": 1.0, "fold_setback_m": 0.02}
-"""Rules for armpits and the like, where a raised or twisted arm squashes cloth."""
+HQ = DrawingRules(squash_limit=1.0, fold_setback_m=0.02)
 TIERS = {
-    "hq": DrawingRules(**SQUASHED),
-    "lite": DrawingRules(
-        **SQUASHED,
+    "hq": HQ,
+    "lite": replace(
+        HQ,
         samples=5,
         block=2,
         steady=1,

@@ -53,7 +53,7 @@ class _Posed:
     """The skin and, linear in tetrahedra, the hull in the camera's frame.
 
     `facing` is the ray to each surfel along its normal in canonical space, negative where it faces
-    the camera; `volume` what becomes of a unit of canonical volume, negative if it is inside out.
+    the camera; `volume` the ratio of posed to canonical volume, negative where it is inside out.
     """
 
     nodes: PosedNodes
@@ -260,8 +260,8 @@ def _footprints(
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_STEPS - 1)
     code = np.clip(code, 0, DEPTH_STEPS - 1).astype(np.int64)
     steps = int(rules.fold_setback_m / (2.0 * tables.reach_m) * DEPTH_STEPS)
-    squashed = posed.volume[surfel] < rules.fold_volume
-    code = np.where(squashed, np.minimum(code + steps, DEPTH_STEPS - 1), code)
+    folded = posed.volume[surfel] < rules.fold_volume
+    code = np.where(folded, np.minimum(code + steps, DEPTH_STEPS - 1), code)
     key = (code << SURFEL_BITS) | surfel
     deep_enough = np.where(faces, depth, np.float32(0.0))
 

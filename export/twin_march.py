@@ -31,7 +31,10 @@ class Rays(NamedTuple):
 def carried(
     posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
-    """Where canonical points are in the camera's frame, and the derivative: trilinear."""
+    """Where canonical points are in the camera's frame, and the derivative: trilinear.
+
+    The derivative is 0, which no inverse is taken of, where one of the eight nodes is not stored.
+    """
     nodes = posed.nodes
     last = np.array(nodes.index.shape) - 1
     place = np.clip((points - nodes.low) / nodes.step_m, 0.0, last - 1e-3)
@@ -39,14 +42,17 @@ def carried(
     part = (place - base).astype(np.float32)
     moved = np.zeros((len(points), 3), dtype=np.float32)
     derivative = np.zeros((len(points), 3, 3), dtype=np.float32)
+    stored = np.ones(len(points), dtype=bool)
     for corner in np.ndindex(2, 2, 2):
         below = nodes.index[tuple((base + np.array([*corner[:2], 0])).T)]
+        stored &= below > 0
         there = posed.camera[below + corner[2]]
         x, y, z = np.where(corner, part, 1 - part).T
         moved += there * (x * y * z)[:, None]
         for axis, others in enumerate((y * z, x * z, x * y)):
             sign = (2 * corner[axis] - 1) / nodes.step_m[axis]
             derivative[:, :, axis] += there * (others * sign)[:, None]
+    derivative[~stored] = 0.0
     return moved, derivative
 
 
@@ -158,7 +164,7 @@ def longest(
 def unsquashed(
     rules: DrawingRules, direction: Float32[np.ndarray, "rays 3"]
 ) -> Float32[np.ndarray, "rays"]:
-    """The share of a usual length that is gone where the pose squashes canonical space."""
+    """Factor by which lengths along rays shrink where the pose compresses canonical space."""
     canonical_per_m = np.linalg.norm(direction, axis=1)
     return np.minimum(np.float32(rules.squash_limit) / canonical_per_m, np.float32(1.0))
 

@@ -17,7 +17,7 @@ from export.bake import COARSEST_M, FINEST_M, BakeConfig
 from export.build import export_avatar, export_field
 from export.checks import GOOD_PSNR, POOR_PSNR, warnings_for
 from export.errors import ExportRefused
-from export.manifest import Manifest
+from export.manifest import LATER, Manifest
 from export.package import read_package, write_package
 from export.player import Player
 
@@ -367,12 +367,15 @@ def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, 
             player.render(*views["bent"])
 
 
-def test_a_package_from_before_sheets_had_a_gap_of_their_own_is_read(exported):
+def test_a_package_from_before_later_rules_is_read_and_drawn_without_them(exported):
     text = json.loads(read_package(exported.path).manifest.to_json())
     rules = text["tiers"]["hq"]["rules"]
-    del rules["sheet_gap_m"]
+    for name in LATER:
+        del rules[name]
     known = Manifest.from_json(json.dumps(text).encode()).tiers["hq"].rules
     assert known.sheet_gap_m == known.gap_m
+    assert known.fold_setback_m == 0.0
+    assert known.squash_limit > 1e6
     del rules["gap_m"]
     with pytest.raises(BadInput, match="damaged"):
         Manifest.from_json(json.dumps(text).encode())

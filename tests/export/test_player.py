@@ -51,6 +51,30 @@ def test_the_graph_draws_what_its_twin_draws(
     assert likeness.alike, likeness
 
 
+@pytest.mark.parametrize("tier", ["hq", "lite"])
+def test_folded_surfels_stand_behind_their_neighbours_in_graph_and_twin(
+    exported, tables, camera, tier
+):
+    """A shoulder from near by, with the arm turned by two radians about its axis."""
+    rotations = np.zeros((23, 3))
+    rotations[15], rotations[16] = [2.0, 0, 0.4], [-2.0, 0, -0.4]
+    pose = replace(BodyPose.rest(), joint_rotations=rotations)
+    view = replace(camera(96, 96), focal_px=(800.0, 800.0), center_px=(98.0, 184.0))
+    player = Player.load(exported.path, tier=tier)
+    rules = player.manifest.tiers[tier].rules
+    shot = Shot(
+        bones=player.bones(pose, view),
+        focal=np.array(view.focal_px, np.float32),
+        center=np.array(view.center_px, np.float32),
+        size_px=view.size_px,
+        samples=rules.samples,
+    )
+    drawn = premultiplied(player.render(pose, view))
+    assert Likeness.of(drawn, draw(tables, rules, shot)).alike
+    before = draw(tables, replace(rules, fold_setback_m=0.0), shot)
+    assert Likeness.of(drawn, before).close < 0.99
+
+
 @pytest.mark.parametrize("sheet_gap_m", [0.01, -0.015])
 @pytest.mark.parametrize("layers", [1, 2, 3, 4])
 def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
@@ -85,6 +109,22 @@ def test_the_player_shows_what_volume_rendering_shows(player, views, truth, pose
     drawn, exact = premultiplied(player.render(*views[posed])), truth[posed]
     assert psnr(on_white(drawn), on_white(exact)) > least
     assert abs(drawn[..., 3].sum() / exact[..., 3].sum() - 1) < 0.02
+
+
+@pytest.mark.parametrize(("tier", "least"), [("hq", 50.0), ("lite", 38.0)])
+def test_rays_do_not_leap_over_cloth_that_a_pose_squashes(exported, stand_in, camera, tier, least):
+    """All of the body at a sixth of its depth, as twisted sleeves are in places."""
+    times, view = 6.0, camera(64, 80)
+    flat = np.diag([1.0, 1.0, 1.0 / times, 1.0])
+    flat[2, 3] = view.camera_from_world[2, 3] * (1.0 - 1.0 / times)
+    squashed = replace(view, camera_from_world=flat @ view.camera_from_world)
+    player = Player.load(exported.path, tier=tier)
+    drawn = premultiplied(player.render(stand_in.canonical, squashed))
+    exact = premultiplied(
+        Player.load(exported.path).render(stand_in.canonical, squashed, samples=200)
+    )
+    assert exact[..., 3].mean() > 0.1
+    assert psnr(on_white(drawn), on_white(exact)) > least
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 200), (333, 90)])

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from capture.errors import BadInput
+from export.rules import DrawingRules
 from export.skin import finer_nodes, nodes_of
 from export.tables import rounded
+from export.twin_march import PosedNodes, carried
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +44,26 @@ def test_along_z_rows_follow_each_other(skin):
     index = finer_nodes(skin).index
     both = (index[..., :-1] > 0) & (index[..., 1:] > 0)
     assert (np.diff(index, axis=2)[both] == 1).all()
+
+
+@pytest.mark.parametrize("per_step", [1, 2])
+def test_no_inverse_is_taken_of_the_skin_beyond_its_stored_cells(skin, per_step):
+    """There the derivative is taken between unrelated nodes, and rays go anywhere: stray dots."""
+    nodes, stretch = nodes_of(skin, per_step), DrawingRules().stretch
+    whole, some = np.ones(np.subtract(skin.index.shape, 1), bool), np.zeros(1, bool)
+    x, y, z = skin.index.shape
+    for i, j, k in np.ndindex(2, 2, 2):
+        stored = skin.index[i : x - 1 + i, j : y - 1 + j, k : z - 1 + k] > 0
+        whole, some = whole & stored, some | stored
+
+    def trusted(cells):
+        inside = np.random.default_rng(0).uniform(0.01, 0.99, (len(cells), 3))
+        points = (skin.low + (cells + inside) * skin.step_m).astype(np.float32)
+        volume = np.linalg.det(carried(PosedNodes(nodes, nodes.positions), points)[1])
+        return ((volume > 1 / stretch) & (volume < stretch)).mean()
+
+    assert trusted(np.argwhere(whole)) == 1.0
+    assert trusted(np.argwhere(some & ~whole)) == 0.0
 
 
 def test_all_weights_sum_to_one(skin):

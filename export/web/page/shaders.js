@@ -189,8 +189,8 @@ void main() {
   float side = footprint_side(near);
   bool seen = s.seen && all(greaterThan(s.uv, vec2(-0.5 * side))) && all(lessThan(s.uv, vec2(size) + 0.5 * side));
   float code = floor(clamp((depth - near) * (float(DEPTH_STEPS - 1) / (2.0 * reach_m)), 0.0, float(DEPTH_STEPS - 1)));
-  bool squashed = determinant(s.derivative) < fold_volume; // then a neighbour shows the place better
-  if (squashed) code = min(code + floor(fold_setback_m / (2.0 * reach_m) * float(DEPTH_STEPS)), float(DEPTH_STEPS - 1));
+  bool folded = determinant(s.derivative) < fold_volume; // then a neighbour shows the place better
+  if (folded) code = min(code + floor(fold_setback_m / (2.0 * reach_m) * float(DEPTH_STEPS)), float(DEPTH_STEPS - 1));
   key = (int(code) << SURFEL_BITS) | gl_VertexID;
 #ifdef BEHIND
   deep_enough = faces(gl_VertexID, s) ? depth : 0.0;
@@ -263,7 +263,7 @@ vec4 read_bricks(vec3 lattice) {
 `;
 
 const MARCH = `
-/** The share of a usual length that is gone where the pose squashes canonical space. */
+/** Factor by which lengths along rays shrink where the pose compresses canonical space. */
 float unsquashed(vec3 direction) { return min(squash_limit / length(direction), 1.0); }
 
 /** Premultiplied colour and the light that is left of it after a block of samples. */
