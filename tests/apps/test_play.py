@@ -21,7 +21,7 @@ from apps.playing.verdict import package_notes
 from capture.file_list import NAME as LIST
 from export.package import read_package, write_package
 from export.player import Player
-from export.web import runtime
+from export.web import runtime, site
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import BodyPose
 from preprocess.pose_file import read_motion
@@ -296,7 +296,8 @@ def test_poses_in_other_units_are_refused(
     call_play, package, novel, tmp_path, monkeypatch, changed, words
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(runtime, "runtime_files", dict)
+    for module in (runtime, site):  # `site` holds a name of its own
+        monkeypatch.setattr(module, "runtime_files", dict)
     with np.load(novel) as given:
         turned, places = given["body_pose"], given["transl"] + np.array([0.0, 0.0, 3.0])
     for said, other in (
