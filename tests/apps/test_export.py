@@ -85,7 +85,7 @@ def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_p
     code, said = call_export(*words)
     assert code == 0, said.err
     assert len(trimesh.load(out).geometry) == 1
-    code, said = call_export(*words, "--person", "7")
+    code, said = call_export(*words, "--overwrite", "--person", "7")
     assert code == 2
     assert "7" in said.err
 

@@ -44,7 +44,7 @@ def frames(call_play, package, tmp_path):
         out = tmp_path / "frames"
         outcome = call_play(package, *arguments, "--out", out, "--size", SIZE)
         assert outcome.code == code, outcome.err
-        files = sorted(out.iterdir())
+        files = sorted(out.glob("*.png"))
         return np.stack([np.asarray(Image.open(file)).astype(int) for file in files])
 
     return frames
