@@ -135,7 +135,7 @@ def test_without_masks_the_pictures_edges_tell_whether_poses_fit(capture, diagno
     code, said, found = diagnosed()
     assert (code, found["verdict"], found["iou"]["now"]) == (0, "good", None)
     assert found["edges"] > 2.0
-    assert "as strong across the body's outline" in said
+    assert "times as much as beside it" in said
     motion = read_motion(capture / "poses.npz")
     motion.root_translations[:, 0] += 0.5
     write_motion(capture / "poses.npz", motion)
