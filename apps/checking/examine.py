@@ -246,7 +246,14 @@ def _mask_rows(recording: Recording) -> Callable[[int], int]:
         masks = recording.masks
         if masks is None or not same_shape(masks.size_px, recording.source.size_px):
             raise
-        return lambda index: index
+        path, count = masks.path, masks.count
+
+    def in_order(index: int) -> int:
+        if index >= count:
+            raise BadInput(f"There is no mask for frame {index} in {path}.")
+        return index
+
+    return in_order
 
 
 def _evidence(recording: Recording, count: int = FRAMES) -> Evidence:

@@ -106,9 +106,10 @@ def test_fewer_masks_than_frames_and_what_to_try(refused, capture, step, hint):
     refused(capture, words=[f"{len(kept)} masks", "24 frames", hint])
 
 
-def test_pictures_of_a_phone_that_nobody_reads(refused, tmp_path):
-    (tmp_path / "IMG_1.HEIC").write_bytes(b"ftypheic")
-    refused(tmp_path, "--poses", tmp_path, words=["HEIC pictures must be converted"])
+def test_pictures_of_a_phone_that_nobody_reads(refused, capture, tmp_path):
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"ftypheic")
+    refused(tmp_path / "phone", "--poses", capture / "poses.npz", words=["HEIC pictures must be converted"])
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "poses.NPZ", "0001.png"])
