@@ -109,7 +109,12 @@ def test_fewer_masks_than_frames_and_what_to_try(refused, capture, step, hint):
 def test_pictures_of_a_phone_that_nobody_reads(refused, capture, tmp_path):
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"ftypheic")
-    refused(tmp_path / "phone", "--poses", capture / "poses.npz", words=["HEIC pictures must be converted"])
+    refused(
+        tmp_path / "phone",
+        "--poses",
+        capture / "poses.npz",
+        words=["HEIC pictures must be converted"],
+    )
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "poses.NPZ", "0001.png"])

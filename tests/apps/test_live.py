@@ -127,7 +127,7 @@ def test_a_camera_that_another_program_uses(call_ingest, film, tmp_path, monkeyp
     ],
 )
 def test_what_is_wrong_with_a_live_source_is_said(call_ingest, tmp_path, arguments, word):
-    (tmp_path / "images").mkdir()
-    outcome = call_ingest(tmp_path, *arguments, "--out", tmp_path / "run")
+    (tmp_path / "capture" / "images").mkdir(parents=True)
+    outcome = call_ingest(tmp_path / "capture", *arguments, "--out", tmp_path / "run")
     assert outcome.code == 2
     assert word in outcome.complaint()
