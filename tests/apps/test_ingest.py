@@ -59,7 +59,7 @@ def test_the_report_has_the_keys_that_were_agreed(report):
         assert list(found) == keys.split()
     assert set(report["curve"][0]) == {
         "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask", "verdict",
-        "frames",
+        "frames", "video",
     }  # fmt: skip
     last = report["curve"][-1]
     assert [frame for frame, _ in last["frames"]] == report["held_out"]["frames"]
