@@ -16,7 +16,7 @@ from avatar.refine import PoseTable
 from avatar.replay import Replay
 from avatar.sampling import CanonicalSampler
 from avatar.step import cosine, gradients
-from avatar.trainer import Trainer, let_follow, solve_anew
+from avatar.trainer import Trainer, let_follow, rebuild_warp
 
 CORRECTIONS = 32
 """Corrections that each frame's pose gets."""
@@ -60,7 +60,7 @@ def fitted(
         slot, begin = replay.add(prepared), guessed(prepared.index, trainer.corrections)
         poses.put(slot, prepared.pose, correction=begin)
         if begin.any():
-            solve_anew(avatar.rig, replay, poses, slot)
+            rebuild_warp(avatar.rig, replay, poses, slot)
     config = dataclasses.replace(
         trainer.config,
         empty_weight=0.0,

@@ -108,7 +108,7 @@ class Trainer:
         step = 0 if again else self.steps
         self.poses.put(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
-            solve_anew(self.avatar.rig, self.replay, self.poses, slot)
+            rebuild_warp(self.avatar.rig, self.replay, self.poses, slot)
         self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
         self.frames_seen += not again
         if not again:
@@ -189,8 +189,8 @@ class Trainer:
         )
 
 
-def solve_anew(rig: Rig, replay: Replay, poses: PoseTable, slot: int) -> None:
-    """Lets a frame's warp and rays stand where its corrected pose is, from scratch."""
+def rebuild_warp(rig: Rig, replay: Replay, poses: PoseTable, slot: int) -> None:
+    """Solves a frame's warp cells again and moves its rays to its corrected pose."""
     joints = poses.pose(slot).joint_rotations
     replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
     replay.move_root(slot, poses.root(slot))
@@ -215,7 +215,7 @@ def let_follow(
     if slot is None:
         return None
     if poses.strayed(slot):
-        solve_anew(rig, replay, poses, slot)
+        rebuild_warp(rig, replay, poses, slot)
     else:
         backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
         replay.move_root(slot, poses.root(slot))
