@@ -5,8 +5,7 @@
 Draws the same 24 pictures of 540 px natively and in headless Chromium (WebAssembly, one thread), in
 turns, of both tiers. A loaded machine lengthens wall time; so CPU time is given as well,
 of Chromium with all its processes. Before that, how long the page takes from its address to the
-first picture, as Chromium opens it for the first time and again. Shaders are not measured: without
-a GPU they would say nothing.
+first picture, as Chromium opens it for the first time and again.
 """
 
 import itertools

@@ -14,7 +14,6 @@ from jaxtyping import Float, Float32, Shaped
 from export.initialisers import initialisers
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage, read_package
-from export.tables import BRICK, DEPTH_STEPS, LOG_DENSITY, SURFEL_BITS
 from export.web.runtime import MODULE, SCRIPT, runtime_files
 from preprocess.pose import BodyPose
 
@@ -23,13 +22,6 @@ PAGE_SCRIPT = "ort.js"
 """Hosts such as nginx serve .mjs as a stream of bytes, which browsers do not run as a script."""
 NARROW = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
 """Element types that the page reads (arrays.js)."""
-CONSTANTS = {
-    "surfel_bits": SURFEL_BITS,
-    "depth_steps": DEPTH_STEPS,
-    "brick": BRICK,
-    "log_density": LOG_DENSITY,
-}
-"""What the page's shaders must know besides rules and layout."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -156,7 +148,6 @@ def _tier(draft: _Draft, package: AvatarPackage, tier: str) -> dict[str, Any]:
     return {
         "rules": asdict(note.rules),
         "layout": asdict(note.layout),
-        "constants": CONSTANTS,
         "graph": draft.array(_bytes(package.graphs[tier])),
         "tables": [{"name": name, **draft.array(array)} for name, array in tables.items()],
     }

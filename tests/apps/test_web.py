@@ -108,12 +108,8 @@ def test_only_this_machine_is_answered(served):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["wasm", "webgl"])
-def test_the_browser_draws_the_golden_frames_again(page, engine):
-    """By the graph, and by shaders: here they run on the CPU, too, and prove only that they fit."""
-    if engine == "webgl" and not page.run("player.graphics.there"):
-        pytest.skip("this Chromium has no WebGL2 with float targets")
-    found = page.run(f"player.verify('{engine}')", seconds=240.0)
+def test_the_browser_draws_the_golden_frames_again(page):
+    found = page.run("player.verify()", seconds=240.0)
     assert len(found) > 0
     assert all(frame["alike"] for frame in found), found
 
@@ -129,7 +125,7 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
           const {{ Orbit }} = await import("./orbit.js");
           const pose = player.pose({row});
           const camera = new Orbit(player.avatar.look).camera(pose, {size}, {size});
-          const part = await player.draw({{ engine: "wasm", tier: "hq" }}, pose, camera);
+          const part = await player.draw({{ tier: "hq" }}, pose, camera);
           return {{ ...part, rgba: Array.from(part.rgba) }};
         }})()""",
         seconds=120.0,
@@ -248,41 +244,6 @@ def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
     )
     assert far == beside == 2000
     assert 500 < near < 1800
-
-
-@with_runtime
-@with_chromium
-@pytest.mark.slow
-def test_a_gpu_that_goes_away_leaves_the_drawing_to_the_cpu(page):
-    if not page.run("player.graphics.there"):
-        pytest.skip("this Chromium has no WebGL2 with float targets")
-    drawn_by = page.run(
-        """(async () => {
-          const { Orbit } = await import("./orbit.js");
-          const { Show } = await import("./show.js");
-          const canvas = document.createElement("canvas");
-          document.body.append(canvas);
-          const state = { engine: "webgl", tier: "never opened", sharpness: "360", speed: 1 };
-          const opened = [];
-          const patched = Object.create(player, { open: { value: (wanted) => {
-            opened.push(wanted.engine);
-            state.tier = "hq";
-            return player.open({ ...wanted, tier: "hq" });
-          } } });
-          let show;
-          const shown = new Promise((resolve) => {
-            show = new Show(canvas, patched, new Orbit(player.avatar.look), state, (news) => {
-              if (news.row !== undefined) resolve();
-            });
-          });
-          show.run();
-          await shown;
-          canvas.remove();
-          return [...opened, state.engine];
-        })()""",
-        seconds=120.0,
-    )
-    assert drawn_by == ["wasm", "wasm"]
 
 
 @with_runtime

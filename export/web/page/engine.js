@@ -1,16 +1,14 @@
-// Whoever draws: asks a worker, which runs the ONNX graph on the CPU or shaders on the GPU.
-
-const WORKERS = { wasm: "./graph_worker.js", webgl: "./shader_worker.js" };
+// Draws: asks a worker, which runs the package's ONNX graph on the CPU.
 
 export class Engine {
-  /** heard: called with {arrived: bytes} and {preparing: true} while a tier is being opened. */
-  constructor(kind, avatar, heard) {
+  /** onProgress: called with {arrived: bytes} and {preparing: true} while a tier is being opened. */
+  constructor(avatar, onProgress) {
     this.avatar = avatar;
     this.waiting = new Map();
     this.next = 0;
-    this.worker = new Worker(new URL(WORKERS[kind], import.meta.url), { type: "module" });
+    this.worker = new Worker(new URL("./graph_worker.js", import.meta.url), { type: "module" });
     this.worker.onmessage = ({ data }) => {
-      if (data.number === undefined) return heard(data);
+      if (data.number === undefined) return onProgress(data);
       const { resolve, reject } = this.waiting.get(data.number);
       this.waiting.delete(data.number);
       return data.failed ? reject(new Error(data.failed)) : resolve(data);
@@ -40,16 +38,4 @@ export class Engine {
       this.worker.postMessage({ number, kind, ...content });
     });
   }
-}
-
-const SOFTWARE = /swiftshader|llvmpipe|software|basic render|softpipe/i;
-
-/** Whether there is WebGL2 with float targets, and whether hardware is behind it. */
-export function graphics() {
-  const gl = typeof OffscreenCanvas !== "undefined" && document.createElement("canvas").getContext("webgl2");
-  if (!gl || !gl.getExtension("EXT_color_buffer_float")) return { there: false, hardware: false };
-  const told = gl.getExtension("WEBGL_debug_renderer_info");
-  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
-  gl.getExtension("WEBGL_lose_context")?.loseContext();
-  return { there: true, hardware: !SOFTWARE.test(name), name };
 }

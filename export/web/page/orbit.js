@@ -1,6 +1,6 @@
 // A camera that goes round the avatar and follows its pelvis.
 
-import { moved, product, rigid } from "./matrices.js";
+import { moved, product, rigid } from "./kinematics.js";
 
 const SHARE = 0.8; // of the picture's height, how much the standing person takes
 const AWAY = 3.5; // how far the camera stands, in heights of the person

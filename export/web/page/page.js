@@ -1,12 +1,11 @@
-// The page: buttons, settings and words around the show.
+// The page: buttons, settings and words around the playback.
 
 import { listen } from "./gestures.js";
 import { Orbit } from "./orbit.js";
+import { Playback } from "./playback.js";
 import { Player } from "./player.js";
-import { Show } from "./show.js";
 
 const TIERS = { hq: "Full", lite: "Lite" };
-const ENGINES = { wasm: "CPU", webgl: "GPU" };
 const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
 const THEMES = { system: "System", light: "Light", dark: "Dark" };
 const SAID_MS = 6000;
@@ -14,24 +13,23 @@ const $ = (id) => document.getElementById(id);
 
 export async function start() {
   const loading = new Loading();
-  const player = await Player.load((news) => loading.hear(news));
+  const player = await Player.load((news) => loading.onProgress(news));
   const { avatar } = player;
   $("name").textContent = document.title = avatar.name;
   $("licence").textContent = avatar.licence;
-  const state = { engine: "wasm", tier: "hq", sharpness: "auto", playing: false, speed: 1 };
+  const state = { tier: "hq", sharpness: "auto", playing: false, speed: 1 };
   loading.expect(avatar, "hq");
-  state.engine = await player.best();
   await player.open(state);
   const orbit = new Orbit(avatar.look);
-  const show = new Show($("picture"), player, orbit, state, (news) => tell(news, player, loading));
-  settings(player, state, show, loading);
-  transport(player, state, show, orbit);
-  listen($("picture"), orbit, () => show.changed());
+  const playback = new Playback($("picture"), player, orbit, state, (news) => tell(news, player, loading));
+  settings(player, state, playback, loading);
+  transport(player, state, playback, orbit);
+  listen($("picture"), orbit, () => playback.changed());
   window.player = player; // for scripts: verify(), measure()
-  show.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
+  playback.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
   markPlaying(state);
   loading.done();
-  show.run().catch((error) => loading.failed(error.message));
+  playback.run().catch((error) => loading.failed(error.message));
 }
 
 /** What is shown while a tier is being loaded. */
@@ -49,7 +47,7 @@ class Loading {
     $("status").classList.remove("failed");
   }
 
-  hear({ arrived, preparing }) {
+  onProgress({ arrived, preparing }) {
     if ($("status").classList.contains("failed")) return; // other files may still be coming
     this.bytes += arrived || 0;
     const [done, all] = [this.bytes, this.total].map((bytes) => (bytes / 1e6).toFixed(1));
@@ -62,7 +60,7 @@ class Loading {
   }
 
   /** Something that was wished for cannot be; what is shown goes on. */
-  refused(message) {
+  showError(message) {
     this.failed(message);
     setTimeout(() => { $("status").hidden = true; $("status").classList.remove("failed"); }, SAID_MS);
   }
@@ -74,9 +72,8 @@ class Loading {
   }
 }
 
-function tell({ failed, fallback, row, ms, rate, playing }, player, loading) {
+function tell({ failed, row, ms, rate, playing }, player, loading) {
   if (failed) return loading.failed(failed.message);
-  if (fallback) return markEngine("wasm");
   const second = (value) => (value / player.fps).toFixed(1);
   $("timeline").value = row;
   $("time").textContent = `${second(row)} / ${second(player.count)} s`;
@@ -104,28 +101,26 @@ function choices(fieldset, values, current, chosen, dress = (span, label) => { s
 
 const known = (names, there) => Object.fromEntries(there.map((name) => [name, names[name] ?? name]));
 
-function settings(player, state, show, loading) {
-  const change = (key) => async (value) => {
-    const wanted = { ...state, [key]: value };
-    loading.expect(player.avatar, wanted.tier);
+function settings(player, state, playback, loading) {
+  const changeTier = async (tier) => {
+    loading.expect(player.avatar, tier);
     try {
-      await player.open(wanted);
-      state[key] = value;
-      show.changed();
+      await player.open({ tier });
+      state.tier = tier;
+      playback.changed();
       loading.done();
     } catch (error) {
-      loading.refused(error.message);
-      for (const input of document.getElementsByName(`${key}s`)) input.checked = input.value === state[key];
+      loading.showError(error.message);
+      for (const input of document.getElementsByName("tiers")) input.checked = input.value === state.tier;
     }
   };
-  choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, change("tier"));
-  choices($("engines"), known(ENGINES, player.graphics.hardware ? Object.keys(player.engines) : ["wasm"]), state.engine, change("engine"));
+  choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, changeTier);
   choices($("themes"), THEMES, "system", (theme) => { document.documentElement.dataset.theme = theme; });
   backgrounds();
-  $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; show.changed(); };
+  $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; playback.changed(); };
   $("speed").onchange = () => { state.speed = Number($("speed").value); };
-  $("check").onclick = () => check(player, state);
-  $("save").onclick = () => save(player.avatar.name, show);
+  $("check").onclick = () => check(player);
+  $("save").onclick = () => save(player.avatar.name, playback);
 }
 
 function backgrounds() {
@@ -146,10 +141,10 @@ function backgrounds() {
   box.append(other);
 }
 
-async function check(player, { engine }) {
+async function check(player) {
   $("checked").textContent = "Drawing the golden frames …";
   try {
-    const found = await player.verify(engine);
+    const found = await player.verify();
     const alike = found.filter((each) => each.alike).length;
     const worst = Math.max(...found.map((each) => each.largest));
     $("checked").textContent = alike === found.length
@@ -161,18 +156,14 @@ async function check(player, { engine }) {
 }
 
 /** The picture as it is shown, with its alpha. */
-function save(name, show) {
-  show.canvas.toBlob((blob) => {
+function save(name, playback) {
+  playback.canvas.toBlob((blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
-    link.download = `${name}-${String(show.row).padStart(4, "0")}.png`;
+    link.download = `${name}-${String(playback.row).padStart(4, "0")}.png`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   });
-}
-
-function markEngine(engine) {
-  for (const input of $("engines").querySelectorAll("input")) input.checked = input.value === engine;
 }
 
 function markPlaying({ playing }) {
@@ -180,14 +171,14 @@ function markPlaying({ playing }) {
   $("play").setAttribute("aria-label", playing ? "Pause" : "Play");
 }
 
-function transport(player, state, show, orbit) {
-  const play = (playing) => { show.play(playing); markPlaying(state); };
-  const step = (by) => { play(false); show.seek(show.row + by); };
+function transport(player, state, playback, orbit) {
+  const play = (playing) => { playback.play(playing); markPlaying(state); };
+  const step = (by) => { play(false); playback.seek(playback.row + by); };
   $("timeline").max = player.count - 1;
-  $("timeline").oninput = () => { play(false); show.seek(Number($("timeline").value)); };
+  $("timeline").oninput = () => { play(false); playback.seek(Number($("timeline").value)); };
   $("play").onclick = () => play(!state.playing);
-  $("front").onclick = () => { orbit.reset(); show.changed(); };
-  document.addEventListener("visibilitychange", () => { show.began = undefined; });
+  $("front").onclick = () => { orbit.reset(); playback.changed(); };
+  document.addEventListener("visibilitychange", () => { playback.began = undefined; });
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const typing = event.target.closest("button, select, #panel");

@@ -1,53 +1,36 @@
-// The avatar, its motion and whoever draws it, without the page around them.
+// The avatar, its motion and the engine that draws it, without the page around them.
 
 import { fetched, load } from "./arrays.js";
-import { Engine, graphics } from "./engine.js";
-import { moved } from "./matrices.js";
+import { Engine } from "./engine.js";
+import { Skeleton, bones, moved } from "./kinematics.js";
 import { Orbit, coarser, nearestOf, windowOf } from "./orbit.js";
-import { Skeleton, bones } from "./skeleton.js";
 
 const CLOSE = 2; // two pictures are alike where no premultiplied channel differs by more, in 1/255 …
 const ALIKE = 0.999; // … on at least this share of the pixels
-const PATIENCE_MS = 20000; // for a GPU's driver to compile the shaders
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
 export class Player {
-  /** heard: as of Engine. */
-  static async load(heard) {
+  /** onProgress: as of Engine. */
+  static async load(onProgress) {
     const avatar = await (await fetched("avatar.json")).json();
-    return new Player(avatar, await load(avatar.motion.poses), heard);
+    return new Player(avatar, await load(avatar.motion.poses), onProgress);
   }
 
-  constructor(avatar, poses, heard) {
+  constructor(avatar, poses, onProgress) {
     this.avatar = avatar;
     this.poses = poses;
     this.count = poses.length / POSE;
     this.fps = avatar.motion.fps;
     this.skeleton = new Skeleton(avatar);
-    this.graphics = graphics();
-    const kinds = this.graphics.there ? ["webgl", "wasm"] : ["wasm"];
-    this.engines = Object.fromEntries(kinds.map((kind) => [kind, new Engine(kind, avatar, heard)]));
+    this.engine = new Engine(avatar, onProgress);
   }
 
   pose(row) {
     return this.poses.subarray(POSE * row, POSE * (row + 1));
   }
 
-  open({ engine, tier }) {
-    return this.engines[engine].open(tier);
-  }
-
-  /** The engine to begin with: a GPU that draws the golden frames as they should be, else the CPU. */
-  async best() {
-    if (!this.graphics.hardware) return "wasm";
-    try {
-      const late = new Promise((_, reject) => { setTimeout(reject, PATIENCE_MS, new Error("it takes too long")); });
-      const found = await Promise.race([this.verify("webgl"), late]);
-      return found.every((each) => each.alike) ? "webgl" : "wasm";
-    } catch (error) {
-      console.warn("The GPU is not used:", error);
-      return "wasm";
-    }
+  open({ tier }) {
+    return this.engine.open(tier);
   }
 
   /** The camera, with fewer pixels where surfels could not cover what is near (export/close_up.py). */
@@ -61,13 +44,13 @@ export class Player {
   }
 
   /** A pose seen by a camera: {x, y, width, height, rgba, ms}, the part where the avatar is; or null. */
-  async draw({ engine, tier }, pose, camera) {
+  async draw({ tier }, pose, camera) {
     const { worldFromCanonical, joints } = this.skeleton.posed(pose);
     const seen = joints.map((joint) => moved(camera.cameraFromWorld, joint));
     const part = windowOf(camera, seen);
     if (!part) return null;
     const center = [camera.center[0] - part.x, camera.center[1] - part.y];
-    const drawn = await this.engines[engine].draw(tier, {
+    const drawn = await this.engine.draw(tier, {
       bones: bones(worldFromCanonical, camera.cameraFromWorld),
       camera: [...camera.focal, ...center],
       width: part.width,
@@ -77,32 +60,32 @@ export class Player {
   }
 
   /** Draws the package's golden frames again: for each, how far the picture is from the stored one. */
-  async verify(engine = "wasm") {
-    await this.open({ engine, tier: "hq" });
-    const likenesses = [];
+  async verify() {
+    await this.open({ tier: "hq" });
+    const differences = [];
     for (const golden of this.avatar.golden) {
       const stored = await load(golden.picture);
       const { worldFromCanonical } = this.skeleton.posed(golden.pose);
-      const { rgba } = await this.engines[engine].draw("hq", {
+      const { rgba } = await this.engine.draw("hq", {
         bones: bones(worldFromCanonical, golden.camera.cameraFromWorld),
         camera: [...golden.camera.focal, ...golden.camera.center],
         width: golden.camera.width,
         height: golden.camera.height,
       });
-      likenesses.push(likeness(rgba, stored));
+      differences.push(pictureDifference(rgba, stored));
     }
-    return likenesses;
+    return differences;
   }
 
   /** Milliseconds of every frame of the motion, whole square pictures from the front. */
-  async measure({ engine = "wasm", tier = "hq", size = 540, frames = 24 } = {}) {
-    await this.open({ engine, tier });
+  async measure({ tier = "hq", size = 540, frames = 24 } = {}) {
+    await this.open({ tier });
     const orbit = new Orbit(this.avatar.look);
     const times = [];
     for (let frame = 0; frame < frames; frame++) {
       const pose = this.pose(frame % this.count);
       const camera = orbit.camera(pose, size, size);
-      const { ms } = await this.engines[engine].draw(tier, {
+      const { ms } = await this.engine.draw(tier, {
         bones: bones(this.skeleton.posed(pose).worldFromCanonical, camera.cameraFromWorld),
         camera: [...camera.focal, ...camera.center],
         width: size,
@@ -115,7 +98,7 @@ export class Player {
 }
 
 /** How far two straight-alpha pictures are apart, premultiplied, as `ia-play --verify` counts it. */
-export function likeness(a, b) {
+export function pictureDifference(a, b) {
   let largest = 0, close = 0;
   for (let i = 0; i < a.length; i += 4) {
     let most = Math.abs(a[i + 3] - b[i + 3]);

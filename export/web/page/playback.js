@@ -7,10 +7,10 @@ const SLOW_MS = 75; // … and above this it becomes coarser
 const COARSEST = 270, SHARPEST = 1080; // shorter side, pixels
 const STILL_MS = 180; // so long after the last movement the sharp picture is drawn
 
-export class Show {
-  /** state: {engine, tier, sharpness, playing, speed}; told: hears of every picture and failure. */
-  constructor(canvas, player, orbit, state, told) {
-    Object.assign(this, { canvas, player, orbit, state, told });
+export class Playback {
+  /** state: {tier, sharpness, playing, speed}; onNews: hears of every picture and failure. */
+  constructor(canvas, player, orbit, state, onNews) {
+    Object.assign(this, { canvas, player, orbit, state, onNews });
     this.context = canvas.getContext("2d");
     this.row = 0; this.time = 0; this.moving = 540;
     this.shown = []; this.wake = () => {}; this.dirty = true; this.touched = 0; this.sharp = false;
@@ -44,19 +44,9 @@ export class Show {
       try {
         await this.picture(this.size());
       } catch (error) {
-        if (!(await this.recovered())) return this.told({ failed: error });
+        return this.onNews({ failed: error });
       }
     }
-  }
-
-  /** A GPU that was taken away leaves the drawing to the CPU. */
-  async recovered() {
-    if (this.state.engine === "wasm") return false;
-    this.state.engine = "wasm";
-    await this.player.open(this.state);
-    this.told({ fallback: true });
-    this.changed();
-    return true;
   }
 
   /** Waits until something happens; true when it is time for the sharp picture. */
@@ -108,7 +98,7 @@ export class Show {
     }
     if (part) this.context.putImageData(new ImageData(part.rgba, part.width, part.height), part.x, part.y);
     if (part && state.playing) this.adapt(part.ms);
-    this.told({ row, ms: part ? part.ms : 0, rate: this.rate(), playing: state.playing });
+    this.onNews({ row, ms: part ? part.ms : 0, rate: this.rate(), playing: state.playing });
     // lets the browser paint, clicks and keys come in
     await new Promise((resolve) => { const { port1, port2 } = new MessageChannel(); port1.onmessage = resolve; port2.postMessage(0); });
   }
