@@ -20,16 +20,6 @@ def cross(a: Vector, b: Vector) -> Vector:
     return [a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3] for k in range(3)]
 
 
-def applied(matrix: Matrix, vector: Vector) -> Vector:
-    """Matrix times vector."""
-    return [dot(row, vector) for row in matrix]
-
-
-def moved(affine: Matrix, point: Vector) -> Vector:
-    """A 3×4 matrix applied to a point."""
-    return [dot(row, point) + row[3] for row in affine]
-
-
 def adjugate(matrix: Matrix) -> Matrix:
     """The inverse of 3×3 matrices times their determinant."""
     rows: Matrix = []

@@ -1,9 +1,8 @@
-"""The loops of baking, compiled: walks along normals, neighbours' colours, weights and slopes."""
+"""The loops of baking, compiled: walks along normals, and neighbours' colours."""
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, UInt8
 
-from avatar.kernels.cpu_skin import interpolate
 from avatar.kernels.jit import compile_kernel
 
 F32, I32 = np.float32, np.int32
@@ -102,24 +101,6 @@ def grown(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     return solid
 
 
-@compile_kernel(nogil=True, error_model="numpy")
-def _interpolated(volume, low, nodes_per_m, points, out):
-    for p in range(len(points)):
-        interpolate(volume, low, nodes_per_m, points[p, 0], points[p, 1], points[p, 2], 24, out[p])
-
-
-def interpolated(
-    volume: Float32[np.ndarray, "x y z 24"],
-    low: Float32[np.ndarray, "3"],
-    nodes_per_m: Float32[np.ndarray, "3"],
-    points: Float32[np.ndarray, "points 3"],
-) -> Float32[np.ndarray, "points 24"]:
-    """Trilinear skinning weights; the border's value outside the volume."""
-    out = np.empty((len(points), 24), dtype=np.float32)
-    _interpolated(volume, low, nodes_per_m, points, out)
-    return out
-
-
 def warm_up() -> None:
     """Compiles these loops, or loads them from disk, before anybody waits for a package."""
     nodes, point = np.zeros((3, 3, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
@@ -129,4 +110,3 @@ def warm_up() -> None:
     solid = np.zeros((3, 3, 3), dtype=bool)
     solid[1, 1, 1] = True
     spread_colors(solid, np.zeros((3, 3, 3, 3), dtype=np.uint8))
-    interpolated(np.zeros((3, 3, 3, 24), dtype=np.float32), low, low, point)

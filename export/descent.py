@@ -15,7 +15,6 @@ CUBE = BRICK**3
 A_CODE = F32((LOG_DENSITY[1] - LOG_DENSITY[0]) / 255.0)
 """Logarithm of the density, per code."""
 LOWEST = F32(LOG_DENSITY[0])
-NO_LIGHT = F32(1e-12)
 
 
 class Push(NamedTuple):

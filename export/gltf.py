@@ -111,7 +111,7 @@ def glb(mesh: SkinnedMesh, manifest: Manifest, animation: Animation, *, name: st
     return _packed(content, bytes(draft.binary))
 
 
-FLOOR, FIRST_JOINT = 1, 2
+FIRST_JOINT = 2
 """Nodes: 0 is the mesh, then what stands on the floor, then the joints."""
 
 

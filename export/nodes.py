@@ -268,10 +268,6 @@ class Graph:
         yes, no = self.value(yes, known.dtype), self.value(no, known.dtype)
         return self.node("Where", condition, yes, no, dtype=known.dtype)
 
-    def nonzero(self, condition: Value) -> Value:
-        """Places (int64) where a one-dimensional condition holds."""
-        return self.node("NonZero", condition, dtype=np.int64).reshaped(-1)
-
     def range(self, count: Value) -> Value:
         """0, 1, … count − 1, of the count's type; the count is a scalar."""
         limits = [self.value(limit, count.dtype) for limit in (0, 1)]

@@ -10,7 +10,6 @@ BRICK = 8
 NODES = BRICK + 1
 LOG_DENSITY = (float(np.log(0.5)), float(np.log(3000.0)))
 """Range of the 8-bit log-density, density in 1/m; code 0 means empty."""
-JOINTS = 24
 FULL_WEIGHT = 65535
 """Code of the skinning weight 1."""
 THICKNESS_STEP_M = 0.0005

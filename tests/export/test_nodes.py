@@ -70,11 +70,11 @@ def test_a_loop_whose_states_shrink_ends_when_nothing_is_left():
 
     def halved(turn, states):
         steps, place, left = states
-        ended = graph.nonzero(left < 1.0)
-        steps = steps.scattered(place.take(ended), left.take(ended) * 0.0 + turn.cast(np.float32))
-        more = graph.nonzero(left > 1.0)
-        some = graph.node("Size", more, dtype=np.int64) > 0
-        return some, [steps, place.take(more), left.take(more) * 0.5]
+        ended = place.compressed(left < 1.0)
+        turns = left.compressed(left < 1.0) * 0.0 + turn.cast(np.float32)
+        steps = steps.scattered(ended, turns)
+        place, left = place.compressed(left > 1.0), left.compressed(left > 1.0)
+        return graph.size(place) > 0, [steps, place, left * 0.5]
 
     steps = graph.loop_while(graph.constant(np.int64(50)), [x * 0.0 - 1.0, place, x], halved)[0]
     numbers = np.array([0.5, 3.0, 100.0, 0.9, 1.5, 5e3], dtype=np.float32)
