@@ -13,10 +13,10 @@ from apps.learning import deliver, learn, snapshot
 from apps.recording.opening import open_recording
 from apps.recording.wanted import RecordingPaths
 from apps.studio.writer import ShootConfig, shoot
-from avatar import warm
+from avatar import fit, warm
 from avatar.rig import Rig
 from capture.atomic_files import write_text
-from export import bake
+from export import bake, tuning
 from export.build import ExportReport
 
 
@@ -51,9 +51,15 @@ FEW_STEPS = 10
 
 @pytest.fixture(scope="session", autouse=True)
 def briefly_tuned():
-    """Bricks are fine-tuned on fewer pictures: what that is worth is seen in tests of `export`."""
+    """Bricks are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
+
+    What these are worth is seen in tests of `export` and of `avatar`.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bake, "TUNED", 4)
+        patch.setattr(tuning, "TUNED_PX", 128)
+        patch.setattr(tuning, "JUDGED_PX", 128)
+        patch.setattr(fit, "CORRECTIONS", 4)
         yield
 
 
