@@ -18,8 +18,12 @@ MASK = (64, 64)
 
 
 @pytest.fixture
-def refused(call_ingest, tmp_path):
-    """Asserts exit code 2, one message with some words in it, and no run folder."""
+def refused(call_ingest, tmp_path, monkeypatch):
+    """Asserts exit code 2, one message with some words in it, and no run folder.
+
+    What might mend the capture takes ten seconds to find; tests of ia-check ask for that.
+    """
+    monkeypatch.setattr(ingest, "hint", lambda wanted: "")
 
     def check(*arguments, words):
         outcome = call_ingest(*arguments, "--out", tmp_path / "run")
