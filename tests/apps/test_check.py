@@ -81,6 +81,7 @@ def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
     assert sheet.shape[1] > 3 * sheet.shape[0]
 
 
+@pytest.mark.slow
 def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
     config = ShootConfig(frames=40, size=96, pose_noise_deg=2.0, pose_noise_cm=1.0, turns=1.0)
     shoot(tmp_path / "noisy", config)
@@ -88,7 +89,12 @@ def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
     assert (found["verdict"], found["cause"]) == ("good", None)
 
 
-@pytest.mark.parametrize("cause", SPOILS)
+def quick_where(causes, quick):
+    """Parameters of which all but a few are slow: each is searched for like any other."""
+    return [c if c in quick else pytest.param(c, marks=pytest.mark.slow) for c in causes]
+
+
+@pytest.mark.parametrize("cause", quick_where(SPOILS, ("frame_offset",)))
 def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_check):
     folder, out = spoilt(SPOILS[cause]), tmp_path / "mended"
     code, _, found = call_check(folder, "--fix", out)
@@ -106,6 +112,7 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
         assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
 
 
+@pytest.mark.slow
 def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
     _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
     assert (found["verdict"], found["cause"]) == ("good", "mask_polarity")
@@ -122,7 +129,7 @@ FILM_SPOILS = {
 }
 
 
-@pytest.mark.parametrize("cause", FILM_SPOILS)
+@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("film_mirrored",)))
 def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
     folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
     code, said, found = call_check(folder, "--fix", out)
@@ -152,6 +159,7 @@ def narrowed(folder: Path) -> None:
     np.savez(folder / "cameras.npz", **{**camera, "width": 64})
 
 
+@pytest.mark.slow
 def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path, call_check):
     folder, out = spoilt(narrowed, spoils.rotated_film(3)), tmp_path / "corrected"
     code, said, found = call_check(folder, "--fix", out)
@@ -164,6 +172,7 @@ def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path,
     assert looks_well(recording)
 
 
+@pytest.mark.slow
 def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_path, call_check):
     folder, out = spoilt(spoils.second_person), tmp_path / "corrected"
     _, _, found = call_check(folder, "--fix", out)
@@ -176,6 +185,7 @@ def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_pat
     assert len(alone) > 35  # an arm that touches the other person makes one part of both
 
 
+@pytest.mark.slow
 def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call_check):
     _, _, found = call_check(spoilt(spoils.unnumbered_end(22)))
     assert found["cause"] == "frame_offset"
@@ -183,6 +193,7 @@ def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call
     assert found["iou"]["after_fix"] > 0.75
 
 
+@pytest.mark.slow
 def test_a_world_with_z_up_is_one_mistake_however_it_was_converted(spoilt, call_check):
     _, _, found = call_check(spoilt(spoils.z_up_about_the_origin))
     assert [cure["cause"] for cure in found["cures"]] == ["root_rotation"]
@@ -213,6 +224,7 @@ def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call
     assert "They fit in the frames that have both" in said
 
 
+@pytest.mark.slow
 def test_the_command_that_corrects_can_be_pasted(spoilt, call_check, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # the sheet goes to runs/ there
     folder = spoilt(SPOILS["left_right"]).rename(tmp_path / "my film")
@@ -226,6 +238,7 @@ def test_the_command_that_corrects_can_be_pasted(spoilt, call_check, tmp_path, m
     assert looks_well(open_recording(RecordingPaths(video=tmp_path / "my film-corrected")))
 
 
+@pytest.mark.slow
 def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
     code, said, found = call_check(spoilt(spoils.opengl_poses, spoils.late(-5)))
     assert code == 2
@@ -236,6 +249,7 @@ def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt,
     assert "--fix" in said
 
 
+@pytest.mark.slow
 def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
     _, _, found = call_check(spoilt(spoils.camera_forgotten))
     assert found["cause"] == "world_frame"
@@ -309,12 +323,14 @@ def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
     assert "0.5 times the video's frame rate" in said
 
 
+@pytest.mark.slow
 def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path):
     outcome = call_ingest(spoilt(spoils.late(-9)), "--force", "--out", tmp_path / "run")
     assert outcome.code == 0
     assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
 
 
+@pytest.mark.slow
 def test_ingest_warns_of_late_poses_and_goes_on(spoilt, call_ingest, without_baking, tmp_path):
     outcome = call_ingest(spoilt(spoils.late(2)), "--out", tmp_path / "run")
     assert outcome.code == 0

@@ -20,6 +20,7 @@ def call_export(capsys):
     return call
 
 
+@pytest.mark.slow
 def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     code, said = call_export(run, "--out", tmp_path / "now.iavatar")

@@ -77,6 +77,7 @@ def test_an_avatar_is_learnt_and_scored_through_a_moving_camera(
     assert outcome.code == 0
 
 
+@pytest.mark.slow
 def test_a_moving_camera_is_checked_and_mended(walk, tmp_path):
     folder, _ = walk
     motion = read_motion(folder / "poses.npz")

@@ -154,6 +154,7 @@ def test_no_command_writes_over_what_it_reads(
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_is_written_beside_other_peoples_files_leaves_them(
     hoard, film, package, monkeypatch, capsys
 ):

@@ -54,6 +54,7 @@ def change_masks(folder: Path, change) -> None:
         cv2.imwrite(str(path), change(row, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
 
 
+@pytest.mark.slow
 def test_a_cropped_video_is_told_by_its_principal_point_and_mended(
     capture, diagnosed, tmp_path, capsys
 ):
@@ -83,6 +84,7 @@ def test_a_cropped_video_is_told_by_its_principal_point_and_mended(
         assert abs(moved[1, 2]) < 1.5
 
 
+@pytest.mark.slow
 def test_somebody_elses_poses_from_the_middle_on_are_no_offset(capture, diagnosed):
     motion = read_motion(capture / "poses.npz")
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
@@ -145,6 +147,7 @@ def test_without_masks_the_pictures_edges_tell_whether_poses_fit(capture, diagno
     assert "hardly fit" in said
 
 
+@pytest.mark.slow
 def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
     capture, diagnosed, tmp_path
 ):
@@ -161,6 +164,7 @@ def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
     np.testing.assert_allclose(mended.root_translations, true.root_translations, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_degrees_are_told_from_radians_and_mended(capture, diagnosed, tmp_path):
     true = read_motion(capture / "poses.npz")
     degrees = replace(

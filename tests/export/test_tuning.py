@@ -183,6 +183,7 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
+@pytest.mark.slow
 def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
     more = replace(RULES, **DEEPER)
 
