@@ -211,6 +211,7 @@ def test_without_masks_the_sheet_shows_the_body(spoilt, call_check, tmp_path):
     assert orange.mean() > 0.005
 
 
+@pytest.mark.slow
 def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call_check, changed):
     folder = spoilt()
     with np.load(folder / "poses.npz") as archive:
@@ -315,6 +316,7 @@ def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tm
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
     folder = spoilt(spoils.resampled(0.5))
     assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2

@@ -243,6 +243,7 @@ def test_a_run_learns_beside_the_solving_and_tells_of_both(
     assert np.abs(heights).max() < 0.06  # whoever stands on the floor stands on y = 0
 
 
+@pytest.mark.slow
 def test_an_avatar_that_is_refused_costs_nobody_the_cameras(
     walkaround, solved_run, call_ingest, tmp_path, monkeypatch
 ):
@@ -321,6 +322,7 @@ def test_what_is_solved_when_the_run_is_stopped_counts(walkaround, solved_run, t
         assert solving.wait(quiet(), stop) is not None
 
 
+@pytest.mark.slow
 def test_cameras_that_are_refused_cost_nobody_the_avatar(
     walkaround, call_ingest, tmp_path, without_baking, monkeypatch
 ):

@@ -33,6 +33,8 @@ VARIANTS = {
 }
 SCHEMES = {name: choices for name, choices in VARIANTS.items() if not name.startswith("no ")}
 """Where samples lie, what warps them, where density is asked; losses are our own, tested there."""
+QUICK = ("none", "union, broyden")
+"""No scheme, and the paper's own."""
 
 
 def trainer_of(rig, clip, **choices):
@@ -53,7 +55,13 @@ def test_every_variant_learns(rig, clip, choices):
     assert np.mean(color[-5:]) < 0.5 * np.mean(color[:5])
 
 
-@pytest.mark.parametrize("choices", SCHEMES.values(), ids=SCHEMES.keys())
+@pytest.mark.parametrize(
+    "choices",
+    [
+        pytest.param(choices, id=name, marks=() if name in QUICK else pytest.mark.slow)
+        for name, choices in SCHEMES.items()
+    ],
+)
 def test_every_scheme_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
     """The reference path, on any device that torch knows."""
     samples, losses = [], []
