@@ -15,7 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
-def _stopped(
+def _quiet_excepthook(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
     """Ctrl-C while a command still loads what it needs is no fault, and shows none.
@@ -31,4 +31,4 @@ def _stopped(
 
 
 if Path(sys.argv[0]).name.startswith(("ia-", "-m")):  # a command, not somebody who imports one
-    sys.excepthook = _stopped
+    sys.excepthook = _quiet_excepthook

@@ -10,21 +10,21 @@ from typing import Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.checking.command import check_command
-from apps.checking.examine import GOOD_EDGES, UNEXPLAINED, Examined, examine, share
-from apps.checking.mended import check_new_folder, write_mended
-from apps.checking.sheet import write_sheet
-from apps.ingest_arguments import parsed_frames, polarity
-from apps.recording.wanted import RecordingPaths
-from apps.terminal.command_line import parsed
+from apps.checking.examine import GOOD_EDGE_RATIO, NO_KNOWN_MISTAKE, CaptureValidation, check_capture, json_number
+from apps.checking.mended import check_new_or_empty, write_corrected_capture
+from apps.checking.sheet import write_contact_sheet
+from apps.ingest_arguments import parse_frame_range, mask_inversion
+from apps.recording.wanted import CaptureInputs
+from apps.terminal.command_line import parse_arguments
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, exit_code
-from apps.terminal.places import check_apart, check_file_place
-from capture.atomic_files import write_text
+from apps.terminal.exit_codes import BAD_INPUT, DONE, run_command
+from apps.terminal.places import check_disjoint_from_inputs, check_output_file
+from capture.atomic_files import write_text_atomically
 from capture.camera_device import camera_address
-from capture.errors import BadInput
-from preprocess.doctor.diagnosis import GOOD, USABLE
+from capture.errors import InputError
+from preprocess.doctor.diagnosis import GOOD_IOU, USABLE_IOU
 
-SHEETS = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """How the name of a picture that --sheet names may end."""
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
@@ -83,40 +83,40 @@ class CheckArguments:
     overwrite: Flag = False
     """Replace the files that --sheet and --json name, if they are there."""
 
-    def wanted(self) -> RecordingPaths:
+    def capture_inputs(self) -> CaptureInputs:
         """What is to be opened.
 
         Raises:
-            BadInput: If the arguments contradict each other.
+            InputError: If the arguments contradict each other.
         """
         if camera_address(self.video) is not None:
-            raise BadInput(f"{self.video} is a camera; a recording was expected.")
-        return RecordingPaths(
+            raise InputError(f"{self.video} is a camera; a recording was expected.")
+        return CaptureInputs(
             video=self.video,
             poses=self.poses,
             masks=self.masks,
             cameras=self.cameras,
             body=self.body,
-            frames=parsed_frames(self.frames),
-            mask_invert=polarity(dark=self.mask_invert, bright=self.no_mask_invert),
+            frames=parse_frame_range(self.frames),
+            invert_masks=mask_inversion(person_dark=self.mask_invert, person_bright=self.no_mask_invert),
             person=self.person,
         )
 
-    def check_places(self) -> None:
+    def check_outputs(self) -> None:
         """Whether what is found can be written where it should go.
 
         Raises:
-            BadInput: If not.
+            InputError: If not.
         """
-        inputs = self.wanted().inputs()
+        inputs = self.capture_inputs().input_paths()
         if self.json is not None:
-            check_file_place(self.json, "--json", inputs, overwrite=self.overwrite)
-        if self.sheet is not None and self.sheet.suffix.lower() not in SHEETS:
-            raise BadInput(f"--sheet is {self.sheet}; a name in {', '.join(SHEETS)} was expected.")
-        check_file_place(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
+            check_output_file(self.json, "--json", inputs, overwrite=self.overwrite)
+        if self.sheet is not None and self.sheet.suffix.lower() not in IMAGE_SUFFIXES:
+            raise InputError(f"--sheet is {self.sheet}; a name in {', '.join(IMAGE_SUFFIXES)} was expected.")
+        check_output_file(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
         if self.fix is not None:
-            check_apart(self.fix, "--fix", inputs)
-            check_new_folder(self.fix)
+            check_disjoint_from_inputs(self.fix, "--fix", inputs)
+            check_new_or_empty(self.fix)
 
     def sheet_path(self) -> Path:
         """Where the sheet goes."""
@@ -125,128 +125,128 @@ class CheckArguments:
         return self.sheet or Path("runs") / f"{own}-check.png"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = parsed(CheckArguments, "ia-check", arguments)
-    return exit_code("ia-check", lambda: check(given, Console()))
+    given = parse_arguments(CheckArguments, "ia-check", argv)
+    return run_command("ia-check", lambda: check(given, Console()))
 
 
-def check(given: CheckArguments, console: Console) -> int:
+def check(arguments: CheckArguments, console: Console) -> int:
     """Does what the arguments say.
 
     Raises:
-        BadInput: If there is nothing that can be examined, or nothing to mend where --fix asks.
+        InputError: If there is nothing that can be examined, or nothing to mend where --fix asks.
         OSError: If something cannot be written.
     """
-    wanted = given.wanted()
-    given.check_places()
+    wanted = arguments.capture_inputs()
+    arguments.check_outputs()
     try:
-        with console.waiting("looking at poses, masks and cameras"):
-            examined = examine(wanted)
-    except BadInput as error:
-        if given.json is not None:
-            write_text(
-                given.json, json.dumps(unreadable(str(error)), indent=1) + "\n",
-                replace=given.overwrite,
+        with console.status("looking at poses, masks and cameras"):
+            examined = check_capture(wanted)
+    except InputError as error:
+        if arguments.json is not None:
+            write_text_atomically(
+                arguments.json, json.dumps(unreadable_to_json(str(error)), indent=1) + "\n",
+                replace=arguments.overwrite,
             )  # fmt: skip
         raise
-    if given.json is not None:
-        text = json.dumps(as_json(examined), indent=1) + "\n"
-        write_text(given.json, text, replace=given.overwrite)
-    _say(examined, console)
-    path, ours = given.sheet_path(), given.sheet is None
-    if write_sheet(path, examined, replace=given.overwrite, listed=ours):
-        console.made("look at it", path)
+    if arguments.json is not None:
+        text = json.dumps(check_to_json(examined), indent=1) + "\n"
+        write_text_atomically(arguments.json, text, replace=arguments.overwrite)
+    _print_findings(examined, console)
+    path, ours = arguments.sheet_path(), arguments.sheet is None
+    if write_contact_sheet(path, examined, replace=arguments.overwrite, listed=ours):
+        console.print_artifact("look at it", path)
     else:
-        console.warn(f"{path} was not written: no frame with a pose could be decoded.")
-    if given.fix is not None:
-        write_mended(examined, given.fix)
-        console.made("corrected", given.fix)
-        return DONE if examined.after >= USABLE else BAD_INPUT
-    if examined.causes and not examined.mends_itself:
-        console.say(f"To correct it:  {check_command(wanted)}")
+        console.warning(f"{path} was not written: no frame with a pose could be decoded.")
+    if arguments.fix is not None:
+        write_corrected_capture(examined, arguments.fix)
+        console.print_artifact("corrected", arguments.fix)
+        return DONE if examined.corrected_iou >= USABLE_IOU else BAD_INPUT
+    if examined.causes and not examined.is_auto_corrected:
+        console.info(f"To correct it:  {check_command(wanted)}")
     return BAD_INPUT if examined.verdict == "unusable" else DONE
 
 
-def as_json(examined: Examined) -> dict[str, Any]:
+def check_to_json(examined: CaptureValidation) -> dict[str, Any]:
     """What was found; agreements are null where there are no masks, `edges` where there are."""
     diagnosis = examined.diagnosis
-    cures = diagnosis.cures if diagnosis else ()
-    tried = diagnosis.tried if diagnosis else ()
-    film = diagnosis.film if diagnosis else None
+    cures = diagnosis.corrections if diagnosis else ()
+    tried = diagnosis.candidates if diagnosis else ()
+    film = diagnosis.video if diagnosis else None
     return {
         "format": 1,
         "verdict": examined.verdict,
         "cause": examined.causes[0] if examined.causes else None,
-        "iou": {"now": share(examined.now), "after_fix": share(examined.after)},
+        "iou": {"now": json_number(examined.stored_iou), "after_fix": json_number(examined.corrected_iou)},
         "tried": [
-            {"cause": guess.cure.cause, "iou": share(guess.iou), "words": guess.cure.words}
+            {"cause": guess.correction.cause, "iou": json_number(guess.mean_score), "words": guess.correction.description}
             for guess in tried
         ],
         "film": None
         if film is None
         else {
-            "now": share(film.now),
-            "after_fix": share(film.after),
+            "now": json_number(film.now),
+            "after_fix": json_number(film.after),
             "tried": [
-                {"cause": guess.cure.cause, "score": share(guess.iou), "words": guess.cure.words}
+                {"cause": guess.cure.cause, "score": json_number(guess.iou), "words": guess.cure.words}
                 for guess in film.tried
             ],
         },
-        "cures": [{"cause": cure.cause, "words": cure.words} for cure in cures],
-        "odd": list(examined.odd),
-        "refused": examined.refused,
-        "edges": share(examined.edges),
+        "corrections": [{"cause": cure.cause, "words": cure.description} for cure in cures],
+        "anomalies": list(examined.anomalies),
+        "refused": examined.refusal,
+        "edges": json_number(examined.edge_ratio),
     }
 
 
-def unreadable(why: str) -> dict[str, Any]:
+def unreadable_to_json(reason: str) -> dict[str, Any]:
     """The same for what could not even be opened."""
     return {
         "format": 1, "verdict": "unusable", "cause": None,
-        "iou": {"now": None, "after_fix": None}, "tried": [], "cures": [], "odd": [],
-        "refused": why, "edges": None, "film": None,
+        "iou": {"now": None, "after_fix": None}, "tried": [], "corrections": [], "anomalies": [],
+        "refused": reason, "edges": None, "film": None,
     }  # fmt: skip
 
 
-def _say(examined: Examined, console: Console) -> None:
+def _print_findings(examined: CaptureValidation, console: Console) -> None:
     for note in examined.recording.notes:
-        console.warn(note)
-    for sentence in (*examined.recording.source.warnings, *examined.odd):
-        console.warn(sentence)
-    if examined.refused is not None:
-        console.say(f"ia-ingest would refuse it: {examined.refused}")
+        console.warning(note)
+    for sentence in (*examined.recording.source.warnings, *examined.anomalies):
+        console.warning(sentence)
+    if examined.refusal is not None:
+        console.info(f"ia-ingest would refuse it: {examined.refusal}")
     if examined.diagnosis is None:
-        console.say(_without_masks(examined))
+        console.info(_describe_without_masks(examined))
         return
-    if examined.mends_itself:
-        console.say(
-            f"{examined.verdict}: body and masks agree by {examined.after:.2f} (0 to 1). The masks "
+    if examined.is_auto_corrected:
+        console.info(
+            f"{examined.verdict}: body and masks agree by {examined.corrected_iou:.2f} (0 to 1). The masks "
             "show the background in white (mask_polarity); ia-ingest inverts such masks by itself, "
             "so nothing needs to be done."
         )
         return
-    but = ", but not with the pictures" if examined.film_errs else ""
-    console.say(f"{examined.verdict}: body and masks agree by {examined.now:.2f} (0 to 1){but}.")
-    for cure in examined.diagnosis.cures:
-        console.say(f"It looks as if {cure.words} ({cure.cause}).")
+    but = ", but not with the pictures" if examined.has_film_errors else ""
+    console.info(f"{examined.verdict}: body and masks agree by {examined.stored_iou:.2f} (0 to 1){but}.")
+    for cure in examined.diagnosis.corrections:
+        console.info(f"It looks as if {cure.description} ({cure.cause}).")
     if examined.causes:
-        console.say(examined.promise)
-    elif examined.verdict != "good" and examined.now >= GOOD:
-        console.say("They fit in the frames that have both; the warnings above name the problem.")
+        console.info(examined.expected_improvement)
+    elif examined.verdict != "good" and examined.stored_iou >= GOOD_IOU:
+        console.info("They fit in the frames that have both; the warnings above name the problem.")
     elif examined.verdict != "good":
-        console.say(UNEXPLAINED)
+        console.info(NO_KNOWN_MISTAKE)
 
 
-def _without_masks(examined: Examined) -> str:
+def _describe_without_masks(examined: CaptureValidation) -> str:
     """What can be said of a capture whose masks ia-ingest will have to estimate."""
-    if examined.edges is None:
+    if examined.edge_ratio is None:
         return "There are no masks, and no picture could be looked at."
-    fits = examined.edges >= GOOD_EDGES
+    fits = examined.edge_ratio >= GOOD_EDGE_RATIO
     return (
         f"{examined.verdict}: there are no masks (ia-ingest estimates some from poses and "
         f"pictures), so the pictures' own edges were compared with the body's outline: along it "
-        f"the picture changes {examined.edges:.1f} times as much as beside it. The poses "
+        f"the picture changes {examined.edge_ratio:.1f} times as much as beside it. The poses "
         + (
             "fit (2 to 5 times where they do, about 1 where they do not)."
             if fits

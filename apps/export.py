@@ -12,24 +12,24 @@ import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.learning.run_folder import RunFolder
-from apps.playing.novel import novel_motion
-from apps.terminal.command_line import parsed
+from apps.playing.novel import demo_motion
+from apps.terminal.command_line import parse_arguments
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, NO_AVATAR, Stop, exit_code
-from apps.terminal.places import check_file_place
-from capture.atomic_files import whole_file
+from apps.terminal.exit_codes import DONE, NO_AVATAR, CommandExit, run_command
+from apps.terminal.places import check_output_file
+from capture.atomic_files import atomic_file
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.pose import BodyPose
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from avatar.rig import Rig
 
-VIEWS = 4
+CHECK_VIEWS = 4
 VIEW_PX = 256
-AWAY = 3.5
+DISTANCE_HEIGHTS = 3.5
 """How far the camera stands, in heights of the person."""
-SHARE = 0.8
+PERSON_HEIGHT_SHARE = 0.8
 """Of the picture's height, how much the person takes."""
 
 
@@ -69,88 +69,88 @@ class ExportArguments:
     """Replace the file that --out names, if there is one."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    given = parsed(ExportArguments, "ia-export", arguments)
-    return exit_code("ia-export", lambda: export(given, Console()))
+    given = parse_arguments(ExportArguments, "ia-export", argv)
+    return run_command("ia-export", lambda: export(given, Console()))
 
 
-def export(given: ExportArguments, console: Console) -> int:
+def export(arguments: ExportArguments, console: Console) -> int:
     """Does what the arguments say.
 
     Raises:
-        BadInput: If there is no checkpoint that can be read, or no folder to write to.
+        InputError: If there is no checkpoint that can be read, or no folder to write to.
         OSError: If the disk is full.
         Stop: If there is nothing to draw.
     """
-    if given.out.suffix.lower() != f".{given.to}":
-        raise BadInput(f"--out is {given.out}; a name that ends in .{given.to} was expected.")
-    if not given.out.resolve().parent.is_dir():
-        raise BadInput(f"--out: there is no folder {given.out.resolve().parent}. Make it first.")
-    inputs = [path for path in (given.run, given.poses) if path is not None and path.is_file()]
-    check_file_place(given.out, "--out", inputs, overwrite=given.overwrite)
-    if given.poses is not None and given.to != "glb":
-        raise BadInput(f"--poses go into a .glb; a .{given.to} holds no motion. Leave them out.")
-    if given.run.is_file() and given.to != "iavatar":
-        _mesh(given, given.run, console)
+    if arguments.out.suffix.lower() != f".{arguments.to}":
+        raise InputError(f"--out is {arguments.out}; a name that ends in .{arguments.to} was expected.")
+    if not arguments.out.resolve().parent.is_dir():
+        raise InputError(f"--out: there is no folder {arguments.out.resolve().parent}. Make it first.")
+    inputs = [path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()]
+    check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
+    if arguments.poses is not None and arguments.to != "glb":
+        raise InputError(f"--poses go into a .glb; a .{arguments.to} holds no motion. Leave them out.")
+    if arguments.run.is_file() and arguments.to != "iavatar":
+        _export_mesh(arguments, arguments.run, console)
     else:
         with tempfile.TemporaryDirectory() as folder:
             package = Path(folder) / "avatar.iavatar"
-            _package(given.run, package, console, for_player=given.to == "iavatar")
-            if given.to != "iavatar":
-                _mesh(given, package, console)
+            _export_package(arguments.run, package, console, fine_tune=arguments.to == "iavatar")
+            if arguments.to != "iavatar":
+                _export_mesh(arguments, package, console)
             else:
-                with whole_file(given.out, replace=given.overwrite) as part:
+                with atomic_file(arguments.out, replace=arguments.overwrite) as part:
                     shutil.copyfile(package, part)
-    console.made("mesh" if given.to != "iavatar" else "package", given.out)
+    console.print_artifact("mesh" if arguments.to != "iavatar" else "package", arguments.out)
     return DONE
 
 
-def _mesh(given: ExportArguments, package: Path, console: Console) -> None:
+def _export_mesh(arguments: ExportArguments, package: Path, console: Console) -> None:
     from apps.playing.mesh_file import write_mesh
 
     write_mesh(
-        package, given.out, console, poses=given.poses, name=given.out.stem, person=given.person,
-        replace=given.overwrite,
+        package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem, person=arguments.person,
+        replace=arguments.overwrite,
     )  # fmt: skip
 
 
-def _package(folder: Path, out: Path, console: Console, *, for_player: bool = True) -> None:
+def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: bool = True) -> None:
     """A package of a run's checkpoint; one that nobody will play is not fine-tuned for players."""
     if folder.is_file():
-        raise BadInput(
+        raise InputError(
             f"{folder} is a file; a package is made from the folder that ia-ingest wrote. From a "
             "package come --to glb, --to ply and --to obj."
         )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():
-        raise BadInput(
+        raise InputError(
             f"There is no checkpoint in {run.checkpoint}; a folder that ia-ingest wrote was "
             "expected. It writes the first one five seconds after the first frame."
         )
-    with console.waiting("loading the checkpoint"):
+    with console.status("loading the checkpoint"):
         import torch
 
-        from apps.learning.snapshot import snapshot
+        from apps.learning.snapshot import write_package_snapshot
         from avatar import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
-    with console.bar("writing the package", 1.0) as bar:
-        shots = views(trainer.avatar.rig)
-        taken = snapshot(trainer, out, shots, mark=None, fine_tuned=for_player, progress=bar.share)
-    if taken.exported is None:
-        raise Stop(taken.refused or "nothing was written.", NO_AVATAR)
-    for warning in taken.exported.warnings:
-        console.warn(warning)
-    console.say(f"As learnt from {trainer.frames_seen} frames in {trainer.wall_seconds:.1f} s.")
+    with console.progress("writing the package", 1.0) as bar:
+        shots = synthetic_views(trainer.avatar.rig)
+        taken = write_package_snapshot(trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share)
+    if taken.export_report is None:
+        raise CommandExit(taken.refusal or "nothing was written.", NO_AVATAR)
+    for warning in taken.export_report.warnings:
+        console.warning(warning)
+    console.info(f"As learnt from {trainer.frames_seen} frames in {trainer.wall_seconds:.1f} s.")
 
 
-def views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
+def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
     """Poses of a little motion, each seen from the front: a checkpoint holds no frames."""
-    motion = novel_motion(frames=VIEWS)
+    motion = demo_motion(frames=CHECK_VIEWS)
     low, high = rig.seeds.min(axis=0).astype(float), rig.seeds.max(axis=0).astype(float)
-    distance = AWAY * (high[1] - low[1])
-    focal = SHARE * VIEW_PX * AWAY
+    distance = DISTANCE_HEIGHTS * (high[1] - low[1])
+    focal = PERSON_HEIGHT_SHARE * VIEW_PX * DISTANCE_HEIGHTS
     axes = np.diag([1.0, -1.0, -1.0])
     camera_from_world = np.eye(4)
     camera_from_world[:3, :3] = axes
@@ -161,7 +161,7 @@ def views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
         size_px=(VIEW_PX, VIEW_PX),
         camera_from_world=camera_from_world,
     )
-    return [(motion[row], camera) for row in range(VIEWS)]
+    return [(motion[row], camera) for row in range(CHECK_VIEWS)]
 
 
 if __name__ == "__main__":

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apps.terminal.command_line import parsed
+from apps.terminal.command_line import parse_arguments
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, exit_code
-from capture.errors import BadInput
+from apps.terminal.exit_codes import DONE, run_command
+from capture.errors import InputError
 from export.web import runtime
 
 PROGRAM = "python -m apps.fetch_runtime"
@@ -28,39 +28,39 @@ class FetchArguments:
     """
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    parsed(FetchArguments, PROGRAM, arguments)
-    return exit_code("make web", lambda: fetch(Console()))
+    parse_arguments(FetchArguments, PROGRAM, argv)
+    return run_command("make web", lambda: fetch_runtime(Console()))
 
 
-def fetch(console: Console) -> int:
+def fetch_runtime(console: Console) -> int:
     """Fetches, checks and keeps the pinned release, unless it is there.
 
     Raises:
-        BadInput: If npm is missing, cannot fetch it, or fetches something else.
+        InputError: If npm is missing, cannot fetch it, or fetches something else.
     """
     try:
         runtime.runtime_files()
-    except BadInput:
-        with console.waiting(f"fetching onnxruntime-web {runtime.VERSION}"):
-            runtime.install(_tarball())
-    console.made("onnxruntime-web", runtime.FOLDER)
+    except InputError:
+        with console.status(f"fetching onnxruntime-web {runtime.ORT_WEB_VERSION}"):
+            runtime.install_runtime(_fetch_tarball())
+    console.print_artifact("onnxruntime-web", runtime.FOLDER)
     return DONE
 
 
-def _tarball() -> bytes:
+def _fetch_tarball() -> bytes:
     npm = shutil.which("npm")
     if npm is None:
-        raise BadInput("npm was not found. Install Node.js, which brings it, and try again.")
+        raise InputError("npm was not found. Install Node.js, which brings it, and try again.")
     with tempfile.TemporaryDirectory() as folder:
-        package = f"onnxruntime-web@{runtime.VERSION}"
+        package = f"onnxruntime-web@{runtime.ORT_WEB_VERSION}"
         command = [npm, "pack", package, "--ignore-scripts", "--pack-destination", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
         found = list(Path(folder).glob("*.tgz"))
         if done.returncode or len(found) != 1:
             lines = done.stderr.strip().splitlines() or ["no reason given"]
-            raise BadInput(f"npm could not fetch {package}: {lines[-1]}")
+            raise InputError(f"npm could not fetch {package}: {lines[-1]}")
         return found[0].read_bytes()
 
 

@@ -9,25 +9,25 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.learning.run_folder import RunFolder, is_report
-from apps.recording.opening import open_recording
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
+from apps.learning.run_folder import RunFolder, is_run_report
+from apps.recording.opening import open_capture
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
 from apps.solving.job import SolveJob
-from apps.terminal.places import check_file_place
-from avatar.config import HOLD_EVERY, NOMINAL_STEPS_PER_S
+from apps.terminal.places import check_output_file
+from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.camera_device import camera_address
-from capture.errors import BadInput
-from capture.growing import IDLE_S
-from preprocess.fit.stature import LEAST_CM, MOST_CM
+from capture.errors import InputError
+from capture.growing import IDLE_TIMEOUT_S
+from preprocess.fit.stature import MIN_HEIGHT_CM, MAX_HEIGHT_CM
 from preprocess.masks.segmenter import segmenter_name
 
-LEARNABLE_PX = 540
+REFERENCE_LONGER_SIDE_PX = 540
 """Longer side of the pictures that a minute is enough for."""
 
-A_MINUTE = 60.0
+DEFAULT_SECONDS = 60.0
 
-LEAST_SECONDS = 0.1
+MIN_SECONDS = 0.1
 """A few steps; every frame is trained on once in any case."""
 
 VIEW_PORT = 8008
@@ -102,14 +102,14 @@ class IngestArguments:
     the poses (the .npz again and again, or a .jsonl, a frame a line) and masks of the same names as
     the pictures come into --masks. It ends with a file named DONE in the folder, when nothing new
     has come for --idle-seconds, after --seconds, or by Ctrl-C. A camera is live without it."""
-    idle_seconds: float = IDLE_S
+    idle_seconds: float = IDLE_TIMEOUT_S
     """How long a live source may bring nothing new, and its first picture and pose may take."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of the pictures in pixels; they are never enlarged. Without it, what can
     be learnt in --seconds: 540 in a minute, twice as many in four."""
     frames: str = "::"
     """Which frames, START:STOP:STEP, counted from 0."""
-    hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HOLD_EVERY
+    hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
     """Every Nth frame is kept for scores and never learnt from; 0 learns from all."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Correct the poses while the avatar is learnt: a tracker's jitter costs more than anything."""
@@ -129,57 +129,57 @@ class IngestArguments:
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write a copy of report.json to this file."""
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Refuses numbers out of their range.
 
         Raises:
-            BadInput: Naming the option.
+            InputError: Naming the option.
         """
-        if self.seconds is not None and not LEAST_SECONDS <= self.seconds < float("inf"):
-            raise BadInput(
-                f"--seconds is {self.seconds}; at least {LEAST_SECONDS:g} was expected "
-                f"({A_MINUTE:.0f} make a good avatar)."
+        if self.seconds is not None and not MIN_SECONDS <= self.seconds < float("inf"):
+            raise InputError(
+                f"--seconds is {self.seconds}; at least {MIN_SECONDS:g} was expected "
+                f"({DEFAULT_SECONDS:.0f} make a good avatar)."
             )
         if self.steps is not None and self.steps < 1:
-            raise BadInput(f"--steps is {self.steps}; at least 1 was expected.")
+            raise InputError(f"--steps is {self.steps}; at least 1 was expected.")
         if self.steps is not None and self.seconds is not None:
-            raise BadInput("--steps and --seconds both say when training ends: give one of them.")
+            raise InputError("--steps and --seconds both say when training ends: give one of them.")
         if self.size is not None and self.size < 16:
-            raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
+            raise InputError(f"--size is {self.size}; at least 16 pixels were expected.")
         if self.threads is not None and self.threads < 1:
-            raise BadInput(f"--threads is {self.threads}; at least 1 was expected.")
+            raise InputError(f"--threads is {self.threads}; at least 1 was expected.")
         if not 0.0 < self.idle_seconds < float("inf"):
-            raise BadInput(
+            raise InputError(
                 f"--idle-seconds is {self.idle_seconds}; a positive number was expected."
             )
         if self.realtime and (self.live or camera_address(self.video) is not None):
-            raise BadInput("--realtime plays a recording; a live source has its own pace. Drop it.")
-        if self.height_cm is not None and not LEAST_CM <= self.height_cm <= MOST_CM:
-            raise BadInput(
-                f"--height-cm is {self.height_cm}; {LEAST_CM:.0f} to {MOST_CM:.0f} was expected."
+            raise InputError("--realtime plays a recording; a live source has its own pace. Drop it.")
+        if self.height_cm is not None and not MIN_HEIGHT_CM <= self.height_cm <= MAX_HEIGHT_CM:
+            raise InputError(
+                f"--height-cm is {self.height_cm}; {MIN_HEIGHT_CM:.0f} to {MAX_HEIGHT_CM:.0f} was expected."
             )
         if self.hold_out < 0 or self.hold_out == 1:
-            raise BadInput(f"--hold-out is {self.hold_out}; 0, or 2 and more, was expected.")
+            raise InputError(f"--hold-out is {self.hold_out}; 0, or 2 and more, was expected.")
         if self.seed < 0:
-            raise BadInput(f"--seed is {self.seed}; 0 or more was expected.")
+            raise InputError(f"--seed is {self.seed}; 0 or more was expected.")
         if self.json is not None:
-            check_file_place(
-                self.json, "--json", self.wanted().inputs(), overwrite=self.replaces_json
+            check_output_file(
+                self.json, "--json", self.capture_inputs().input_paths(), overwrite=self.may_replace_json
             )
-        polarity(dark=self.mask_invert, bright=self.no_mask_invert)
+        mask_inversion(person_dark=self.mask_invert, person_bright=self.no_mask_invert)
         if self.view is not None and not 0 <= self.view < 1 << 16:
-            raise BadInput(f"--view is {self.view}; a port from 0 to 65535 was expected.")
+            raise InputError(f"--view is {self.view}; a port from 0 to 65535 was expected.")
         if self.view is not None and importlib.util.find_spec("viser") is None:
-            raise BadInput(
+            raise InputError(
                 "--view shows a page made with viser, which is not installed. Install it with: "
                 "pip install 'instant-avatar-stream[viewer]' (or: pip install viser). Or leave "
                 "--view out: report.html shows the result afterwards."
             )
 
     @property
-    def replaces_json(self) -> bool:
+    def may_replace_json(self) -> bool:
         """Whether --json may replace the file there: as told, or because it is a report of ours."""
-        return self.overwrite or (self.json is not None and is_report(self.json))
+        return self.overwrite or (self.json is not None and is_run_report(self.json))
 
     def run_folder(self) -> RunFolder:
         """Where the run lies."""
@@ -189,43 +189,43 @@ class IngestArguments:
             own = re.sub(r"\W+", "-", str(self.video)).strip("-")
         return RunFolder(path=self.out or Path("runs") / own)
 
-    def wanted(self) -> RecordingPaths:
+    def capture_inputs(self) -> CaptureInputs:
         """What is to be opened."""
-        return RecordingPaths(
+        return CaptureInputs(
             video=self.video,
             poses=self.poses,
             masks=self.masks,
             cameras=self.cameras,
             body=self.body,
-            frames=parsed_frames(self.frames),
-            mask_invert=polarity(dark=self.mask_invert, bright=self.no_mask_invert),
+            frames=parse_frame_range(self.frames),
+            invert_masks=mask_inversion(person_dark=self.mask_invert, person_bright=self.no_mask_invert),
             live=self.live,
             person=self.person,
             idle_s=self.idle_seconds,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
 
-    def solve_job(self, recording: Recording) -> SolveJob | None:
+    def solve_job(self, recording: Capture) -> SolveJob | None:
         """What is to be solved, if cameras are; by the parts that were found."""
         if self.cameras != "solve":
             return None
         found = recording.paths
-        named = self.wanted()
+        named = self.capture_inputs()
         if segmenter_name(named.masks) is None:
             named = replace(named, masks=found.masks)
         named = replace(named, video=found.video, poses=found.poses)
         return SolveJob(paths=named, seed=self.seed, threads=self.threads or os.cpu_count() or 1)
 
-    def recording(self) -> Recording:
+    def open_capture(self) -> Capture:
         """Opens what the arguments name."""
         run = self.run_folder()
-        goes_on = self.resume and run.has_checkpoint() and run.person.is_file()
-        recording = open_recording(self.wanted(), avatars=run.person if goes_on else None)
-        size_px = self.size or learnable_px(self.training_seconds(recording))
+        goes_on = self.resume and run.has_checkpoint() and run.body_file.is_file()
+        recording = open_capture(self.capture_inputs(), avatar_body=run.body_file if goes_on else None)
+        size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
-        return recording.played() if self.realtime else recording
+        return recording.in_real_time() if self.realtime else recording
 
-    def training_seconds(self, recording: Recording) -> float:
+    def training_seconds(self, recording: Capture) -> float:
         """Seconds of training: as given, else as long as the clip lasts, else a minute.
 
         With --steps they are nominal: they decide the detail, not when training ends.
@@ -235,7 +235,7 @@ class IngestArguments:
         if self.seconds is not None:
             return self.seconds
         duration_s = recording.source.duration_s
-        return duration_s if self.realtime and duration_s else A_MINUTE
+        return duration_s if self.realtime and duration_s else DEFAULT_SECONDS
 
     def as_json(self) -> dict[str, Any]:
         """The arguments as report.json keeps them."""
@@ -245,21 +245,21 @@ class IngestArguments:
         }
 
 
-def parsed_frames(text: str) -> slice | None:
+def parse_frame_range(text: str) -> slice | None:
     """START:STOP:STEP as a slice; None for all frames.
 
     Raises:
-        BadInput: If it is something else.
+        InputError: If it is something else.
     """
     if not re.fullmatch(r"\d*(:\d*){0,2}", text) or ":" not in text:
-        raise BadInput(
+        raise InputError(
             f"--frames is {text!r}; expected START:STOP:STEP counted from 0, as in 0:120:2 or 30:."
         )
     parts = [int(part) if part else None for part in text.split(":")]
     return None if not any(part is not None for part in parts) else slice(*parts)
 
 
-def polarity(*, dark: bool, bright: bool) -> bool | None:
+def mask_inversion(*, person_dark: bool, person_bright: bool) -> bool | None:
     """Whether masks are to be turned; None if that is to be found out.
 
     Args:
@@ -267,13 +267,13 @@ def polarity(*, dark: bool, bright: bool) -> bool | None:
         bright: Whether --no-mask-invert was given.
 
     Raises:
-        BadInput: If both were.
+        InputError: If both were.
     """
-    if dark and bright:
-        raise BadInput("--mask-invert and --no-mask-invert contradict; give one of them.")
-    return dark if dark or bright else None
+    if person_dark and person_bright:
+        raise InputError("--mask-invert and --no-mask-invert contradict; give one of them.")
+    return person_dark if person_dark or person_bright else None
 
 
-def learnable_px(seconds: float) -> int:
+def trainable_longer_side_px(seconds: float) -> int:
     """Longer side, in pixels, of pictures whose detail can be learnt in so many seconds."""
-    return max(256, round(LEARNABLE_PX * (seconds / 60.0) ** 0.5))
+    return max(256, round(REFERENCE_LONGER_SIDE_PX * (seconds / 60.0) ** 0.5))

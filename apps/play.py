@@ -7,172 +7,172 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apps.playing.arguments import TURN_S, WEB_PORT, PlayArguments
-from apps.terminal.command_line import parsed
+from apps.playing.arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
+from apps.terminal.command_line import parse_arguments
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, exit_code
-from apps.terminal.port import with_port, with_value
-from capture.errors import BadInput
+from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, run_command
+from apps.terminal.port import fill_optional_port, fill_optional_number
+from capture.errors import InputError
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
     from export.player import Player
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    words = with_port(sys.argv[1:] if arguments is None else arguments, "--web", WEB_PORT)
-    words = with_value(words, "--turntable", TURN_S)
-    given = parsed(PlayArguments, "ia-play", words)
-    return exit_code("ia-play", lambda: play(given, Console()))
+    words = fill_optional_port(sys.argv[1:] if argv is None else argv, "--web", WEB_PORT)
+    words = fill_optional_number(words, "--turntable", DEFAULT_TURN_S)
+    given = parse_arguments(PlayArguments, "ia-play", words)
+    return run_command("ia-play", lambda: play(given, Console()))
 
 
-def play(given: PlayArguments, console: Console) -> int:
+def play(arguments: PlayArguments, console: Console) -> int:
     """Does what the arguments say.
 
     Raises:
-        BadInput: If something is missing, unreadable or does not fit together.
+        InputError: If something is missing, unreadable or does not fit together.
         OSError: If the disk is full.
     """
-    given.check()
-    if given.verify:
-        return _verify(given, console)
-    if given.web is not None:
-        return _web(given, given.web, console)
-    return _bench(given, console) if given.bench else _clip(given, console)
+    arguments.validate()
+    if arguments.verify:
+        return _run_verification(arguments, console)
+    if arguments.web is not None:
+        return _run_web(arguments, arguments.web, console)
+    return _run_benchmark(arguments, console) if arguments.bench else _render_clip(arguments, console)
 
 
-def _clip(given: PlayArguments, console: Console) -> int:
-    from apps.playing.background import TRANSPARENT, background
-    from apps.playing.clip import GIF_FPS, check_clip, encoder_of, write_clip
-    from apps.playing.shots import shots_of
-    from apps.terminal.interrupt import asked_to_stop
+def _render_clip(arguments: PlayArguments, console: Console) -> int:
+    from apps.playing.background import TRANSPARENT, background_compositor
+    from apps.playing.clip import MAX_GIF_FPS, check_clip_path, choose_encoder, write_clip
+    from apps.playing.shots import plan_render
+    from apps.terminal.interrupt import stop_on_interrupt
     from export.player import Player
 
-    out = given.clip
+    out = arguments.output_path
     suffix = out.suffix.lower()
-    check_clip(out, given.inputs, overwrite=given.overwrite)
-    clear = suffix in ("", ".png") if given.background is None else given.background == TRANSPARENT
-    blend = None if clear else background(given.background or "white")
-    encoder = encoder_of(out, blend)
-    player = Player.load(given.avatar, tier=given.tier, provider=given.provider)
-    _warn(player, console)
-    shots = shots_of(given, player, console, most_fps=GIF_FPS if suffix == ".gif" else np.inf)
-    if given.fps is not None and shots.fps < given.fps:
-        console.say(f"note: a GIF shows {GIF_FPS:g} pictures a second at most.")
+    check_clip_path(out, arguments.inputs, overwrite=arguments.overwrite)
+    clear = suffix in ("", ".png") if arguments.background is None else arguments.background == TRANSPARENT
+    blend = None if clear else background_compositor(arguments.background or "white")
+    encoder = choose_encoder(out, blend)
+    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
+    _print_package_warnings(player, console)
+    shots = plan_render(arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf)
+    if arguments.fps is not None and shots.fps < arguments.fps:
+        console.info(f"note: a GIF shows {MAX_GIF_FPS:g} pictures a second at most.")
     total = len(shots)
     with (
-        asked_to_stop(console, "the pictures drawn so far are being kept") as stop,
-        console.bar(f"drawing {out.name}", float(total)) as bar,
+        stop_on_interrupt(console, "the pictures drawn so far are being kept") as stop,
+        console.progress(f"drawing {out.name}", float(total)) as bar,
     ):
 
         def pictures() -> Iterator[np.ndarray]:
-            drawn = player.render_all(shots, workers=given.threads, samples=given.samples)
+            drawn = player.render_all(shots, workers=arguments.worker_count, samples=arguments.samples)
             for done, picture in enumerate(drawn):
-                bar.move(float(done), f"{done}/{total} pictures")
+                bar.update(float(done), f"{done}/{total} pictures")
                 yield picture
                 if stop.is_set():
                     drawn.close()
                     return
 
         count = write_clip(
-            out, pictures(), fps=shots.fps, blend=blend, encoder=encoder, replace=given.overwrite
+            out, pictures(), fps=shots.fps, blend=blend, encoder=encoder, replace=arguments.overwrite
         )
     width, height = shots.cameras[0].size_px
     pace = f" at {shots.fps:.4g} a second" if count > 1 else ""
     what = "a picture" if count == 1 else f"{count} pictures"
     cut = f" of {total}" if count < total else ""
-    console.say(f"Drew {what}{cut} of {width}x{height} px{pace}; {encoder.said}:")
+    console.info(f"Drew {what}{cut} of {width}x{height} px{pace}; {encoder.description}:")
     print(out)  # noqa: T201 - what was made goes to stdout, for scripts
     return DONE if count == total else INTERRUPTED
 
 
-def _warn(player: "Player", console: Console) -> None:
-    from apps.playing.verdict import package_notes
+def _print_package_warnings(player: "Player", console: Console) -> None:
+    from apps.playing.verdict import package_warnings
 
-    for note in package_notes(player.manifest):
-        console.warn(note)
+    for note in package_warnings(player.manifest):
+        console.warning(note)
 
 
-def _bench(given: PlayArguments, console: Console) -> int:
-    from apps.playing.bench import benchmark
-    from apps.playing.shots import shots_of
-    from capture.atomic_files import write_text
+def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
+    from apps.playing.bench import benchmark_player
+    from apps.playing.shots import plan_render
+    from capture.atomic_files import write_text_atomically
     from export.player import Player
 
     started = time.perf_counter()
-    player = Player.load(given.avatar, tier=given.tier, provider=given.provider)
+    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     load_ms = 1000.0 * (time.perf_counter() - started)
-    shots = list(shots_of(given, player, console))
-    result = benchmark(
+    shots = list(plan_render(arguments, player, console))
+    result = benchmark_player(
         player,
         shots,
         load_ms=load_ms,
-        tier=given.tier,
-        workers=given.workers or 1,
-        samples=given.samples,
+        tier=arguments.tier,
+        workers=arguments.workers or 1,
+        samples=arguments.samples,
     )
-    if given.json is not None:
-        write_text(given.json, result.to_json(), replace=given.overwrite)
-    console.say(
+    if arguments.json is not None:
+        write_text_atomically(arguments.json, result.to_json(), replace=arguments.overwrite)
+    console.info(
         f"{result.cpu_ms_per_frame:.1f} CPU-ms a picture of {result.size} px, "
-        f"{result.pictures_per_second:.1f} pictures a second with {_counted(result.workers)} "
+        f"{result.images_per_second:.1f} pictures a second with {_format_workers(result.workers)} "
         f"({result.frames} pictures, {result.pixels_covered:.0%} covered, {result.provider}); "
         f"loaded in {result.load_ms:.0f} ms; reference graph {result.reference_ms:.1f} ms"
     )
     return DONE
 
 
-def _counted(workers: int) -> str:
+def _format_workers(workers: int) -> str:
     return "one worker" if workers == 1 else f"{workers} workers"
 
 
-def _web(given: PlayArguments, port: int, console: Console) -> int:
-    from apps.playing.driving import driving_motion
-    from apps.playing.novel import novel_motion
-    from apps.playing.rate import poses_a_second
-    from apps.playing.web import clip_of, serve, write_site
-    from apps.terminal.places import check_folder_place
+def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
+    from apps.playing.driving import load_driving_motion
+    from apps.playing.novel import demo_motion
+    from apps.playing.rate import pose_rate
+    from apps.playing.web import web_clip, serve_site, write_site
+    from apps.terminal.places import check_output_folder
     from export.player import Player
     from export.web.runtime import runtime_files
-    from export.web.site import site
+    from export.web.site import build_page
 
     if not 0 < port < 1 << 16:
-        raise BadInput(f"--web {port} is no port; 1 to 65535 were expected.")
+        raise InputError(f"--web {port} is no port; 1 to 65535 were expected.")
     runtime_files()
-    if given.out is not None:
-        check_folder_place(given.out, "--out", given.inputs)
-    player = Player.load(given.avatar)
-    _warn(player, console)
-    joints, motion = player.manifest.rest_joints, novel_motion()
-    if given.poses is not None:
-        motion = driving_motion(given.poses, joints, console, person=given.person)
+    if arguments.out is not None:
+        check_output_folder(arguments.out, "--out", arguments.inputs)
+    player = Player.load(arguments.avatar)
+    _print_package_warnings(player, console)
+    joints, motion = player.manifest.rest_joints, demo_motion()
+    if arguments.poses is not None:
+        motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
-    clip = clip_of(player, motion, rows, given.fps or given.speed * poses_a_second(motion))
+    clip = web_clip(player, motion, rows, arguments.fps or arguments.speed * pose_rate(motion))
     name = (
-        given.avatar.resolve().parent.name if given.avatar.stem == "avatar" else given.avatar.stem
+        arguments.avatar.resolve().parent.name if arguments.avatar.stem == "avatar" else arguments.avatar.stem
     )
-    with console.waiting("unpacking the avatar for the page"):
-        files = site(given.avatar, clip, name=name, level=1 if given.out is None else 6)
-    if given.out is None:
-        serve(files, port, console)
+    with console.status("unpacking the avatar for the page"):
+        files = build_page(arguments.avatar, clip, name=name, compression_level=1 if arguments.out is None else 6)
+    if arguments.out is None:
+        serve_site(files, port, console)
         return DONE
-    write_site(files, given.out)
+    write_site(files, arguments.out)
     megabytes = sum(map(len, files.values())) / 1e6
-    console.say(f"Wrote {len(files)} files, {megabytes:.1f} MB; any static host serves them:")
-    print(given.out)  # noqa: T201 - what was made goes to stdout, for scripts
+    console.info(f"Wrote {len(files)} files, {megabytes:.1f} MB; any static host serves them:")
+    print(arguments.out)  # noqa: T201 - what was made goes to stdout, for scripts
     return DONE
 
 
-def _verify(given: PlayArguments, console: Console) -> int:
-    from apps.playing.verdict import verdict_of
-    from capture.atomic_files import write_text
+def _run_verification(arguments: PlayArguments, console: Console) -> int:
+    from apps.playing.verdict import verify_package
+    from capture.atomic_files import write_text_atomically
 
-    verdict = verdict_of(given.avatar, provider=given.provider)
-    if given.json is not None:
-        write_text(given.json, verdict.to_json(), replace=given.overwrite)
-    for line in verdict.lines():
-        console.say(line)
-    return DONE if verdict.same else BAD_INPUT
+    verdict = verify_package(arguments.avatar, provider=arguments.provider)
+    if arguments.json is not None:
+        write_text_atomically(arguments.json, verdict.to_json(), replace=arguments.overwrite)
+    for line in verdict.to_lines():
+        console.info(line)
+    return DONE if verdict.matches else BAD_INPUT
 
 
 if __name__ == "__main__":

@@ -10,13 +10,13 @@ from typing import Annotated
 import tyro
 
 from apps.studio.shoot_config import ShootConfig
-from apps.terminal.command_line import parsed
+from apps.terminal.command_line import parse_arguments
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, exit_code
+from apps.terminal.exit_codes import DONE, run_command
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleConfig:
+class SampleArguments:
     """Films a synthetic person into a capture folder, with the truth beside it.
 
     OUT then holds video.mp4 (lossless FFV1: VLC, mpv and ffmpeg play it), preview.webm (the same
@@ -43,35 +43,35 @@ class SampleConfig:
     """Replace a capture that is already there."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    config = parsed(SampleConfig, "ia-sample", arguments)
-    return exit_code("ia-sample", lambda: _sample(config, Console()))
+    config = parse_arguments(SampleArguments, "ia-sample", argv)
+    return run_command("ia-sample", lambda: _film(config, Console()))
 
 
-def _sample(config: SampleConfig, console: Console) -> int:
+def _film(config: SampleArguments, console: Console) -> int:
     try:
-        _shoot_with_bar(config, console)
+        _film_with_progress(config, console)
     except (OSError, KeyboardInterrupt) as error:
         error.add_note("Nothing was left behind.")
         raise
     video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
-    console.say(f"Filmed {config.shoot.frames} frames into {config.out}.")
-    console.say(f"To look at in a browser: {config.out / 'preview.webm'}. Next:")
-    console.say(f"  ia-ingest {video} --poses {poses}")
+    console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
+    console.info(f"To look at in a browser: {config.out / 'preview.webm'}. Next:")
+    console.info(f"  ia-ingest {video} --poses {poses}")
     return DONE
 
 
-def _shoot_with_bar(config: SampleConfig, console: Console) -> None:
-    from apps.studio.writer import shoot
+def _film_with_progress(config: SampleArguments, console: Console) -> None:
+    from apps.studio.writer import film_capture
 
-    with console.bar("filming", 1.0) as bar:
+    with console.progress("filming", 1.0) as bar:
 
         def advance(done: int, total: int) -> None:
-            bar.move(done / total, f"{done}/{total} pictures")
+            bar.update(done / total, f"{done}/{total} pictures")
 
-        bar.move(0.0, "dressing the actor")
-        shoot(config.out, config.shoot, advance, overwrite=config.overwrite)
+        bar.update(0.0, "dressing the actor")
+        film_capture(config.out, config.shoot, advance, overwrite=config.overwrite)
 
 
 if __name__ == "__main__":

@@ -7,25 +7,25 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from avatar.coverage import Coverage, Stage
+from avatar.coverage import Coverage, VisibilityStage
 from avatar.patches import PART_NAMES, SkinPatches
 
-WORTH_A_WORD = 0.02
+MIN_REGION_SHARE = 0.02
 """Share of the skin below which an unseen piece is not mentioned: one hand is 2.3 %."""
-HEAD_COUNTS = 2.0
+HEAD_WEIGHT = 2.0
 """A face is what people look at: the head's skin counts as so much more."""
-NEARLY_ALL = 0.95
-NOBODY = "Nobody has been seen yet."
-EVERYTHING = "It was seen from all sides: no piece as large as a hand is missing."
-SCATTERED = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
+NEARLY_COMPLETE = 0.95
+NOT_SEEN_YET = "Nobody has been seen yet."
+SEEN_COMPLETELY = "It was seen from all sides: no piece as large as a hand is missing."
+SMALL_REGIONS_LEFT = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
 
-MOST = 0.7
+MIN_LIMB_SHARE = 0.7
 """Share of a piece that a limb must hold to give the piece its name."""
-UPWARD = 0.6
+MIN_TOP_NORMAL_Y = 0.6
 """A piece whose mean normal points up this much is the top of its limb."""
-ALL_AROUND = 0.12
+MAX_SIDELESS_NORMAL = 0.12
 """A piece whose mean normal is shorter than this has no side."""
-LEFT_AND_RIGHT = {
+PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),
     "arm": ("upper arm", "forearm", "hand"),
@@ -33,9 +33,9 @@ LEFT_AND_RIGHT = {
 }
 PLURALS = {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}
 
-ALL_OF_IT = "Show your {limb}: {they} {was} never seen."
-ELSEWHERE = "Turn until the {side}{s} of your {limb} {has} been seen."
-WORDS = {
+WHOLE_LIMB_ADVICE = "Show your {limb}: {they} {was} never seen."
+TURN_ADVICE = "Turn until the {side}{s} of your {limb} {has} been seen."
+ADVICE_BY_SIDE = {
     ("arm", "under"): "Raise your {limb}: {its} underside{s} {was} never seen.",
     ("arm", "top"): "Lower your {limb}: {its} upper side{s} {was} never seen.",
     ("hand", "under"): "Turn your palm{s} to the camera: the {limb} {was} never seen from below.",
@@ -51,9 +51,9 @@ WORDS = {
     ("torso", "left"): "Turn until your left side has been seen.",
     ("torso", "right"): "Turn until your right side has been seen.",
 }
-OUTSIDE = "Step back: your {limb} {was} never in the picture."
-MASKED = "Look at the masks: your {limb} {was} never in them, though nothing of you hid {it}."
-HIDDEN = {
+OUTSIDE_IMAGE_ADVICE = "Step back: your {limb} {was} never in the picture."
+OUTSIDE_MASK_ADVICE = "Look at the masks: your {limb} {was} never in them, though nothing of you hid {it}."
+SELF_OCCLUSION_ADVICE = {
     ("torso", "left"): "Raise your arms: they hide your left side.",
     ("torso", "right"): "Raise your arms: they hide your right side.",
     ("torso", "front"): "Move your arms aside: they hide your front.",
@@ -62,7 +62,7 @@ HIDDEN = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gap:
+class UnseenRegion:
     """A connected piece of skin that no frame shows.
 
     Attributes:
@@ -77,59 +77,59 @@ class Gap:
 
     share: float
     limb: str
-    whose: str
+    laterality: str
     side: str
-    stage: Stage
+    stage: VisibilityStage
 
 
-def advice(coverage: Coverage) -> str:
+def coverage_advice(coverage: Coverage) -> str:
     """What the person should do next, in one sentence.
 
     It is about the largest connected piece that nobody has seen; if the same piece of the other
     arm or leg is missing, too, about both.
     """
     if not coverage.stages.any():
-        return NOBODY
-    found = gaps(coverage)
+        return NOT_SEEN_YET
+    found = unseen_regions(coverage)
     if found:
-        return _sentence(_of_both(found))
-    return EVERYTHING if coverage.seen >= NEARLY_ALL else SCATTERED.format(rest=1.0 - coverage.seen)
+        return _advice_sentence(_merge_symmetric(found))
+    return SEEN_COMPLETELY if coverage.seen_share >= NEARLY_COMPLETE else SMALL_REGIONS_LEFT.format(rest=1.0 - coverage.seen_share)
 
 
-def gaps(coverage: Coverage) -> list[Gap]:
+def unseen_regions(coverage: Coverage) -> list[UnseenRegion]:
     """The connected unseen pieces worth a word, the largest first."""
     patches = coverage.patches
-    unseen = coverage.stages < Stage.SEEN
-    links = patches.links[unseen[patches.links].all(axis=1)]
+    unseen = coverage.stages < VisibilityStage.SEEN
+    links = patches.adjacent_pairs[unseen[patches.adjacent_pairs].all(axis=1)]
     count = len(unseen)
     graph = coo_array((np.ones(len(links), dtype=bool), tuple(links.T)), shape=(count, count))
     _, piece = connected_components(graph, directed=False)
-    counts = np.where(patches.parts == PART_NAMES.index("head"), HEAD_COUNTS, 1.0)
+    counts = np.where(patches.parts == PART_NAMES.index("head"), HEAD_WEIGHT, 1.0)
     weights = np.bincount(piece, weights=unseen * counts * patches.areas)
-    least = WORTH_A_WORD * float(patches.areas.sum())
+    least = MIN_REGION_SHARE * float(patches.areas.sum())
     large = [k for k in np.argsort(-weights) if weights[k] >= least]
-    return [_gap(coverage, np.flatnonzero(piece == k)) for k in large]
+    return [_describe_region(coverage, np.flatnonzero(piece == k)) for k in large]
 
 
-def _gap(coverage: Coverage, piece: Int[np.ndarray, "piece"]) -> Gap:
+def _describe_region(coverage: Coverage, piece: Int[np.ndarray, "piece"]) -> UnseenRegion:
     patches, areas = coverage.patches, coverage.patches.areas[piece].astype(np.float64)
     share = float(areas.sum() / patches.areas.sum())
     limb, whose = _limb(patches, piece)
-    stage = Stage(int(np.bincount(coverage.stages[piece], weights=areas).argmax()))
+    stage = VisibilityStage(int(np.bincount(coverage.stages[piece], weights=areas).argmax()))
     looks = np.average(patches.normals[piece], axis=0, weights=areas)
-    return Gap(share=share, limb=limb, whose=whose, side=_side(looks, limb, whose), stage=stage)
+    return UnseenRegion(share=share, limb=limb, laterality=whose, side=_side(looks, limb, whose), stage=stage)
 
 
-def _side(looks: Float[np.ndarray, "3"], limb: str, whose: str) -> str:
+def _side(mean_normal: Float[np.ndarray, "3"], limb: str, whose: str) -> str:
     """The side of a limb that a mean normal looks to, in the T-pose."""
-    if np.linalg.norm(looks) < ALL_AROUND:
+    if np.linalg.norm(mean_normal) < MAX_SIDELESS_NORMAL:
         return "all around"
-    x, y, z = looks
+    x, y, z = mean_normal
     if limb in ("arm", "hand"):
         return (
             ("front" if z > 0.0 else "back") if abs(z) > abs(y) else "top" if y > 0.0 else "under"
         )
-    if y > UPWARD:
+    if y > MIN_TOP_NORMAL_Y:
         return "top"
     if abs(z) >= abs(x):
         return "front" if z > 0.0 else "back"
@@ -143,8 +143,8 @@ def _limb(patches: SkinPatches, piece: Int[np.ndarray, "piece"]) -> tuple[str, s
     """The smallest limb that holds most of a piece, and whose it is."""
     areas = np.bincount(patches.parts[piece], weights=patches.areas[piece], minlength=14)
     held: dict[str, float] = dict(zip(PART_NAMES, areas.tolist(), strict=True))
-    enough = MOST * float(areas.sum())
-    for limb, parts in LEFT_AND_RIGHT.items():
+    enough = MIN_LIMB_SHARE * float(areas.sum())
+    for limb, parts in PARTS_OF_LIMB.items():
         left, right = (sum(held[f"{whose} {p}"] for p in parts) for whose in ("left", "right"))
         for whose, area in (("left", left), ("right", right), ("both", left + right)):
             if area >= enough:
@@ -152,23 +152,23 @@ def _limb(patches: SkinPatches, piece: Int[np.ndarray, "piece"]) -> tuple[str, s
     return ("head", "") if held["head"] >= enough else ("torso", "")
 
 
-def _of_both(found: list[Gap]) -> Gap:
+def _merge_symmetric(found: list[UnseenRegion]) -> UnseenRegion:
     """The largest gap; of both limbs if the other one has a like gap half as large."""
     first = found[0]
-    other = {"left": "right", "right": "left"}.get(first.whose)
+    other = {"left": "right", "right": "left"}.get(first.laterality)
     for gap in found[1:]:
-        alike = (gap.limb, gap.whose, gap.side, gap.stage) == (
+        alike = (gap.limb, gap.laterality, gap.side, gap.stage) == (
             first.limb, other, first.side, first.stage,
         )  # fmt: skip
         if alike and gap.share >= 0.5 * first.share:
-            return replace(first, whose="both", share=first.share + gap.share)
+            return replace(first, laterality="both", share=first.share + gap.share)
     return first
 
 
-def _sentence(gap: Gap) -> str:
-    both = gap.whose == "both"
+def _advice_sentence(gap: UnseenRegion) -> str:
+    both = gap.laterality == "both"
     words = {
-        "limb": PLURALS[gap.limb] if both else f"{gap.whose} {gap.limb}".strip(),
+        "limb": PLURALS[gap.limb] if both else f"{gap.laterality} {gap.limb}".strip(),
         "side": f"{gap.side} side" if gap.side in ("left", "right") else gap.side,
         "s": "s" if both else "",
         "it": "them" if both else "it",
@@ -178,11 +178,11 @@ def _sentence(gap: Gap) -> str:
         "has": "have" if both else "has",
     }
     kind = (gap.limb, gap.side)
-    if gap.stage is Stage.OUTSIDE:
-        return OUTSIDE.format(**{**words, "limb": words["limb"].replace("torso", "whole body")})
-    if gap.stage is Stage.MASKED:
-        return MASKED.format(**words)
-    if gap.stage is Stage.HIDDEN and kind in HIDDEN:
-        return HIDDEN[kind]
-    otherwise = ALL_OF_IT if gap.side == "all around" else ELSEWHERE
-    return WORDS.get(kind, otherwise).format(**words)
+    if gap.stage is VisibilityStage.OUTSIDE_IMAGE:
+        return OUTSIDE_IMAGE_ADVICE.format(**{**words, "limb": words["limb"].replace("torso", "whole body")})
+    if gap.stage is VisibilityStage.OUTSIDE_MASK:
+        return OUTSIDE_MASK_ADVICE.format(**words)
+    if gap.stage is VisibilityStage.SELF_OCCLUDED and kind in SELF_OCCLUSION_ADVICE:
+        return SELF_OCCLUSION_ADVICE[kind]
+    otherwise = WHOLE_LIMB_ADVICE if gap.side == "all around" else TURN_ADVICE
+    return ADVICE_BY_SIDE.get(kind, otherwise).format(**words)

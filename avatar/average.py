@@ -7,18 +7,18 @@ falls, which is always while a video streams, and takes nothing away after.
 
 import torch
 
-from avatar.field import Field
+from avatar.field import RadianceField
 
-HORIZON = 250
+EMA_HORIZON_STEPS = 250
 """Steps over which the mean reaches back: the longer, the later it shows what is new."""
-YOUNG_SHARE = 1 / 5
+MAX_HORIZON_SHARE = 1 / 5
 """Share of all steps so far that it reaches back at most: the first ones were fog."""
-EVERY = 16
+EMA_INTERVAL = 16
 """Steps between updates."""
 
 
 @torch.no_grad()
-def follow(mean: Field, field: Field, steps: int) -> None:
+def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None:
     """Moves an exponential mean on, if it is time.
 
     Args:
@@ -26,8 +26,8 @@ def follow(mean: Field, field: Field, steps: int) -> None:
         field: As it is after so many steps.
         steps: How many, 1 or more.
     """
-    if steps % EVERY and steps > EVERY:
+    if steps % EMA_INTERVAL and steps > EMA_INTERVAL:
         return
-    share = min(1.0, EVERY / min(HORIZON, max(steps * YOUNG_SHARE, 1.0)))
-    for shown, learnt in zip(mean.parameters(), field.parameters(), strict=True):
+    share = min(1.0, EMA_INTERVAL / min(EMA_HORIZON_STEPS, max(steps * MAX_HORIZON_SHARE, 1.0)))
+    for shown, learnt in zip(average.parameters(), field.parameters(), strict=True):
         shown.lerp_(learnt, share)

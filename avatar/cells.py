@@ -16,14 +16,14 @@ from jaxtyping import Float, Float32, Int32
 from avatar.kernels.choice import backend_for
 from avatar.rig import Rig
 
-CELL_M = 0.03
-BAND_M = 0.08
+CORRESPONDENCE_CELL_M = 0.03
+CLOTHING_BAND_M = 0.08
 """How far from the skin clothes and hair may reach."""
 CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WarpCells:
+class CorrespondenceGrid:
     """The warp of one frame, from its body frame to canonical space.
 
     Attributes:
@@ -38,19 +38,19 @@ class WarpCells:
 
     low: Float32[np.ndarray, "3"]
     cell_m: float
-    index: Int32[np.ndarray, "gx gy gz"]
+    packed_cells: Int32[np.ndarray, "gx gy gz"]
     roots: Float32[np.ndarray, "rows 12"]
 
     @classmethod
-    def of(
+    def solve(
         cls,
         rig: Rig,
         joint_rotations: Float[np.ndarray, "23 3"],
         *,
-        band_m: float = BAND_M,
-        cell_m: float = CELL_M,
+        band_m: float = CLOTHING_BAND_M,
+        cell_m: float = CORRESPONDENCE_CELL_M,
         device: torch.device = CPU,
-    ) -> "WarpCells":
+    ) -> "CorrespondenceGrid":
         """Solves the warp of one pose.
 
         Args:
@@ -61,7 +61,7 @@ class WarpCells:
             device: Where to solve.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
-        solved = backend_for(device).build_cells(
+        solved = backend_for(device).solve_correspondences(
             rig, bones.astype(np.float32), band_m, cell_m, device
         )
-        return cls(low=solved.low, cell_m=cell_m, index=solved.index, roots=solved.roots)
+        return cls(low=solved.low, cell_m=cell_m, index=solved.packed_cells, roots=solved.roots)

@@ -10,20 +10,20 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.rig import Rig
-from avatar.save_whole import save_whole
+from avatar.save_whole import save_atomically
 from avatar.trainer import Trainer
-from capture.errors import BadInput
+from capture.errors import InputError
 
-FORMAT = 1
-FILE = "state.pt"
-COUNTS = ("steps", "rays", "samples", "frames_seen", "wall_seconds", "cpu_seconds")
+CHECKPOINT_FORMAT = 1
+CHECKPOINT_FILE = "state.pt"
+COUNTERS = ("steps", "rays", "samples", "frames_seen", "wall_seconds", "cpu_seconds")
 
 
 def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None) -> Path:
     """Writes the trainer's state, the rig and the caller's notes into `folder`.
 
     Args:
-        trainer: What has been learnt. Frames are not kept: the video still has them.
+        trainer: What has been learnt. EvaluationFrames are not kept: the video still has them.
         folder: Made if it is not there.
         notes: What the caller wants back (plain data: numbers, text, lists, dicts).
 
@@ -32,15 +32,15 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
     """
     folder.mkdir(parents=True, exist_ok=True)
     state = {**_state(trainer), "notes": notes or {}}
-    path = folder / FILE
-    save_whole(state, path)
+    path = folder / CHECKPOINT_FILE
+    save_atomically(state, path)
     return path
 
 
 def _state(trainer: Trainer) -> dict[str, Any]:
-    occupancy = trainer.avatar.occupancy.grid
+    occupancy = trainer.avatar.occupancy.density_grid
     return {
-        "format": FORMAT,
+        "format": CHECKPOINT_FORMAT,
         "config": dataclasses.asdict(trainer.config),
         "rig": {
             item.name: torch.from_numpy(
@@ -53,9 +53,9 @@ def _state(trainer: Trainer) -> dict[str, Any]:
         "optimizer": trainer.optimizer.state_dict(),
         "density": occupancy.density,
         "occupied": occupancy.occupied,
-        "counts": {name: getattr(trainer, name) for name in COUNTS},
+        "counts": {name: getattr(trainer, name) for name in COUNTERS},
         "corrections": {
-            frame: torch.from_numpy(numbers) for frame, numbers in trainer.corrections.items()
+            frame: torch.from_numpy(numbers) for frame, numbers in trainer.pose_corrections.items()
         },
     }
 
@@ -65,28 +65,28 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
 
     Raises:
         FileNotFoundError: If there is no checkpoint in `folder`.
-        BadInput: If it cannot be read.
+        InputError: If it cannot be read.
     """
-    path = folder / FILE
+    path = folder / CHECKPOINT_FILE
     if not path.exists():
         raise FileNotFoundError(path)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        if state["format"] != FORMAT:
-            raise BadInput(
-                f"The checkpoint {path} has format {state['format']}; this version reads {FORMAT}. "
+        if state["format"] != CHECKPOINT_FORMAT:
+            raise InputError(
+                f"The checkpoint {path} has format {state['format']}; this version reads {CHECKPOINT_FORMAT}. "
                 "Train again with --overwrite."
             )
         return _restored(state, device), state["notes"]
-    except BadInput:
+    except InputError:
         raise
     except pickle.UnpicklingError as error:
-        raise BadInput(
+        raise InputError(
             f"The checkpoint {path} holds something other than numbers and is refused. "
             "Train again with --overwrite."
         ) from error
     except Exception as error:  # what a damaged file makes torch stumble over has many types
-        raise BadInput(
+        raise InputError(
             f"The checkpoint {path} cannot be read ({str(error).split('. ')[0]}). "
             "Expected one that ia-ingest wrote. Train again with --overwrite."
         ) from error
@@ -104,10 +104,10 @@ def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
             for parameter, values in zip(field.parameters(), known, strict=True):
                 parameter.copy_(values)
     trainer.optimizer.load_state_dict(state["optimizer"])
-    grid = trainer.avatar.occupancy.grid
+    grid = trainer.avatar.occupancy.density_grid
     grid.density.copy_(state["density"])
     grid.occupied.copy_(state["occupied"])
-    trainer.corrections = {frame: tensor.numpy() for frame, tensor in state["corrections"].items()}
-    for name in COUNTS:
+    trainer.pose_corrections = {frame: tensor.numpy() for frame, tensor in state["corrections"].items()}
+    for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])
     return trainer

@@ -5,30 +5,30 @@ from dataclasses import dataclass
 from typing import Literal
 
 COARSEST_M = 0.13
-"""Cells of the coarsest hash level: 16 along a two-metre box."""
-ENOUGH_FRAMES = 24
+"""SolvedCorrespondences of the coarsest hash level: 16 along a two-metre box."""
+FULL_DETAIL_FRAMES = 24
 """So many frames, all round, determine the detail that their pixels show."""
-SCANT_FRAMES = 12
+FEW_FRAMES = 12
 """Fewer do not tell a pose's error from the body's shape: what they leave open becomes fog, unless
 surfaces are asked to be firm. Asked of twelve frames in exact poses it cost 0.5 dB."""
-FEWEST, SCANTEST = 4.0, 1.5
+MAX_DETAIL_SHORTAGE, MAX_FRAME_SHORTAGE = 4.0, 1.5
 """Both count no further than to a quarter, and to two thirds."""
-FIRM_WEIGHT, SOLID_WEIGHT = 1.5, 0.15
-SOFT_WEIGHT, EVEN_WEIGHT, THIN_DENSITY = 0.15, 0.3, 180.0
-GAP_WEIGHT = 0.1
-"""Of all six, times the share by which frames are fewer than `SCANT_FRAMES`."""
-STEEPEST = 4.0
+FEW_FRAMES_DOUBLE_WELL_WEIGHT, FEW_FRAMES_INTERIOR_WEIGHT = 1.5, 0.15
+FEW_FRAMES_SLOPE_WEIGHT, FEW_FRAMES_COLOR_TV_WEIGHT, FEW_FRAMES_MIN_DENSITY = 0.15, 0.3, 180.0
+FEW_FRAMES_INNER_LEG_WEIGHT = 0.1
+"""Of all six, times the share by which frames are fewer than `FEW_FRAMES`."""
+MAX_LOG_DENSITY_STEP = 4.0
 """Logarithm of the density may change by so much along a finest cell, where that is asked."""
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that count as one second where steps are counted instead: what two cores make."""
-Skipping = Literal["canonical", "union", "frame", "none"]
+SkippingScheme = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
-Roots = Literal["cells", "broyden"]
-"""How samples are warped: by our warp cells, or each by Broyden's method (Fast-SNARF)."""
-EmptyTerm = Literal["occupancy", "global"]
+RootScheme = Literal["cells", "broyden"]
+"""How samples are warped: by our warp cells, or each by BroydenLookup's method (Fast-SNARF)."""
+EmptySpaceScheme = Literal["occupancy", "global"]
 """Where density is penalised: in empty cells (InstantAvatar, §3.4), or in the whole box."""
-HOLD_EVERY = 10
+HELD_OUT_STRIDE = 10
 """Every so manieth frame is held out, unless somebody says otherwise."""
 
 
@@ -43,69 +43,69 @@ class TrainConfig:
     machine. `seconds` is then `steps / NOMINAL_STEPS_PER_S`."""
     rays: int = 1024
     """Rays per step."""
-    step_m: float = 0.01
+    sample_step_m: float = 0.01
     """Distance between samples along a ray, metres."""
-    grace_m: float = 0.06
+    opaque_margin_m: float = 0.06
     """How far a ray is followed once its cached optical depth says it is opaque, metres."""
-    most_samples: int = 128
-    """Samples a ray may have."""
+    max_samples: int = 128
+    """RaySamples a ray may have."""
     levels: int = 8
     """Levels of the hash grid."""
     table_size: int = 1 << 17
     """Entries of a hashed level."""
     finest_m: float = 0.008
-    """Cells of the finest level, metres."""
+    """SolvedCorrespondences of the finest level, metres."""
     learning_rate: float = 2.5e-2
     """Of the table; the network's is 0.3 of it."""
     alpha_weight: float = 0.1
     """Of the L1 loss on alpha; 0 turns it off."""
-    hard_weight: float = 0.02
+    hard_surface_weight: float = 0.02
     """Of the hard-surface loss; 0 turns it off."""
-    empty_weight: float = 1.0
+    empty_space_weight: float = 1.0
     """Of the opacity in cells that should be empty; 0 turns the term off."""
-    empty_points: int = 256
+    empty_space_points: int = 256
     """Points at which that opacity is measured in each step."""
-    variation_weight: float = 0.025
+    density_tv_weight: float = 0.025
     """Of the total variation of opacity; 0 turns the term off."""
-    first_variation: float = 1.0
+    initial_density_tv_factor: float = 1.0
     """So many times that weight at first: it falls to it as the learning rate falls."""
-    firm_weight: float = 0.0
+    double_well_weight: float = 0.0
     """Of the double well of opacity, at the end; it grows as the learning rate falls. Where total
     variation is asked for strongly, it keeps surfaces from becoming fog."""
-    solid_weight: float = 0.0
+    interior_weight: float = 0.0
     """Of the opacity deep under the body's skin, which must be solid; 0 turns the term off."""
-    soft_weight: float = 0.0
+    density_slope_weight: float = 0.0
     """Of edges steeper than `steepest_per_m`, and of needless density, at the end; it grows as the
     learning rate falls. What is sharper than the finest cells no picture has shown."""
-    even_weight: float = 0.0
+    color_tv_weight: float = 0.0
     """Of the variation of colour between points as close; it grows the same way."""
-    soft_pairs: int = 256
+    smoothness_pairs: int = 256
     """Pairs of close points at which both are measured in each step."""
-    thin_density: float = 0.0
-    """Cells less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
-    gap_weight: float = 0.0
+    min_occupied_density: float = 0.0
+    """SolvedCorrespondences less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
+    inner_leg_weight: float = 0.0
     """Of log density off the skin between the legs, where no ray may tell; 0 turns it off."""
-    gap_points: int = 128
+    inner_leg_points: int = 128
     """Points at which that is measured in each step."""
-    solid_points: int = 128
+    interior_points: int = 128
     """Points at which that opacity is measured in each step."""
-    variation_pairs: int = 128
+    density_tv_pairs: int = 128
     """Pairs of points at which that variation is measured in each step."""
-    occupancy_every: int = 16
+    occupancy_interval: int = 16
     """Steps between updates of the occupancy."""
     refine_poses: bool = True
     """Whether the frames' poses are corrected while they are learnt from."""
-    key_frames: int = 200
-    """Frames that stay for replay."""
-    hold_every: int = HOLD_EVERY
+    replay_capacity: int = 200
+    """EvaluationFrames that stay for replay."""
+    held_out_stride: int = HELD_OUT_STRIDE
     """Every so manieth frame is held out; 0 for none."""
     seed: int = 0
     """Of everything random."""
-    skipping: Skipping = "canonical"
+    skipping: SkippingScheme = "canonical"
     """How empty space is skipped. All but "canonical" are there to repeat the paper's tables."""
-    roots: Roots = "cells"
+    roots: RootScheme = "cells"
     """How samples find their canonical points; "broyden" is the paper's way."""
-    empty_term: EmptyTerm = "occupancy"
+    empty_term: EmptySpaceScheme = "occupancy"
     """Where emptiness is asked for; "global" is the prior that the paper argues against."""
 
     def __post_init__(self) -> None:
@@ -121,23 +121,23 @@ class TrainConfig:
                 "roots='broyden' warps samples without cells, and it is the cells that carry a "
                 "pose's gradient: set refine_poses=False."
             )
-        if self.skipping == "none" and self.empty_term == "occupancy" and self.empty_weight:
+        if self.skipping == "none" and self.empty_term == "occupancy" and self.empty_space_weight:
             raise ValueError(
                 "skipping='none' knows no empty cells that could be kept empty: set "
                 "empty_weight=0 or empty_term='global'."
             )
 
     @property
-    def steepest_per_m(self) -> float:
+    def max_log_density_slope_per_m(self) -> float:
         """By how much the logarithm of the density may change along a metre."""
-        return STEEPEST / self.finest_m
+        return MAX_LOG_DENSITY_STEP / self.finest_m
 
-    def variation_at(self, firm_share: float) -> float:
+    def density_tv_weight_at(self, surface_share: float) -> float:
         """The weight of total variation when surfaces have become firm so far, in [0, 1]."""
-        return self.variation_weight * self.first_variation ** (1.0 - firm_share)
+        return self.density_tv_weight * self.initial_density_tv_factor ** (1.0 - surface_share)
 
     @classmethod
-    def within(
+    def for_budget(
         cls,
         seconds: float | None = None,
         *,
@@ -145,7 +145,7 @@ class TrainConfig:
         footprint_m: float,
         frames: int | None = None,
         seed: int = 0,
-        hold_every: int = HOLD_EVERY,
+        held_out_stride: int = HELD_OUT_STRIDE,
     ) -> "TrainConfig":
         """The recipe for a waiting time, or a number of steps, and a picture size.
 
@@ -165,11 +165,11 @@ class TrainConfig:
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
-        too_few = 1.0 if frames is None else max(1.0, ENOUGH_FRAMES / max(frames, 1))
+        too_few = 1.0 if frames is None else max(1.0, FULL_DETAIL_FRAMES / max(frames, 1))
         footprint_m *= too_few**0.5
-        few = min(too_few, FEWEST)
-        scant = 1.0 if frames is None else SCANT_FRAMES / max(frames, 1)
-        scant = min(max(scant, 1.0), SCANTEST)
+        few = min(too_few, MAX_DETAIL_SHORTAGE)
+        scant = 1.0 if frames is None else FEW_FRAMES / max(frames, 1)
+        scant = min(max(scant, 1.0), MAX_FRAME_SHORTAGE)
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         wanted = 4.0 * 2.0 / finest_m**2
@@ -180,14 +180,14 @@ class TrainConfig:
             step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,
-            variation_weight=cls.variation_weight * few * scant**3,
-            first_variation=scant**3,
-            firm_weight=FIRM_WEIGHT * (1.0 - 1.0 / scant),
-            solid_weight=SOLID_WEIGHT * (1.0 - 1.0 / scant),
-            soft_weight=SOFT_WEIGHT * (1.0 - 1.0 / scant),
-            even_weight=EVEN_WEIGHT * (1.0 - 1.0 / scant),
-            thin_density=THIN_DENSITY * (1.0 - 1.0 / scant),
-            gap_weight=GAP_WEIGHT * (1.0 - 1.0 / scant),
+            density_tv_weight=cls.density_tv_weight * few * scant**3,
+            initial_density_tv_factor=scant**3,
+            double_well_weight=FEW_FRAMES_DOUBLE_WELL_WEIGHT * (1.0 - 1.0 / scant),
+            interior_weight=FEW_FRAMES_INTERIOR_WEIGHT * (1.0 - 1.0 / scant),
+            density_slope_weight=FEW_FRAMES_SLOPE_WEIGHT * (1.0 - 1.0 / scant),
+            color_tv_weight=FEW_FRAMES_COLOR_TV_WEIGHT * (1.0 - 1.0 / scant),
+            min_occupied_density=FEW_FRAMES_MIN_DENSITY * (1.0 - 1.0 / scant),
+            inner_leg_weight=FEW_FRAMES_INNER_LEG_WEIGHT * (1.0 - 1.0 / scant),
             seed=seed,
-            hold_every=hold_every,
+            hold_every=held_out_stride,
         )

@@ -8,36 +8,36 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from avatar.patches import PART_NAMES, SIDE_NAMES, SkinPatches, in_front
+from avatar.patches import PART_NAMES, SIDE_NAMES, SkinPatches, visible_points
 from preprocess.body import ShapedBody
 from preprocess.observation import Observation
 
-SEEN_COSINE = 0.3
+MIN_SEEN_COSINE = 0.3
 """A patch that is turned further from the camera than this (72°) shows nothing of itself."""
-WELL_COSINE = 0.6
+MIN_WELL_SEEN_COSINE = 0.6
 """From this cosine on (53°) it was seen well."""
-CELL_M, SLACK_M = 0.03, 0.03
+DEPTH_CELL_M, DEPTH_TOLERANCE_M = 0.03, 0.03
 """Of the depth buffer in which the body hides itself."""
-PERSON = 0.5
-"""Alpha above which a pixel shows the person."""
+MIN_PERSON_ALPHA = 0.5
+"""AlphaMask above which a pixel shows the person."""
 
 
-class Stage(IntEnum):
+class VisibilityStage(IntEnum):
     """How far towards being seen a patch has ever come."""
 
-    AWAY = 0
+    FACING_AWAY = 0
     """It never faced the camera."""
-    OUTSIDE = 1
+    OUTSIDE_IMAGE = 1
     """It did, outside the picture."""
-    HIDDEN = 2
+    SELF_OCCLUDED = 2
     """It did, inside the picture, behind another part of the body."""
-    MASKED = 3
+    OUTSIDE_MASK = 3
     """Nothing of the body was before it, but the mask says that no person is there."""
     SEEN = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PartSeen:
+class PartCoverage:
     """How much of a body part's surface was seen, all around and side by side.
 
     Attributes:
@@ -45,7 +45,7 @@ class PartSeen:
         sides: The same by side, in the order of `SIDE_NAMES`; only sides that the part has.
     """
 
-    seen: float
+    seen_share: float
     sides: dict[str, float]
 
 
@@ -53,7 +53,7 @@ class PartSeen:
 class Coverage:
     """What has been seen of one person. Costs about a millisecond a frame.
 
-    Frames may be added on one thread while others read: nothing that was seen is ever unseen.
+    EvaluationFrames may be added on one thread while others read: nothing that was seen is ever unseen.
 
     Attributes:
         patches: The person's skin.
@@ -67,7 +67,7 @@ class Coverage:
     def __init__(self, shaped: ShapedBody) -> None:
         """Nothing of this person has been seen yet."""
         self._shaped = shaped
-        self.patches = SkinPatches.of(shaped)
+        self.patches = SkinPatches.from_shaped_body(shaped)
         self.cosines = np.zeros(len(self.patches.points), dtype=np.float32)
         self.stages = np.zeros(len(self.patches.points), dtype=np.uint8)
 
@@ -78,7 +78,7 @@ class Coverage:
         no other patch before it, and the mask says that a person is there.
         """
         camera, body = observation.camera, self._shaped.with_pose(observation.pose)
-        points, normals = posed(self.patches, body.world_from_rest())
+        points, normals = pose_patches(self.patches, body.world_from_rest())
         to_camera = camera.center_world - points
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
         cosines = np.einsum("pa,pa->p", to_camera, normals)
@@ -87,42 +87,42 @@ class Coverage:
         if depths.min() <= 0.0:  # somebody behind the camera is not in the picture either
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-        free = in_front(plane, depths, cosines, cell_m=CELL_M, slack_m=SLACK_M)
+        free = visible_points(plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M)
         column, row = np.floor(camera.project(points)).astype(np.int64).T
         width, height = camera.size_px
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
-        passed = (cosines > SEEN_COSINE, inside, free, alpha > PERSON)
+        passed = (cosines > MIN_SEEN_COSINE, inside, free, alpha > MIN_PERSON_ALPHA)
         stages = np.cumprod(passed, axis=0, dtype=np.uint8).sum(axis=0, dtype=np.uint8)
         np.maximum(self.stages, stages, out=self.stages)
-        shown = np.where(stages == Stage.SEEN, cosines, 0.0).astype(np.float32)
+        shown = np.where(stages == VisibilityStage.SEEN, cosines, 0.0).astype(np.float32)
         np.maximum(self.cosines, shown, out=self.cosines)
 
     @property
-    def seen(self) -> float:
+    def seen_share(self) -> float:
         """Share of the whole surface, in [0, 1]."""
-        return _share(self.patches.areas, self.cosines > 0.0)
+        return _area_share(self.patches.areas, self.cosines > 0.0)
 
     @property
-    def well(self) -> float:
+    def well_seen_share(self) -> float:
         """The share that was seen within 53° of squarely."""
-        return _share(self.patches.areas, self.cosines >= WELL_COSINE)
+        return _area_share(self.patches.areas, self.cosines >= MIN_WELL_SEEN_COSINE)
 
-    def parts(self) -> dict[str, PartSeen]:
+    def by_part(self) -> dict[str, PartCoverage]:
         """How much of each part was seen, by its name."""
         patches, seen = self.patches, self.cosines > 0.0
-        found: dict[str, PartSeen] = {}
+        found: dict[str, PartCoverage] = {}
         for part, name in enumerate(PART_NAMES):
             here = patches.parts == part
             sides = {
-                side: _share(patches.areas[among], seen[among])
+                side: _area_share(patches.areas[among], seen[among])
                 for k, side in enumerate(SIDE_NAMES)
                 if (among := here & (patches.sides == k)).any()
             }
-            found[name] = PartSeen(seen=_share(patches.areas[here], seen[here]), sides=sides)
+            found[name] = PartCoverage(seen_share=_area_share(patches.areas[here], seen[here]), sides=sides)
         return found
 
-    def as_notes(self) -> dict[str, Any]:
+    def to_state(self) -> dict[str, Any]:
         """All of it as text, for a checkpoint."""
         steps = np.round(self.cosines * 255.0).astype(np.uint8)
         return {
@@ -130,10 +130,10 @@ class Coverage:
             "stages": base64.b64encode(self.stages.tobytes()).decode("ascii"),
         }
 
-    def recall(self, notes: dict[str, Any]) -> None:
-        """Adds what `as_notes` of an earlier run has kept; notes of another body count nothing."""
+    def merge_state(self, state: dict[str, Any]) -> None:
+        """Adds what `to_state` of an earlier run has kept; notes of another body count nothing."""
         cosines, stages = (
-            np.frombuffer(base64.b64decode(notes[key]), dtype=np.uint8)
+            np.frombuffer(base64.b64decode(state[key]), dtype=np.uint8)
             for key in ("cosines", "stages")
         )
         if len(stages) == len(self.stages) == len(cosines):
@@ -141,7 +141,7 @@ class Coverage:
             np.maximum(self.stages, stages, out=self.stages)
 
 
-def posed(
+def pose_patches(
     patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
 ) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
     """Centres and unit normals of the patches in the world, by linear blend skinning.
@@ -157,6 +157,6 @@ def posed(
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def _share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
+def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
     total = float(areas.sum())
     return float(areas[seen].sum()) / total if total else 0.0

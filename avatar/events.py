@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arrived:
+class FrameArrived:
     """The trainer has been given a frame.
 
     Attributes:
@@ -18,7 +18,7 @@ class Arrived:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Idle:
+class WaitingForFrame:
     """There is nothing to learn from yet; it has been waited for a moment."""
 
 
@@ -31,7 +31,7 @@ class Stepped:
         wall_seconds: Training time so far.
         loss: Mean of its rays.
         samples_per_ray: Mean of its rays.
-        frames_seen: Frames trained on so far.
+        frames_seen: EvaluationFrames trained on so far.
     """
 
     step: int
@@ -42,7 +42,7 @@ class Stepped:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score:
+class HeldOutScore:
     """How well one held-out frame is rendered, on white.
 
     Attributes:
@@ -69,14 +69,14 @@ class Evaluated:
 
     Attributes:
         wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: Frames trained on so far.
+        frames_seen: EvaluationFrames trained on so far.
         scores: One a frame.
     """
 
     wall_seconds: float
     cpu_seconds: float
     frames_seen: int
-    scores: tuple[Score, ...]
+    scores: tuple[HeldOutScore, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,4 +102,4 @@ class Finished:
     samples: int
 
 
-TrainEvent = Arrived | Idle | Stepped | Evaluated | Warned | Finished
+TrainEvent = FrameArrived | WaitingForFrame | Stepped | Evaluated | Warned | Finished

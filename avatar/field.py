@@ -9,12 +9,12 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from avatar.kernels.backend import Backend
-from avatar.levels import FEATURES, HashLevels
+from avatar.levels import FEATURES_PER_LEVEL, HashLevels
 
-HIDDEN = 64
-FIRST_LOG_DENSITY = 0.0
+HIDDEN_WIDTH = 64
+INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
-CHUNK = 1 << 13
+POINTS_PER_CHUNK = 1 << 13
 """Points whose features and hidden numbers a cache still holds when they are read."""
 
 
@@ -25,7 +25,7 @@ class Activations(NamedTuple):
         points: Canonical positions, metres.
         features: Of the hash grid.
         hidden: After the first layer's ReLU.
-        raw: Colour logits and log density (log 1/m).
+        raw: SrgbColor logits and log density (log 1/m).
     """
 
     points: Float32[Tensor, "points 3"]
@@ -35,8 +35,8 @@ class Activations(NamedTuple):
 
 
 @final
-class Field:
-    """Colour and density at canonical points, without view direction (InstantAvatar, §3.1).
+class RadianceField:
+    """SrgbColor and density at canonical points, without view direction (InstantAvatar, §3.1).
 
     One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code.
 
@@ -60,18 +60,18 @@ class Field:
         def normal(rows: int, columns: int, spread: float) -> Tensor:
             return torch.randn(rows, columns, generator=generator) * spread
 
-        table = (torch.rand(levels.entries, FEATURES, generator=generator) * 2.0 - 1.0) * 1e-2
-        first = normal(levels.width, HIDDEN, math.sqrt(2.0 / levels.width))
-        second = normal(HIDDEN, 4, math.sqrt(1.0 / HIDDEN))
-        bias = torch.tensor([0.0, 0.0, 0.0, FIRST_LOG_DENSITY])
+        table = (torch.rand(levels.entries, FEATURES_PER_LEVEL, generator=generator) * 2.0 - 1.0) * 1e-2
+        first = normal(levels.feature_width, HIDDEN_WIDTH, math.sqrt(2.0 / levels.feature_width))
+        second = normal(HIDDEN_WIDTH, 4, math.sqrt(1.0 / HIDDEN_WIDTH))
+        bias = torch.tensor([0.0, 0.0, 0.0, INITIAL_LOG_DENSITY])
         self.table, *self.layers = (
             torch.nn.Parameter(values.to(device))
-            for values in (table, first, torch.zeros(HIDDEN), second, bias)
+            for values in (table, first, torch.zeros(HIDDEN_WIDTH), second, bias)
         )
         for parameter in self.parameters():
             parameter.grad = torch.zeros_like(parameter)
 
-    def copied(self) -> "Field":
+    def clone(self) -> "RadianceField":
         """A field of its own with the same numbers."""
         other = copy.copy(self)
         other.table, *other.layers = (
@@ -103,7 +103,7 @@ class Field:
 
     @torch.no_grad()
     def backward(
-        self, seen: Activations, grad_raw: Float32[Tensor, "points 4"]
+        self, activations: Activations, grad_raw: Float32[Tensor, "points 4"]
     ) -> Float32[Tensor, "points width"]:
         """Writes the gradient of every parameter (the table's is added to what is there).
 
@@ -111,20 +111,20 @@ class Field:
             The gradient of the grid's features.
         """
         first, _, second, _ = self.layers
-        grad_hidden = (grad_raw @ second.T).mul_(seen.hidden.sign())
+        grad_hidden = (grad_raw @ second.T).mul_(activations.hidden.sign())
         grads = (
-            seen.features.T @ grad_hidden, grad_hidden.sum(dim=0),
-            (grad_raw.T @ seen.hidden).T, grad_raw.sum(dim=0),
+            activations.features.T @ grad_hidden, grad_hidden.sum(dim=0),
+            (grad_raw.T @ activations.hidden).T, grad_raw.sum(dim=0),
         )  # fmt: skip
         for parameter, grad in zip(self.layers, grads, strict=True):
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
             parameter.grad.copy_(grad)
         grad_features = grad_hidden @ first.T
-        self.backend.encode_backward(seen.points, grad_features, self.levels, self.table_grad)
+        self.backend.encode_backward(activations.points, grad_features, self.levels, self.table_grad)
         return grad_features
 
     @torch.no_grad()
-    def raw_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
+    def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
         """Raw outputs at any number of canonical points, in chunks."""
-        chunks = [self.forward(chunk).raw for chunk in points.split(CHUNK)]
+        chunks = [self.forward(chunk).raw for chunk in points.split(POINTS_PER_CHUNK)]
         return torch.cat(chunks) if chunks else points.new_empty(0, 4)

@@ -7,36 +7,36 @@ from dataclasses import replace
 
 import torch
 
-from avatar.cells import WarpCells
-from avatar.events import Score
-from avatar.hold import HeldOut, score
-from avatar.pose_prior import guessed
-from avatar.prepare import prepare
-from avatar.refine import PoseTable
-from avatar.replay import Replay
-from avatar.sampling import CanonicalSampler
-from avatar.step import cosine, gradients
-from avatar.trainer import Trainer, let_follow, rebuild_warp
+from avatar.cells import CorrespondenceGrid
+from avatar.events import HeldOutScore
+from avatar.hold import HeldOutFrame, score_frame
+from avatar.pose_prior import interpolate_correction
+from avatar.prepare import prepare_frame
+from avatar.refine import PoseOptimizer
+from avatar.replay import ReplayBuffer
+from avatar.sampling import OccupancySampler
+from avatar.step import cosine_decay, compute_gradients
+from avatar.trainer import Trainer, correct_one_pose, resolve_correspondences
 
-CORRECTIONS = 32
+CORRECTIONS_PER_FRAME = 32
 """Corrections that each frame's pose gets."""
-RAYS_A_CORRECTION = 512
+RAYS_PER_CORRECTION = 512
 
 
 FITTING_SHARE = 0.8
 """Of the time that fitting and scoring take."""
 
 
-def fitted_scores(
-    trainer: Trainer, held: list[HeldOut], *, progress: Callable[[float], None] = lambda _: None
-) -> tuple[Score, ...]:
+def score_with_fitted_poses(
+    trainer: Trainer, frames: list[HeldOutFrame], *, progress: Callable[[float], None] = lambda _: None
+) -> tuple[HeldOutScore, ...]:
     """Scores of held-out frames after their poses have been fitted to them (see `fitted`)."""
-    return tuple(found for _, found in fitted(trainer, held, progress=progress))
+    return tuple(found for _, found in fit_test_poses(trainer, frames, progress=progress))
 
 
-def fitted(
-    trainer: Trainer, held: list[HeldOut], *, progress: Callable[[float], None] = lambda _: None
-) -> Iterator[tuple[HeldOut, Score]]:
+def fit_test_poses(
+    trainer: Trainer, frames: list[HeldOutFrame], *, progress: Callable[[float], None] = lambda _: None
+) -> Iterator[tuple[HeldOutFrame, HeldOutScore]]:
     """Held-out frames in poses that have been fitted to them, each with its score.
 
     The avatar stays as it is: nothing of these frames is learnt but where the body was, from where
@@ -46,45 +46,45 @@ def fitted(
 
     Args:
         trainer: Whose avatar; its field's gradients are overwritten.
-        held: Frames that were never trained on.
+        held: EvaluationFrames that were never trained on.
         progress: Gets the share that is done, from 0 to 1.
     """
-    if not held:
+    if not frames:
         return
     avatar, field = trainer.avatar, trainer.avatar.field
     device = field.table.device
-    replay = Replay(len(held), device)
-    poses = PoseTable(avatar.rig, len(held), device, frozen=True)
-    for frame in held:
-        prepared = prepare(frame.observation, avatar.rig)
-        slot, begin = replay.add(prepared), guessed(prepared.index, trainer.corrections)
-        poses.put(slot, prepared.pose, correction=begin)
+    replay = ReplayBuffer(len(frames), device)
+    poses = PoseOptimizer(avatar.rig, len(frames), device, avatar_frozen=True)
+    for frame in frames:
+        prepared = prepare_frame(frame.observation, avatar.rig)
+        slot, begin = replay.add(prepared), interpolate_correction(prepared.index, trainer.pose_corrections)
+        poses.set_pose(slot, prepared.pose, correction=begin)
         if begin.any():
-            rebuild_warp(avatar.rig, replay, poses, slot)
+            resolve_correspondences(avatar.rig, replay, poses, slot)
     config = dataclasses.replace(
         trainer.config,
-        empty_weight=0.0,
-        solid_weight=0.0,
-        gap_weight=0.0,
-        rays=2 * RAYS_A_CORRECTION,
+        empty_space_weight=0.0,
+        interior_weight=0.0,
+        inner_leg_weight=0.0,
+        rays=2 * RAYS_PER_CORRECTION,
     )
-    sampler = CanonicalSampler(field.backend, avatar.occupancy, config)
+    sampler = OccupancySampler(field.backend, avatar.occupancy, config)
     generator = torch.Generator(device=device).manual_seed(config.seed)
-    steps = math.ceil(CORRECTIONS * len(held) / 2)
+    steps = math.ceil(CORRECTIONS_PER_FRAME * len(frames) / 2)
     for step in range(steps):
-        batch = replay.draw(config.rays, generator)
-        gradients(
-            field, sampler, replay.cells, batch, config,
-            hard_share=1.0, poses=poses, generator=generator,
+        batch = replay.sample_rays(config.rays, generator)
+        compute_gradients(
+            field, sampler, replay.correspondences, batch, config,
+            hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
         field.table_grad.zero_()
         for _ in range(2):
-            let_follow(avatar.rig, trainer.backend, replay, poses, rate=cosine(step / steps))
+            correct_one_pose(avatar.rig, trainer.backend, replay, poses, rate=cosine_decay(step / steps))
         progress(FITTING_SHARE * (step + 1) / steps)
-    for slot, frame in enumerate(held):
+    for slot, frame in enumerate(frames):
         pose = poses.pose(slot)
-        cells = WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
-        moved = HeldOut(observation=replace(frame.observation, pose=pose), cells=cells)
-        either = [(one, score(avatar, one)) for one in (frame, moved)]
-        progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(held))
+        cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
+        moved = HeldOutFrame(observation=replace(frame.observation, pose=pose), correspondences=cells)
+        either = [(one, score_frame(avatar, one)) for one in (frame, moved)]
+        progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
         yield max(either, key=lambda scored: scored[1].psnr)

@@ -1,4 +1,4 @@
-"""Between the legs: where photographs of few poses leave matter that is no part of anybody."""
+"""ResectionResult the legs: where photographs of few poses leave matter that is no part of anybody."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -8,15 +8,15 @@ from avatar.rig import Rig
 
 OFF_SKIN_M = 0.02
 """Nearer to the skin than this clothes lie, and nothing is said about them."""
-FARTHEST_M = 0.3
+MAX_LEG_DISTANCE_M = 0.3
 """A leg that is farther away than this has no say."""
-OPPOSITE = 0.5
+MAX_DIRECTION_COSINE = 0.5
 """Cosine of 60°: a place is between the legs if it sees them farther apart than this."""
-LEFT_LEG, RIGHT_LEG = (1, 3, 5), (2, 4, 6)
+LEFT_LEG_PARTS, RIGHT_LEG_PARTS = (1, 3, 5), (2, 4, 6)
 """Their body parts (`avatar.rig.PARTS`)."""
 
 
-def between_legs(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray, "cells"]:
+def inner_leg_cells(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray, "cells"]:
     """Which occupancy cells lie off the skin between the legs.
 
     Where thighs touch in every photograph, canonical space has them apart, and skinning folds what
@@ -27,18 +27,18 @@ def between_legs(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray
         cells: Flat numbers of cells of `rig.distance`.
     """
     found = np.zeros(len(cells), dtype=bool)
-    away = (rig.distance.reshape(-1)[cells] > OFF_SKIN_M) & ~rig.inside.reshape(-1)[cells]
+    away = (rig.skin_distance.reshape(-1)[cells] > OFF_SKIN_M) & ~rig.inside_skin.reshape(-1)[cells]
     off = np.flatnonzero(away)
-    place = np.stack(np.unravel_index(cells[off], rig.distance.shape), axis=1) + 0.5
-    points = rig.box_low + place * (rig.box_high - rig.box_low) / rig.distance.shape
-    to_left, left_m = _nearest(rig, LEFT_LEG, points)
-    to_right, right_m = _nearest(rig, RIGHT_LEG, points)
-    apart = (to_left * to_right).sum(axis=1) < OPPOSITE
-    found[off] = apart & (np.maximum(left_m, right_m) < FARTHEST_M)
+    place = np.stack(np.unravel_index(cells[off], rig.skin_distance.shape), axis=1) + 0.5
+    points = rig.box_low + place * (rig.box_high - rig.box_low) / rig.skin_distance.shape
+    to_left, left_m = _nearest_leg_seed(rig, LEFT_LEG_PARTS, points)
+    to_right, right_m = _nearest_leg_seed(rig, RIGHT_LEG_PARTS, points)
+    apart = (to_left * to_right).sum(axis=1) < MAX_DIRECTION_COSINE
+    found[off] = apart & (np.maximum(left_m, right_m) < MAX_LEG_DISTANCE_M)
     return found
 
 
-def _nearest(
+def _nearest_leg_seed(
     rig: Rig, parts: tuple[int, ...], points: Float[np.ndarray, "points 3"]
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points"]]:
     """Direction to the nearest seed of some body parts, and how far away it is."""

@@ -1,4 +1,4 @@
-"""Frames beside a checkpoint: what a finished avatar still needs when another video is added.
+"""EvaluationFrames beside a checkpoint: what a finished avatar still needs when another video is added.
 
 Key frames are kept as replay has them: colours in 8 bits, and from where they were seen; rays and
 warps are found again. A few held-out frames come along, so that it can be said what they lost.
@@ -13,38 +13,38 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from avatar.hold import HeldOut, spread
-from avatar.prepare import PreparedFrame, Sight, restored
-from avatar.replay import KeyFrame, Replay
+from avatar.hold import HeldOutFrame, subsample_evenly
+from avatar.prepare import TrainingFrame, RayView, rebuild_frame
+from avatar.replay import ReplayFrame, ReplayBuffer
 from avatar.rig import Rig
-from avatar.save_whole import save_whole
+from avatar.save_whole import save_atomically
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
 
-FORMAT = 1
-FINISHED, EARLIER = "frames.tensors", "earlier.tensors"
+REPLAY_FILE_FORMAT = 1
+LAST_RUN_FILE, EARLIER_VIDEOS_FILE = "frames.tensors", "earlier.tensors"
 """Of the run that ended last; of the runs before the video that is being learnt now."""
-CLIP = 1 << 32
+INDEX_SHIFT_PER_VIDEO = 1 << 32
 """Among the frames of a trainer's memory, those of an earlier video have numbers so much smaller:
 no two share one. Whoever shows a number shows `number_in_video`."""
-HELD_OUT = 12
+MAX_HELD_OUT_KEPT = 12
 """Held-out frames that are kept."""
 
 
 def number_in_video(index: int) -> int:
     """A frame's number in its own video."""
-    return index % CLIP
+    return index % INDEX_SHIFT_PER_VIDEO
 
 
-def videos_ago(index: int) -> int:
+def video_age(index: int) -> int:
     """How many videos were added since a frame's own: 0 for the one that is learnt now."""
-    return -(index // CLIP)
+    return -(index // INDEX_SHIFT_PER_VIDEO)
 
 
-class KeptFrames(NamedTuple):
+class SavedFrames(NamedTuple):
     """What is kept.
 
     Attributes:
@@ -52,15 +52,15 @@ class KeptFrames(NamedTuple):
         held: To score; never trained on.
     """
 
-    key_frames: list[KeyFrame]
-    held: list[HeldOut]
+    replay_frames: list[ReplayFrame]
+    held_out: list[HeldOutFrame]
 
     @classmethod
-    def of(cls, replay: Replay, held: Sequence[HeldOut]) -> "KeptFrames":
+    def of(cls, replay: ReplayBuffer, held_out: Sequence[HeldOutFrame]) -> "SavedFrames":
         """Everything in replay, and a few of the held-out frames, evenly."""
-        return cls(replay.key_frames(), spread(list(held), HELD_OUT))
+        return cls(replay.replay_frames(), subsample_evenly(list(held_out), MAX_HELD_OUT_KEPT))
 
-    def earlier(self) -> "KeptFrames":
+    def as_earlier_video(self) -> "SavedFrames":
         """The same with the numbers of an earlier video's frames."""
         held = [
             replace(
@@ -68,19 +68,19 @@ class KeptFrames(NamedTuple):
                 observation=replace(
                     kept.observation,
                     frame=replace(
-                        kept.observation.frame, index=kept.observation.frame.index - CLIP
+                        kept.observation.frame, index=kept.observation.frame.index - INDEX_SHIFT_PER_VIDEO
                     ),
                 ),
             )
-            for kept in self.held
+            for kept in self.held_out
         ]
-        return KeptFrames(
-            [frame._replace(index=frame.index - CLIP) for frame in self.key_frames], held
+        return SavedFrames(
+            [frame._replace(index=frame.index - INDEX_SHIFT_PER_VIDEO) for frame in self.replay_frames], held
         )
 
-    def prepared(self, rig: Rig) -> list[PreparedFrame]:
+    def training_frames(self, rig: Rig) -> list[TrainingFrame]:
         """The key frames, ready to be learnt from again."""
-        return [restored(*frame, rig) for frame in self.key_frames]
+        return [rebuild_frame(*frame, rig) for frame in self.replay_frames]
 
     def save(self, path: Path) -> None:
         """Writes them, whole or not at all.
@@ -89,50 +89,50 @@ class KeptFrames(NamedTuple):
             OSError: If the disk is full; what was there before stays.
         """
         state = {
-            "format": FORMAT,
-            "key_frames": [_key_frame_state(frame) for frame in self.key_frames],
-            "held": [_observation_state(kept.observation) for kept in self.held],
+            "format": REPLAY_FILE_FORMAT,
+            "key_frames": [_replay_frame_state(frame) for frame in self.replay_frames],
+            "held": [_observation_state(kept.observation) for kept in self.held_out],
         }
-        save_whole(state, path)
+        save_atomically(state, path)
 
     @classmethod
-    def load(cls, path: Path) -> "KeptFrames":
+    def load(cls, path: Path) -> "SavedFrames":
         """Reads them; none if there is no such file.
 
         Raises:
-            BadInput: If it cannot be read.
+            InputError: If it cannot be read.
         """
         if not path.exists():
             return cls([], [])
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
             return cls(
-                [_key_frame(kept) for kept in state["key_frames"]],
-                [HeldOut(observation=_observation(kept)) for kept in state["held"]],
+                [_replay_frame(kept) for kept in state["key_frames"]],
+                [HeldOutFrame(observation=_observation(kept)) for kept in state["held"]],
             )
         except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError,
                 pickle.UnpicklingError) as error:  # fmt: skip
-            raise BadInput(
+            raise InputError(
                 f"The frames {path} cannot be read ({error}). Expected those that ia-ingest wrote; "
                 "without the file the older video is no longer learnt from."
             ) from error
 
 
-def _key_frame_state(frame: KeyFrame) -> dict[str, Any]:
+def _replay_frame_state(frame: ReplayFrame) -> dict[str, Any]:
     return {
         "index": frame.index,
         "colors": torch.from_numpy(frame.colors),
-        "near": torch.from_numpy(frame.sight.near),
-        "camera": _camera_state(frame.sight.camera),
+        "near": torch.from_numpy(frame.view.near_person_bits),
+        "camera": _camera_state(frame.view.camera),
         "pose": _pose_state(frame.pose),
     }
 
 
-def _key_frame(state: dict[str, Any]) -> KeyFrame:
-    return KeyFrame(
+def _replay_frame(state: dict[str, Any]) -> ReplayFrame:
+    return ReplayFrame(
         index=state["index"],
         pose=_pose(state["pose"]),
-        sight=Sight(camera=_camera(state["camera"]), near=state["near"].numpy()),
+        view=RayView(camera=_camera(state["camera"]), near_person_bits=state["near"].numpy()),
         colors=state["colors"].numpy(),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-FEATURES = 4
+FEATURES_PER_LEVEL = 4
 """Features per entry. Fixed: the kernels are compiled for it (16 bytes are one vector)."""
 PRIMES = (1, 2654435761, 805459861)
 """Müller et al. 2022, eq. 4: h(x) = (⊕ x_i π_i) mod T."""
@@ -15,7 +15,7 @@ PRIMES = (1, 2654435761, 805459861)
 class HashLevels:
     """Multi-resolution grid (Müller et al. 2022) over a box that need not be a cube.
 
-    Cells are cubes. A level whose vertices fit into the table is stored densely, others are hashed.
+    SolvedCorrespondences are cubes. A level whose vertices fit into the table is stored densely, others are hashed.
 
     Attributes:
         low: Corner of the box, metres: vertex (0, 0, 0) of every level.
@@ -27,12 +27,12 @@ class HashLevels:
 
     low: Float32[np.ndarray, "3"]
     cells_per_m: Float32[np.ndarray, "levels"]
-    counts: Int32[np.ndarray, "levels 3"]
-    dense: Int32[np.ndarray, "levels"]
+    vertex_counts: Int32[np.ndarray, "levels 3"]
+    is_dense: Int32[np.ndarray, "levels"]
     offsets: Int64[np.ndarray, "levels+1"]
 
     @classmethod
-    def over(
+    def spanning(
         cls,
         low: Float32[np.ndarray, "3"],
         high: Float32[np.ndarray, "3"],
@@ -66,14 +66,14 @@ class HashLevels:
             offsets=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         )
 
-    def no_finer_than(self, cell_m: float) -> "HashLevels":
+    def coarser_than(self, cell_m: float) -> "HashLevels":
         """The levels whose cells are at least so large, metres; the coarsest in any case."""
         kept = max(int((1.0 / self.cells_per_m >= cell_m).sum()), 1)
         return replace(
             self,
             cells_per_m=self.cells_per_m[:kept],
-            counts=self.counts[:kept],
-            dense=self.dense[:kept],
+            vertex_counts=self.vertex_counts[:kept],
+            is_dense=self.is_dense[:kept],
             offsets=self.offsets[: kept + 1],
         )
 
@@ -83,6 +83,6 @@ class HashLevels:
         return int(self.offsets[-1])
 
     @property
-    def width(self) -> int:
+    def feature_width(self) -> int:
         """Features of one point, all levels together."""
-        return len(self.cells_per_m) * FEATURES
+        return len(self.cells_per_m) * FEATURES_PER_LEVEL

@@ -25,15 +25,15 @@ def psnr(
     return float("inf") if mean == 0.0 else -10.0 * float(np.log10(mean))
 
 
-def overlap(
-    shown: Shaped[np.ndarray, "height width"], truth: Shaped[np.ndarray, "height width"]
+def soft_iou(
+    rendered: Shaped[np.ndarray, "height width"], truth: Shaped[np.ndarray, "height width"]
 ) -> float:
     """Intersection over union of two silhouettes, in [0, 1]; 1 if there is none in either.
 
     Of two alphas it is the sum of the smaller over the sum of the larger: low for fog, too.
     """
-    union = float(np.maximum(shown, truth).sum())
-    return float(np.minimum(shown, truth).sum()) / union if union else 1.0
+    union = float(np.maximum(rendered, truth).sum())
+    return float(np.minimum(rendered, truth).sum()) / union if union else 1.0
 
 
 def ssim(

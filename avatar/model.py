@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.field import Field
-from avatar.kernels.backend import Grid
+from avatar.field import RadianceField
+from avatar.kernels.backend import DensityGrid
 from avatar.kernels.reference import activate
-from avatar.occupancy import Occupancy, inside
+from avatar.occupancy import OccupancyGrid, in_occupied_cells
 from avatar.rig import Rig
 
 
@@ -25,20 +25,20 @@ class Avatar:
     """
 
     rig: Rig
-    field: Field
-    occupancy: Occupancy
-    step_m: float
+    field: RadianceField
+    occupancy: OccupancyGrid
+    sample_step_m: float
 
-    def rendering_grid(self) -> Grid:
+    def rendering_grid(self) -> DensityGrid:
         """Where a picture may show anything."""
-        return self.occupancy.for_rendering(self.step_m)
+        return self.occupancy.for_rendering(self.sample_step_m)
 
-    def field_at(
+    def color_and_density_at(
         self, points: Float32[Tensor, "points 3"]
     ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
-        """Colour in [0, 1] and density in 1/m at canonical points; no density in empty cells."""
-        held = inside(self.rendering_grid(), points).nonzero()[:, 0]
-        color, density = activate(self.field.raw_at(points[held].contiguous()))
+        """SrgbColor in [0, 1] and density in 1/m at canonical points; no density in empty cells."""
+        held = in_occupied_cells(self.rendering_grid(), points).nonzero()[:, 0]
+        color, density = activate(self.field.raw_outputs_at(points[held].contiguous()))
         all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])
         all_colors[held], all_densities[held] = color, density
         return all_colors, all_densities

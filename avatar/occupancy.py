@@ -15,31 +15,31 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy.ndimage import label
 from torch import Tensor
 
-from avatar.cells import BAND_M
-from avatar.gaps import between_legs
-from avatar.kernels.backend import Grid
+from avatar.cells import CLOTHING_BAND_M
+from avatar.gaps import inner_leg_cells
+from avatar.kernels.backend import DensityGrid
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.rig import Rig
 
-DECAY = 0.9
+OCCUPANCY_DECAY = 0.9
 """What a cell keeps of its density when a probe finds nothing. At 0.6 thin surfaces vanish."""
-FIRST_DECAY = 0.7
+INITIAL_OCCUPANCY_DECAY = 0.7
 """The same while the first fog clears and half of the band is probed at each update."""
-OPACITY = 0.02
+MIN_STEP_OPACITY = 0.02
 """A cell counts as empty when a step through it would be less opaque than this."""
-FIRST_DENSITY = 1e-3
-FIRM_DENSITY = 20.0
+INITIAL_DENSITY = 1e-3
+SOLID_DENSITY = 20.0
 """What is denser than this, in 1/m, counts as solid when pieces are told apart."""
-SKIN_M = 0.03
+NEAR_SKIN_M = 0.03
 """A piece of the person lies about this close to the skin; what floats does not."""
-SOLID_M = 0.015
-"""Deeper under the body's skin than this everybody is solid, however the body fits."""
-SPECK = 0.003
+INTERIOR_DEPTH_M = 0.015
+"""FurtherLayer under the body's skin than this everybody is solid, however the body fits."""
+MIN_COMPONENT_SHARE = 0.003
 """Pieces with less near the skin than this share of the largest are no part of the person."""
 
 
 @final
-class Occupancy:
+class OccupancyGrid:
     """Where the canonical person may be.
 
     Attributes:
@@ -47,23 +47,23 @@ class Occupancy:
         band: Flat indices of the cells near enough to the skin to hold anything.
     """
 
-    def __init__(self, rig: Rig, device: torch.device, *, band_m: float = BAND_M) -> None:
+    def __init__(self, rig: Rig, device: torch.device, *, band_m: float = CLOTHING_BAND_M) -> None:
         """Everything near the skin counts as occupied until something is known."""
-        band = torch.from_numpy(rig.distance <= band_m).to(device)
-        cells = np.array(rig.distance.shape, dtype=np.float32)
-        self.grid = Grid(
+        band = torch.from_numpy(rig.skin_distance <= band_m).to(device)
+        cells = np.array(rig.skin_distance.shape, dtype=np.float32)
+        self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
-            density=torch.where(band, FIRST_DENSITY, 0.0),
+            density=torch.where(band, INITIAL_DENSITY, 0.0),
             low=torch.from_numpy(rig.box_low).to(device),
             cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
         )
-        self.band: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
+        self.band_cells: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
-        self._solid = torch.from_numpy(rig.inside & (rig.distance > SOLID_M)).to(device)
-        self._solid = self._solid.flatten().nonzero()[:, 0]
-        self._near_skin = rig.distance <= SKIN_M
+        self._interior_cells = torch.from_numpy(rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)).to(device)
+        self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
+        self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._rig = rig
-        self._known_empty: tuple[int, Tensor] | None = None
+        self._cached_empty_cells: tuple[int, Tensor] | None = None
 
     @torch.no_grad()
     def update(
@@ -71,10 +71,10 @@ class Occupancy:
         log_density_at: Callable[[Float32[Tensor, "points 3"]], Float32[Tensor, "points"]],
         *,
         share: float,
-        decay: float = DECAY,
-        thinnest: float = 0.0,
-        drop_specks: bool = False,
-        step_m: float,
+        decay: float = OCCUPANCY_DECAY,
+        min_density: float = 0.0,
+        drop_floaters: bool = False,
+        sample_step_m: float,
         generator: torch.Generator,
     ) -> None:
         """Probes a share of the band once, at a random place in each cell, and re-thresholds.
@@ -83,66 +83,66 @@ class Occupancy:
             log_density_at: Log density at canonical points.
             share: How much of the band is probed, in (0, 1].
             decay: What a probed cell keeps of its density.
-            thinnest: Cells with less density than this, in 1/m, hold nothing, however long the
+            thinnest: SolvedCorrespondences with less density than this, in 1/m, hold nothing, however long the
                 way through them.
-            drop_specks: Whether pieces without contact to the rest are dropped that are small or
+            drop_floaters: Whether pieces without contact to the rest are dropped that are small or
                 float off the skin (the paper's code keeps the largest piece alone; a foot may be
                 a piece of its own).
             step_m: Distance between samples along a ray.
             generator: Chooses cells and places.
         """
-        chosen = self._draw(self.band, int(len(self.band) * share), generator)
-        log_density = log_density_at(self._somewhere_in(chosen, generator))
+        chosen = self._draw_cells(self.band_cells, int(len(self.band_cells) * share), generator)
+        log_density = log_density_at(self._jittered_points(chosen, generator))
         density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
-        flat = self.grid.density.view(-1)
+        flat = self.density_grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
-        dense = (self.grid.density > max(self._bar(step_m), thinnest)).to(torch.uint8)
-        occupied = grown(dense) & self._in_band
-        if drop_specks:
-            occupied &= 1 - specks(self.grid.density > FIRM_DENSITY, self._near_skin)
-        self.grid.occupied.copy_(occupied)
+        dense = (self.density_grid.density > max(self._density_threshold(sample_step_m), min_density)).to(torch.uint8)
+        occupied = dilate(dense) & self._in_band
+        if drop_floaters:
+            occupied &= 1 - find_floaters(self.density_grid.density > SOLID_DENSITY, self._near_skin)
+        self.density_grid.occupied.copy_(occupied)
 
-    def for_rendering(self, step_m: float) -> Grid:
+    def for_rendering(self, sample_step_m: float) -> DensityGrid:
         """The occupancy grown by one more cell, so that pruning leaves no hole in a picture.
 
         Of what is grown those cells stay that are next to one half as dense as an occupied one, a
         step of the paper's 1 % of opacity: a quarter fewer samples, and no farther from the sum
         over all samples, occupied or not, than with every grown cell.
         """
-        hazy = (self.grid.density > 0.5 * self._bar(step_m)).to(torch.uint8)
-        return self.grid._replace(occupied=grown(self.grid.occupied) & grown(hazy))
+        hazy = (self.density_grid.density > 0.5 * self._density_threshold(sample_step_m)).to(torch.uint8)
+        return self.density_grid._replace(occupied=dilate(self.density_grid.occupied) & dilate(hazy))
 
-    def _bar(self, step_m: float) -> float:
+    def _density_threshold(self, step_m: float) -> float:
         """Density from which a cell is occupied: while all is fog, that which is above the mean."""
-        return min(OPACITY / step_m, float(self.grid.density.view(-1)[self.band].mean()))
+        return min(MIN_STEP_OPACITY / step_m, float(self.density_grid.density.view(-1)[self.band_cells].mean()))
 
-    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of cells near the skin that hold nothing, at most `count`."""
-        return self._somewhere_in(self._draw(self._empty(), count, generator), generator)
+        return self._jittered_points(self._draw_cells(self._empty_cells(), count, generator), generator)
 
-    def gap_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+    def sample_inner_leg(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points off the skin between the legs, at most `count`."""
-        return self._somewhere_in(self._draw(self._between, count, generator), generator)
+        return self._jittered_points(self._draw_cells(self._inner_leg_cells, count, generator), generator)
 
-    def solid_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+    def sample_interior(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points deep under the skin, at most `count`."""
-        return self._somewhere_in(self._draw(self._solid, count, generator), generator)
+        return self._jittered_points(self._draw_cells(self._interior_cells, count, generator), generator)
 
     @cached_property
-    def _between(self) -> Int64[Tensor, "cells"]:
-        """Cells of the band between the legs."""
-        between = between_legs(self._rig, self.band.cpu().numpy())
-        return self.band[torch.from_numpy(between).to(self.band.device)]
+    def _inner_leg_cells(self) -> Int64[Tensor, "cells"]:
+        """SolvedCorrespondences of the band between the legs."""
+        between = inner_leg_cells(self._rig, self.band_cells.cpu().numpy())
+        return self.band_cells[torch.from_numpy(between).to(self.band_cells.device)]
 
-    def _empty(self) -> Int64[Tensor, "cells"]:
-        """Cells of the band that hold nothing: looked up when the occupancy has changed."""
-        version = self.grid.occupied._version
-        if self._known_empty is None or self._known_empty[0] != version:
-            cells = self.band[self.grid.occupied.view(-1)[self.band] == 0]
-            self._known_empty = version, cells
-        return self._known_empty[1]
+    def _empty_cells(self) -> Int64[Tensor, "cells"]:
+        """SolvedCorrespondences of the band that hold nothing: looked up when the occupancy has changed."""
+        version = self.density_grid.occupied._version
+        if self._cached_empty_cells is None or self._cached_empty_cells[0] != version:
+            cells = self.band_cells[self.density_grid.occupied.view(-1)[self.band_cells] == 0]
+            self._cached_empty_cells = version, cells
+        return self._cached_empty_cells[1]
 
-    def _draw(
+    def _draw_cells(
         self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
     ) -> Int64[Tensor, "drawn"]:
         count = count if len(cells) else 0
@@ -151,16 +151,16 @@ class Occupancy:
         )
         return cells[drawn.to(cells.device)]
 
-    def _somewhere_in(
+    def _jittered_points(
         self, cells: Int64[Tensor, "cells"], generator: torch.Generator
     ) -> Float32[Tensor, "cells 3"]:
-        _, ny, nz = self.grid.occupied.shape
+        _, ny, nz = self.density_grid.occupied.shape
         corner = torch.stack([cells // (ny * nz), cells // nz % ny, cells % nz], dim=1)
         within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
-        return (corner + within.to(cells.device)) / self.grid.cells_per_m + self.grid.low
+        return (corner + within.to(cells.device)) / self.density_grid.cells_per_m + self.density_grid.low
 
 
-def inside(grid: Grid, points: Float32[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
+def in_occupied_cells(grid: DensityGrid, points: Float32[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
     """Which points lie in occupied cells."""
     shape = torch.tensor(grid.occupied.shape, device=points.device)
     cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
@@ -168,7 +168,7 @@ def inside(grid: Grid, points: Float32[Tensor, "points 3"]) -> Bool[Tensor, "poi
     return ((cell >= 0) & (cell < shape)).all(dim=1) & (grid.occupied[x, y, z] != 0)
 
 
-def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+def dilate(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
     """The cells and their six neighbours."""
     out = occupied.clone()
     for axis in range(3):
@@ -178,25 +178,25 @@ def grown(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
     return out
 
 
-def specks(
-    firm: Bool[Tensor, "x y z"], near_skin: Bool[np.ndarray, "x y z"]
+def find_floaters(
+    solid: Bool[Tensor, "x y z"], near_skin: Bool[np.ndarray, "x y z"]
 ) -> UInt8[Tensor, "x y z"]:
-    """Cells in and about those connected pieces that are no part of the person.
+    """SolvedCorrespondences in and about those connected pieces that are no part of the person.
 
     Args:
         firm: What is solid.
         near_skin: Only such cells count towards a piece's size.
     """
     # scipy has no types, and what pyright guesses of this function is wrong
-    pieces, count = label(firm.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
+    pieces, count = label(solid.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
-        return torch.zeros_like(firm, dtype=torch.uint8)
+        return torch.zeros_like(solid, dtype=torch.uint8)
     sizes = np.bincount(pieces.ravel(), weights=near_skin.ravel())
     sizes[0] = 0.0
-    kept = sizes >= SPECK * sizes.max()
+    kept = sizes >= MIN_COMPONENT_SHARE * sizes.max()
     kept[0] = False
 
     def about(cells: Bool[np.ndarray, "x y z"]) -> UInt8[Tensor, "x y z"]:
-        return grown(grown(torch.from_numpy(cells.astype(np.uint8)).to(firm.device)))
+        return dilate(dilate(torch.from_numpy(cells.astype(np.uint8)).to(solid.device)))
 
     return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))

@@ -11,13 +11,13 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float, Int64
 
-FEWEST_PAIRS = 12
+MIN_NEIGHBOR_PAIRS = 12
 """Fewer neighbours do not tell whether errors hang together."""
-FARTHEST_APART = 6
-"""Frames; neighbours farther apart say nothing."""
-FLICKERING, WANDERING = 0.1, 0.3
+MAX_FRAME_GAP = 6
+"""EvaluationFrames; neighbours farther apart say nothing."""
+MIN_CORRELATION, FULL_CORRELATION = 0.1, 0.3
 """Correlation of neighbours' errors up to which they say nothing, and from which they say all."""
-WORTH = 8.0
+NEIGHBOR_PRECISION = 8.0
 """How much all neighbours together are then believed, in times of the given pose."""
 
 
@@ -33,40 +33,40 @@ class PosePrior(NamedTuple):
     precision: float
 
 
-UNKNOWN = PosePrior(np.zeros((25, 3)), 1.0)
+UNINFORMATIVE_PRIOR = PosePrior(np.zeros((25, 3)), 1.0)
 """Nobody tells anything: the given pose is as likely as it ever is."""
 
 
 @final
-class Neighbours:
+class TemporalPosePrior:
     """What is known of the frames in replay as neighbours of one another."""
 
     def __init__(self, capacity: int) -> None:
         """Nothing yet, of so many slots."""
         self._frames = np.zeros(capacity, dtype=np.int64)
-        self._alone = np.zeros((capacity, 25, 3))
-        self._in_a_row, self._asked = np.zeros((2, capacity), dtype=bool)
+        self._unregularized = np.zeros((capacity, 25, 3))
+        self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
 
-    def put(self, slot: int, frame: int | None) -> None:
+    def set_frame(self, slot: int, frame: int | None) -> None:
         """A slot takes in a frame of this number; None if it has no neighbours."""
-        self._in_a_row[slot], self._asked[slot] = frame is not None, False
+        self._is_sequential[slot], self._has_estimate[slot] = frame is not None, False
         self._frames[slot] = frame or 0
 
-    def tell(self, slot: int, alone: Float[np.ndarray, "25 3"]) -> None:
+    def record_estimate(self, slot: int, unregularized: Float[np.ndarray, "25 3"]) -> None:
         """What a slot's rays alone would correct, in units of its spread."""
-        self._alone[slot], self._asked[slot] = alone, self._in_a_row[slot]
+        self._unregularized[slot], self._has_estimate[slot] = unregularized, self._is_sequential[slot]
 
-    def expected(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
+    def prior_for(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
         """What the others say of a slot's correction."""
-        row, asked = self._in_a_row, self._asked
+        row, asked = self._is_sequential, self._has_estimate
         if not row[slot]:
-            return UNKNOWN
-        alike = correlation(self._frames[asked], self._alone[asked])
-        return expected(int(self._frames[slot]), self._frames[row], corrections[row], alike)
+            return UNINFORMATIVE_PRIOR
+        alike = neighbor_correlation(self._frames[asked], self._unregularized[asked])
+        return prior_from_neighbors(int(self._frames[slot]), self._frames[row], corrections[row], alike)
 
 
-def correlation(
-    frames: Int64[np.ndarray, "asked"], alone: Float[np.ndarray, "asked 25 3"]
+def neighbor_correlation(
+    frames: Int64[np.ndarray, "asked"], estimates: Float[np.ndarray, "asked 25 3"]
 ) -> float:
     """How alike the errors of neighbouring frames are, in [-1, 1]; 0 if too few tell.
 
@@ -76,19 +76,19 @@ def correlation(
     """
     order = np.argsort(frames, kind="stable")
     apart = np.diff(frames[order])
-    near = np.flatnonzero((apart > 0) & (apart <= FARTHEST_APART))
-    if len(near) < FEWEST_PAIRS:
+    near = np.flatnonzero((apart > 0) & (apart <= MAX_FRAME_GAP))
+    if len(near) < MIN_NEIGHBOR_PAIRS:
         return 0.0
-    one, other = alone[order[near]], alone[order[near + 1]]
+    one, other = estimates[order[near]], estimates[order[near + 1]]
     power = 0.5 * float((one**2).sum() + (other**2).sum())
     return float((one * other).sum()) / max(power, 1e-12)
 
 
-def expected(
+def prior_from_neighbors(
     frame: int,
     frames: Int64[np.ndarray, "others"],
     corrections: Float[np.ndarray, "others 25 3"],
-    alike: float,
+    error_correlation: float,
 ) -> PosePrior:
     """What frames around a frame say of its correction: their mean, the nearest counting most.
 
@@ -98,18 +98,18 @@ def expected(
         corrections: Of the others' poses.
         alike: Correlation of neighbouring frames' errors.
     """
-    share = min(max((alike - FLICKERING) / (WANDERING - FLICKERING), 0.0), 1.0)
+    share = min(max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0)
     apart = np.abs(frames - frame)
-    near = (apart > 0) & (apart <= FARTHEST_APART)
+    near = (apart > 0) & (apart <= MAX_FRAME_GAP)
     if share == 0.0 or not near.any():
-        return UNKNOWN
+        return UNINFORMATIVE_PRIOR
     weights = 1.0 / apart[near]
     mean = np.einsum("s,sja->ja", weights / weights.sum(), corrections[near])
-    worth = share * WORTH
+    worth = share * NEIGHBOR_PRECISION
     return PosePrior(worth / (1.0 + worth) * mean, 1.0 + worth)
 
 
-def guessed(
+def interpolate_correction(
     frame: int, corrections: Mapping[int, Float[np.ndarray, "25 3"]]
 ) -> Float[np.ndarray, "25 3"]:
     """The correction of a frame that was never learnt from, by those of its neighbours.
@@ -119,6 +119,6 @@ def guessed(
         corrections: Of frames' poses, by their numbers.
     """
     if not corrections:
-        return UNKNOWN.mean
+        return UNINFORMATIVE_PRIOR.mean
     frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
-    return expected(frame, frames, found, correlation(frames, found)).mean
+    return prior_from_neighbors(frame, frames, found, neighbor_correlation(frames, found)).mean

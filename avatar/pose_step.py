@@ -10,24 +10,24 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32
 
-from avatar.pose_prior import UNKNOWN, PosePrior
+from avatar.pose_prior import UNINFORMATIVE_PRIOR, PosePrior
 
-SPREAD_RAD = 0.05
+PRIOR_SIGMA_RAD = 0.05
 """How far a tracker's rotations are off, give or take: what no picture determines stays there."""
-SPREAD_M = 0.025
+PRIOR_SIGMA_M = 0.025
 """The same of the root's place, metres."""
-OVERSTEP = 1.6
+OVERRELAXATION = 1.6
 """Steps longer than Gauss-Newton's: the field that a pose is compared with follows the pose."""
-CHANCE, CERTAIN = 1.5, 2.0
+MIN_EVIDENCE, FULL_EVIDENCE = 1.5, 2.0
 """Evidence, the frame's and all frames' halves, up to which a pose stays, and from which it moves
 wholly. Of exact poses 5 % show 1.8, and all together 1.2; poses off by 2° show 3 to 6."""
-LEAST_LOSS = 1e-3
+MIN_RAY_LOSS = 1e-3
 """Of a ray: an error of 0.014 in one channel. What is smaller counts no more than this."""
-LONGEST = 0.1
+MAX_STEP = 0.1
 """No number changes by more at once, in radians or metres."""
 
 
-class PoseStep(NamedTuple):
+class GaussNewtonStep(NamedTuple):
     """What a frame's rays ask its pose to do.
 
     Attributes:
@@ -39,18 +39,18 @@ class PoseStep(NamedTuple):
 
     change: Float[np.ndarray, "25 3"]
     evidence: float
-    alone: Float[np.ndarray, "25 3"]
+    unregularized: Float[np.ndarray, "25 3"]
 
 
-def pose_step(
+def gauss_newton_step(
     gradients: Float32[np.ndarray, "rays 25 3"],
     loss: Float32[np.ndarray, "rays"],
     correction: Float[np.ndarray, "25 3"],
-    common: float,
+    shared_evidence: float,
     *,
-    prior: PosePrior = UNKNOWN,
-    overstep: float = OVERSTEP,
-) -> PoseStep:
+    prior: PosePrior = UNINFORMATIVE_PRIOR,
+    overrelaxation: float = OVERRELAXATION,
+) -> GaussNewtonStep:
     """The step that brings a pose to where its rays fit, as far as they determine it.
 
     Args:
@@ -62,10 +62,10 @@ def pose_step(
         prior: What is believed of the correction before these rays are asked.
         overstep: Length of the step, in Gauss-Newton's.
     """
-    scale = np.full((25, 3), SPREAD_RAD, dtype=np.float32)
-    scale[24] = SPREAD_M
+    scale = np.full((25, 3), PRIOR_SIGMA_RAD, dtype=np.float32)
+    scale[24] = PRIOR_SIGMA_M
     scaled = (gradients * scale).reshape(-1, 75)
-    curvature = (scaled / (2.0 * (loss.clip(min=0.0) + LEAST_LOSS))[:, None]).T @ scaled
+    curvature = (scaled / (2.0 * (loss.clip(min=0.0) + MIN_RAY_LOSS))[:, None]).T @ scaled
     determined, axes = np.linalg.eigh(curvature)
     determined = determined.clip(min=0.0)
     along = scaled @ axes
@@ -74,7 +74,7 @@ def pose_step(
     given = chance.sum() / (determined.sum() + 1e-12) + 1e-12
     told = determined > given
     evidence = float(np.mean(wish[told] ** 2 / (chance[told] + 1e-12))) if told.any() else 0.0
-    share = min(max((0.5 * (evidence + common) - CHANCE) / (CERTAIN - CHANCE), 0.0), 1.0)
+    share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / (FULL_EVIDENCE - MIN_EVIDENCE), 0.0), 1.0)
 
     def asked(length: float, believed: PosePrior) -> Float[np.ndarray, "25 3"]:
         stiff = believed.precision * given
@@ -82,6 +82,6 @@ def pose_step(
         found = axes @ ((length * wish + back) / (determined + stiff))
         return found.reshape(25, 3).astype(np.float64)
 
-    change = -share * scale * asked(overstep, prior)
-    shortened = LONGEST / max(float(np.abs(change).max()), LONGEST)
-    return PoseStep(shortened * change, evidence, correction / scale - asked(1.0, UNKNOWN))
+    change = -share * scale * asked(overrelaxation, prior)
+    shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
+    return GaussNewtonStep(shortened * change, evidence, correction / scale - asked(1.0, UNINFORMATIVE_PRIOR))

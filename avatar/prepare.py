@@ -8,20 +8,20 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.rig import Rig
 from capture.camera import Camera
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
 
-NEAR = 0.035
+NEAR_MASK_SHARE = 0.035
 """Pixels this close to the mask, as a share of the picture's height, are trained on most."""
-FAR = 0.04
+BOX_MARGIN_SHARE = 0.04
 """How far beyond them, as a share of the picture's height, the rest of the pixels reach."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BodyRays:
+class BodyFrameRays:
     """Rays of one camera in the body frame of one pose.
 
     Attributes:
@@ -38,16 +38,16 @@ class BodyRays:
         pixels: Float[np.ndarray, "rays 2"],
         camera: Camera,
         world_from_body: Float[np.ndarray, "4 4"],
-    ) -> "BodyRays":
+    ) -> "BodyFrameRays":
         """Rays through points of the picture; the root's motion is taken out of the camera."""
         rotation, translation = world_from_body[:3, :3], world_from_body[:3, 3]
         return cls(
             origin=((camera.center_world - translation) @ rotation).astype(np.float32),
-            directions=(camera.directions(pixels) @ rotation).astype(np.float32),
+            directions=(camera.ray_directions(pixels) @ rotation).astype(np.float32),
         )
 
 
-class Sight(NamedTuple):
+class RayView(NamedTuple):
     """From where, and through which pixels, a frame is learnt from.
 
     Attributes:
@@ -56,11 +56,11 @@ class Sight(NamedTuple):
     """
 
     camera: Camera
-    near: UInt8[np.ndarray, "bytes"]
+    near_person_bits: UInt8[np.ndarray, "bytes"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PreparedFrame:
+class TrainingFrame:
     """What replay keeps of an observation.
 
     Attributes:
@@ -77,49 +77,49 @@ class PreparedFrame:
 
     index: int
     pose: BodyPose
-    cells: WarpCells
+    correspondences: CorrespondenceGrid
     origin: Float32[np.ndarray, "3"]
     directions: Float32[np.ndarray, "pixels 3"]
     colors: UInt8[np.ndarray, "pixels 4"]
-    near: int
-    sight: Sight | None = None
+    near_count: int
+    view: RayView | None = None
 
 
-def prepare(observation: Observation, rig: Rig) -> PreparedFrame:
+def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
     """Solves the frame's warp and picks the pixels worth training on."""
-    mask = _near(observation.alpha)
-    chosen = np.concatenate(_split(mask))
-    sight = Sight(camera=observation.camera, near=np.packbits(mask))
-    colors = _premultiplied(observation, chosen)
-    return restored(observation.frame.index, observation.pose, sight, colors, rig)
+    mask = _near_person_mask(observation.alpha)
+    chosen = np.concatenate(_split_pixels(mask))
+    sight = RayView(camera=observation.camera, near_person_bits=np.packbits(mask))
+    colors = _premultiplied_rgba(observation, chosen)
+    return rebuild_frame(observation.frame.index, observation.pose, sight, colors, rig)
 
 
-def restored(
-    index: int, pose: BodyPose, sight: Sight, colors: UInt8[np.ndarray, "pixels 4"], rig: Rig
-) -> PreparedFrame:
+def rebuild_frame(
+    index: int, pose: BodyPose, view: RayView, colors: UInt8[np.ndarray, "pixels 4"], rig: Rig
+) -> TrainingFrame:
     """Makes a frame ready from what is kept of it: finds its rays, and solves its warp."""
-    camera = sight.camera
+    camera = view.camera
     width, height = camera.size_px
-    mask = np.unpackbits(sight.near, count=width * height).reshape(height, width).astype(bool)
-    near, far = _split(mask)
+    mask = np.unpackbits(view.near_person_bits, count=width * height).reshape(height, width).astype(bool)
+    near, far = _split_pixels(mask)
     world_from_body = rig.world_from_body(pose)
     camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
-    sights = _sights(camera.focal_px, camera.center_px, camera.size_px, camera.distortion)
+    sights = _camera_directions(camera.focal_px, camera.center_px, camera.size_px, camera.distortion)
     origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
-    return PreparedFrame(
+    return TrainingFrame(
         index=index,
         pose=pose,
-        cells=WarpCells.of(rig, pose.joint_rotations),
+        correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
         origin=origin.astype(np.float32),
         directions=sights[np.concatenate([near, far])] @ camera_from_body.astype(np.float32),
         colors=colors,
-        near=len(near),
-        sight=sight,
+        near_count=len(near),
+        view=view,
     )
 
 
 @lru_cache(maxsize=2)
-def _sights(
+def _camera_directions(
     focal_px: tuple[float, float],
     center_px: tuple[float, float],
     size_px: tuple[int, int],
@@ -130,13 +130,13 @@ def _sights(
         focal_px=focal_px, center_px=center_px, size_px=size_px, distortion=distortion,
         camera_from_world=np.eye(4),
     )  # fmt: skip
-    return camera.directions(camera.pixel_centers().reshape(-1, 2)).astype(np.float32)
+    return camera.ray_directions(camera.pixel_centers().reshape(-1, 2)).astype(np.float32)
 
 
-def _premultiplied(
+def _premultiplied_rgba(
     observation: Observation, chosen: Int[np.ndarray, "pixels"]
 ) -> UInt8[np.ndarray, "pixels 4"]:
-    """Colour times alpha, and alpha, of some pixels, in 8 bits."""
+    """SrgbColor times alpha, and alpha, of some pixels, in 8 bits."""
     alpha = observation.alpha.reshape(-1, 1)[chosen]
     premultiplied = np.empty((len(chosen), 4), dtype=np.float32)
     np.multiply(observation.frame.rgb.reshape(-1, 3)[chosen], alpha, out=premultiplied[:, :3])
@@ -144,18 +144,18 @@ def _premultiplied(
     return np.rint(premultiplied, out=premultiplied).astype(np.uint8)
 
 
-def _near(alpha: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def _near_person_mask(alpha: Float32[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """The pixels near the person."""
-    kernel = np.ones((max(5, int(NEAR * len(alpha)) | 1),) * 2, dtype=np.uint8)
+    kernel = np.ones((max(5, int(NEAR_MASK_SHARE * len(alpha)) | 1),) * 2, dtype=np.uint8)
     return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
 
 
-def _split(
+def _split_pixels(
     near: Bool[np.ndarray, "height width"],
 ) -> tuple[Int[np.ndarray, "near"], Int[np.ndarray, "far"]]:
     """Flat indices of the pixels near the person, and of the others in a box around them."""
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    margin = int(FAR * len(near))
+    margin = int(BOX_MARGIN_SHARE * len(near))
     box = np.zeros_like(near)
     box[
         max(0, rows[0] - margin) : rows[-1] + margin + 1,

@@ -17,49 +17,49 @@ from jaxtyping import Float, Float32, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from avatar.kernels.backend import Skin
-from avatar.pose_prior import Neighbours
-from avatar.pose_step import CHANCE, OVERSTEP, pose_step
+from avatar.kernels.backend import SkinningVolume
+from avatar.pose_prior import TemporalPosePrior
+from avatar.pose_step import MIN_EVIDENCE, OVERRELAXATION, gauss_newton_step
 from avatar.replay import RootCorrection
 from avatar.rig import Rig
 from preprocess.kinematics import body_from_rest, rotation_matrices
 from preprocess.pose import BodyPose
 
-ROWS = 512
+MAX_RAYS_PER_FRAME = 512
 """Rays of a frame that are kept until its pose is corrected."""
-ENOUGH_RAYS = 256
+MIN_RAYS_PER_CORRECTION = 256
 """A frame's pose is corrected when this many of its rays have been seen since it last was."""
-PULLING_M = 0.025
+MIN_POSE_GRADIENT_CELL_M = 0.025
 """Only levels of the grid with cells as large as this pull at poses: finer ones say where to go
 from a few millimetres away, and point anywhere from farther off."""
-MEMORY = 0.95
+EVIDENCE_EMA_DECAY = 0.95
 """Of the mean evidence, and of the share of corrections that moved a pose."""
-SELDOM = 8
+MAX_CORRECTION_INTERVAL = 8
 """Steps from one pull to the next where poses are exact."""
-FOLLOWED_M = 0.04
+MAX_JOINT_STEP_M = 0.04
 """No joint moves farther at one correction: the frame's warp must be able to follow."""
-STRAYED_M = 0.08
+RESOLVE_DISTANCE_M = 0.08
 """When a joint has moved this far since the frame's warp was solved, it is solved anew."""
-MEAN_PULL = 0.2
+MEAN_CORRECTION_DECAY = 0.2
 """Share of the mean correction taken out of a frame's at each of its corrections."""
-BEGUN_AFTER_STEPS = 60
+FIRST_CORRECTION_STEPS = 60
 """A frame's pose is corrected once its frame has been learnt from for so many steps: before, the
 field does not know what is seen from there, and what is new looks like what is off."""
-JUDGED_AFTER_STEPS, JUDGED_BY = 300, 3
+MIN_STEPS_BEFORE_FREEZE, MIN_ESTIMATES_BEFORE_FREEZE = 300, 3
 """A pose is judged once its frame has been learnt from for so many steps, by so many pulls."""
-EXACT = 1.3
+MAX_EXACT_EVIDENCE = 1.3
 """Mean evidence, the frame's and all frames' halves, below which a pose counts as exact and stays
 as it is for good. Were it asked for ever, chance would move it, what it moves would blur the field,
 and a blurred field moves the next: at 540 px that ran away after three thousand steps."""
-SETTLED_AFTER_STEPS = 3000
+FREEZE_AFTER_STEPS = 3000
 """Steps after which any pose stays as it is: what the field shows of it by then is as much its own
 memory of that pose as evidence."""
-FARTHEST = 0.35
+MAX_CORRECTION = 0.35
 """A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
 
 
 @final
-class PoseTable:
+class PoseOptimizer:
     """The poses of the frames in replay, each with its correction.
 
     A correction is 75 numbers: axis-angles of the root and of 23 joints, applied in each one's own
@@ -71,7 +71,7 @@ class PoseTable:
     """
 
     def __init__(
-        self, rig: Rig, capacity: int, device: torch.device, *, frozen: bool = False
+        self, rig: Rig, capacity: int, device: torch.device, *, avatar_frozen: bool = False
     ) -> None:
         """A table without poses.
 
@@ -84,33 +84,33 @@ class PoseTable:
                 share is no change of the canonical body.
         """
         self.rig = rig
-        self._mean_pull, self._overstep = (0.0, 1.0) if frozen else (MEAN_PULL, OVERSTEP)
+        self._mean_decay, self._overrelaxation = (0.0, 1.0) if avatar_frozen else (MEAN_CORRECTION_DECAY, OVERRELAXATION)
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
-        self.skin = Skin(
+        self.skinning = SkinningVolume(
             torch.from_numpy(rig.weights).to(device),
             torch.from_numpy(rig.box_low).to(device),
             torch.from_numpy(nodes / (rig.box_high - rig.box_low)).to(device),
         )
-        self._pulls = torch.zeros(capacity, ROWS, 24, 6, device=device)
-        self._losses = torch.zeros(capacity, ROWS, device=device)
-        self._rays = torch.zeros(capacity, dtype=torch.int64, device=device)
-        self._given: list[BodyPose | None] = [None] * capacity
-        self._posed = np.zeros((capacity, 24, 4, 4))
-        self._solved_at = np.zeros((capacity, 24, 3))
+        self._wrenches = torch.zeros(capacity, MAX_RAYS_PER_FRAME, 24, 6, device=device)
+        self._losses = torch.zeros(capacity, MAX_RAYS_PER_FRAME, device=device)
+        self._ray_counts = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._tracker_poses: list[BodyPose | None] = [None] * capacity
+        self._joint_transforms = np.zeros((capacity, 24, 4, 4))
+        self._joints_at_solve = np.zeros((capacity, 24, 3))
         self._rest_from_canonical = np.linalg.inv(
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
-        self._below = _subtrees(rig)
-        self._moving, self._evidence = 1.0, math.inf if frozen else CHANCE
-        self._since = np.zeros(capacity, dtype=np.int64)
-        self._judged, self._settled = np.zeros((2, capacity), dtype=bool)
-        self._asked, self._told = np.zeros((2, capacity))
-        self._neighbours = Neighbours(capacity)
-        self._open = torch.ones(capacity, dtype=torch.bool, device=device)
+        self._descendants = _descendant_matrix(rig)
+        self._moved_share, self._evidence = 1.0, math.inf if avatar_frozen else MIN_EVIDENCE
+        self._added_at_step = np.zeros(capacity, dtype=np.int64)
+        self._can_freeze, self._is_frozen = np.zeros((2, capacity), dtype=bool)
+        self._estimate_count, self._evidence_sum = np.zeros((2, capacity))
+        self._temporal_prior = TemporalPosePrior(capacity)
+        self._is_correctable = torch.ones(capacity, dtype=torch.bool, device=device)
 
-    def put(
+    def set_pose(
         self,
         slot: int,
         pose: BodyPose,
@@ -128,22 +128,22 @@ class PoseTable:
             frame: Its number: poses of frames in a row err alike. None if nothing is in a row.
             step: Since when it is learnt from.
         """
-        self._given[slot] = pose
-        self._since[slot] = step
-        self._open[slot] = True
-        self._settled[slot] = False
-        self._neighbours.put(slot, frame)
-        self._asked[slot] = self._told[slot] = 0.0
+        self._tracker_poses[slot] = pose
+        self._added_at_step[slot] = step
+        self._is_correctable[slot] = True
+        self._is_frozen[slot] = False
+        self._temporal_prior.set_frame(slot, frame)
+        self._estimate_count[slot] = self._evidence_sum[slot] = 0.0
         self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
-        self._rays[slot] = 0
-        self._move(slot)
-        self._solved_at[slot] = self._joint_places(slot)
+        self._ray_counts[slot] = 0
+        self._update_bones(slot)
+        self._joints_at_solve[slot] = self._joint_positions(slot)
 
     def pose(self, slot: int) -> BodyPose:
         """The corrected pose."""
-        given = self._given[slot]
+        given = self._tracker_poses[slot]
         assert given is not None
         turn, *joints = self.corrections[slot, :24]
         shift = self.corrections[slot, 24]
@@ -158,39 +158,39 @@ class PoseTable:
             ).as_rotvec(),
         )
 
-    def settle(self, step: int) -> bool:
+    def freeze_converged(self, step: int) -> bool:
         """Which poses may be corrected now; whether there are any.
 
         Those whose frames are new wait; those that proved exact, or were refined long enough, stay
         as they are for good.
         """
-        held = np.array([pose is not None for pose in self._given])
-        age = step - self._since
-        self._judged = age >= JUDGED_AFTER_STEPS
-        told = self._told / self._asked.clip(min=1)
-        exact = (self._asked >= JUDGED_BY) & (0.5 * (told + self._evidence) < EXACT)
-        self._settled |= exact | (age >= SETTLED_AFTER_STEPS)
-        open_now = held & ~self._settled & (age >= BEGUN_AFTER_STEPS)
-        self._open.copy_(torch.from_numpy(open_now))
-        self._rays *= self._open
+        held = np.array([pose is not None for pose in self._tracker_poses])
+        age = step - self._added_at_step
+        self._can_freeze = age >= MIN_STEPS_BEFORE_FREEZE
+        told = self._evidence_sum / self._estimate_count.clip(min=1)
+        exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (0.5 * (told + self._evidence) < MAX_EXACT_EVIDENCE)
+        self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
+        open_now = held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
+        self._is_correctable.copy_(torch.from_numpy(open_now))
+        self._ray_counts *= self._is_correctable
         return bool(open_now.any())
 
-    def feel(
+    def accumulate(
         self,
         slots: Int64[Tensor, "rays"],
         wrenches: Float32[Tensor, "rays 24 6"],
         loss: Float32[Tensor, "rays"],
     ) -> None:
         """Keeps what a step's rays exert on their frames' bones; slots ascend."""
-        counts = torch.bincount(slots, minlength=len(self._rays))
+        counts = torch.bincount(slots, minlength=len(self._ray_counts))
         rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
-        place = self._rays[slots] + rank
-        kept = (place < ROWS) & self._open[slots]
-        self._pulls[slots[kept], place[kept]] = wrenches[kept]
+        place = self._ray_counts[slots] + rank
+        kept = (place < MAX_RAYS_PER_FRAME) & self._is_correctable[slots]
+        self._wrenches[slots[kept], place[kept]] = wrenches[kept]
         self._losses[slots[kept], place[kept]] = loss[kept]
-        self._rays = (self._rays + counts * self._open).clamp(max=ROWS)
+        self._ray_counts = (self._ray_counts + counts * self._is_correctable).clamp(max=MAX_RAYS_PER_FRAME)
 
-    def correct_one(self, *, rate: float) -> int | None:
+    def correct_next(self, *, rate: float) -> int | None:
         """Corrects the pose about which most has been found out; cells and rays must follow.
 
         Args:
@@ -199,99 +199,99 @@ class PoseTable:
         Returns:
             The slot, or None if no frame has seen enough rays or the pose stays as it is.
         """
-        slot = int(self._rays.argmax())
-        rows = int(self._rays[slot])
-        if rows < ENOUGH_RAYS:
+        slot = int(self._ray_counts.argmax())
+        rows = int(self._ray_counts[slot])
+        if rows < MIN_RAYS_PER_CORRECTION:
             return None
         loss = self._losses[slot, :rows].cpu().numpy()
-        step = pose_step(
-            self.gradients(slot), loss, self.corrections[slot], self._evidence,
-            prior=self._neighbours.expected(slot, self.corrections), overstep=self._overstep,
+        step = gauss_newton_step(
+            self.pose_gradients(slot), loss, self.corrections[slot], self._evidence,
+            prior=self._temporal_prior.prior_for(slot, self.corrections), overrelaxation=self._overrelaxation,
         )  # fmt: skip
-        self._rays[slot] = 0
-        self._neighbours.tell(slot, step.alone)
-        self._evidence = MEMORY * self._evidence + (1.0 - MEMORY) * step.evidence
-        if self._judged[slot]:
-            self._asked[slot] += 1.0
-            self._told[slot] += step.evidence
+        self._ray_counts[slot] = 0
+        self._temporal_prior.record_estimate(slot, step.unregularized)
+        self._evidence = EVIDENCE_EMA_DECAY * self._evidence + (1.0 - EVIDENCE_EMA_DECAY) * step.evidence
+        if self._can_freeze[slot]:
+            self._estimate_count[slot] += 1.0
+            self._evidence_sum[slot] += step.evidence
         moves = bool(step.change.any())
-        self._moving += (1.0 - MEMORY) * (moves - self._moving)
+        self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
         if not moves:
             return None
-        held = [i for i, pose in enumerate(self._given) if pose is not None]
+        held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
         mean = self.corrections[held].mean(axis=0)
-        moved = self.corrections[slot] + rate * step.change - self._mean_pull * mean
-        self._correct(slot, np.clip(moved, -FARTHEST, FARTHEST))
+        moved = self.corrections[slot] + rate * step.change - self._mean_decay * mean
+        self._apply_correction(slot, np.clip(moved, -MAX_CORRECTION, MAX_CORRECTION))
         return slot
 
     @property
-    def every(self) -> int:
+    def correction_interval(self) -> int:
         """Steps from one pull at poses to the next, 1 to 8: more where poses prove to be exact."""
-        return min(max(round(0.5 / max(self._moving, 1e-3)), 1), SELDOM)
+        return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
 
-    def strayed(self, slot: int) -> bool:
+    def needs_resolve(self, slot: int) -> bool:
         """Whether the slot's pose has left the one for which its warp was last solved.
 
         Saying so counts as solving it anew.
         """
-        places = self._joint_places(slot)
-        moved = np.linalg.norm(places - self._solved_at[slot], axis=1).max()
-        if moved > STRAYED_M:
-            self._solved_at[slot] = places
-        return bool(moved > STRAYED_M)
+        places = self._joint_positions(slot)
+        moved = np.linalg.norm(places - self._joints_at_solve[slot], axis=1).max()
+        if moved > RESOLVE_DISTANCE_M:
+            self._joints_at_solve[slot] = places
+        return bool(moved > RESOLVE_DISTANCE_M)
 
-    def root(self, slot: int) -> RootCorrection:
+    def root_correction(self, slot: int) -> RootCorrection:
         """How the slot's rays move."""
         turn, shift = self.corrections[slot, 0], self.corrections[slot, 24]
         return RootCorrection(
             rotation=rotation_matrices(turn), shift=shift, pivot=self.rig.rest_joints[0]
         )
 
-    def gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
+    def pose_gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
         """Gradient of each kept ray's loss for the slot's correction, from its bones' wrenches.
 
         A joint that turns by ω about its place c carries every bone below it:
         dL/dω = -Σ (M - c × F), in the axes of the body frame; here it is expressed in those of the
         joint, where the corrections live.
         """
-        wrench = self._pulls[slot, : int(self._rays[slot])].cpu().numpy()
+        wrench = self._wrenches[slot, : int(self._ray_counts[slot])].cpu().numpy()
         felt = np.zeros((25, 3, 24, 6))
-        across = np.cross(np.eye(3), self._joint_places(slot)[:, None])  # c × F = across @ F
-        turned = self._posed[slot, :, :3, :3].swapaxes(1, 2)
+        across = np.cross(np.eye(3), self._joint_positions(slot)[:, None])  # c × F = across @ F
+        turned = self._joint_transforms[slot, :, :3, :3].swapaxes(1, 2)
         carried = np.concatenate([turned @ across, -turned], axis=2)
-        felt[:24] = self._below[:, None, :, None] * carried[:, :, None]
+        felt[:24] = self._descendants[:, None, :, None] * carried[:, :, None]
         # the shift lives in the given body frame, the force in the corrected one
         felt[24, :, :, :3] = -rotation_matrices(self.corrections[slot, 0])[:, None]
         flat = felt.reshape(75, 144).astype(np.float32)
         return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
 
-    def _correct(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
+    def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
         """Moves a pose to its new correction, or as far towards it as its cells can follow."""
-        before, places = self.corrections[slot].copy(), self._joint_places(slot)
+        before, places = self.corrections[slot].copy(), self._joint_positions(slot)
         self.corrections[slot] = correction
-        self._move(slot)
-        moved = float(np.linalg.norm(self._joint_places(slot) - places, axis=1).max())
-        if moved > FOLLOWED_M:
-            self.corrections[slot] = before + FOLLOWED_M / moved * (correction - before)
-            self._move(slot)
+        self._update_bones(slot)
+        moved = float(np.linalg.norm(self._joint_positions(slot) - places, axis=1).max())
+        if moved > MAX_JOINT_STEP_M:
+            self.corrections[slot] = before + MAX_JOINT_STEP_M / moved * (correction - before)
+            self._update_bones(slot)
 
-    def _joint_places(self, slot: int) -> Float[np.ndarray, "24 3"]:
+    def _joint_positions(self, slot: int) -> Float[np.ndarray, "24 3"]:
         """Where the joints are, body frame, metres."""
-        posed = self._posed[slot]
+        posed = self._joint_transforms[slot]
         turned = np.einsum("jab,jb->ja", posed[:, :3, :3], self.rig.rest_joints)
         return turned + posed[:, :3, 3]
 
-    def _move(self, slot: int) -> None:
+    def _update_bones(self, slot: int) -> None:
         """Lets the slot's joints and bones follow its correction."""
         rig = self.rig
-        self._posed[slot] = body_from_rest(
+        self._joint_transforms[slot] = body_from_rest(
             rig.rest_joints, rig.parents, self.pose(slot).joint_rotations
         )
-        bones = (self._posed[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
+        bones = (self._joint_transforms[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
         self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)
 
 
-def _subtrees(rig: Rig) -> Float[np.ndarray, "24 24"]:
+def _descendant_matrix(rig: Rig) -> Float[np.ndarray, "24 24"]:
     """1 where a joint (row) moves a bone (column)."""
     below = np.eye(24)
     for bone in range(24):

@@ -14,22 +14,22 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from avatar.cells import WarpCells
-from avatar.field import Field
-from avatar.kernels.backend import CellTables, Grid, Marching, Rays, Samples
+from avatar.cells import CorrespondenceGrid
+from avatar.field import RadianceField
+from avatar.kernels.backend import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch, RaySamples
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
-from avatar.prepare import BodyRays
-from avatar.skip import pruned, window
-from avatar.strays import Strays
+from avatar.prepare import BodyFrameRays
+from avatar.skip import cull_cells, screen_bounds
+from avatar.strays import CorrespondenceCheck
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
-RAYS_AT_ONCE = 1 << 15
-SAMPLES_AT_ONCE = 1 << 15
-FEWEST, MOST = 4, 8
-"""Samples of a ray that are asked for together: more of them, the fewer rays are left."""
-UNSEEN = 5e-6
+RAYS_PER_CHUNK = 1 << 15
+SAMPLES_PER_CHUNK = 1 << 15
+MIN_SAMPLES_PER_PASS, MAX_SAMPLES_PER_PASS = 4, 8
+"""RaySamples of a ray that are asked for together: more of them, the fewer rays are left."""
+MIN_TRANSMITTANCE = 5e-6
 """Share of the light that may be left where a ray ends: no colour is farther off than this."""
 EMPTY_LOG_DENSITY = -30.0
 
@@ -40,12 +40,12 @@ def render(
     pose: BodyPose,
     camera: Camera,
     *,
-    cells: WarpCells | None = None,
-    samples_along: Callable[[Rays, CellTables], Samples] | None = None,
+    cells: CorrespondenceGrid | None = None,
+    sample_rays: Callable[[RayBatch, CorrespondenceTables], RaySamples] | None = None,
 ) -> Float32[np.ndarray, "height width 4"]:
     """Premultiplied RGBA in [0, 1] of the avatar in one pose, seen by one camera.
 
-    It is within `UNSEEN`, and what single precision rounds off, of the sum over all lattice samples
+    It is within `MIN_TRANSMITTANCE`, and what single precision rounds off, of the sum over all lattice samples
     in `avatar.rendering_grid()` that are on their rays (`avatar.strays`).
 
     Args:
@@ -57,47 +57,47 @@ def render(
             (`avatar.paper.rendering`).
     """
     device = avatar.field.table.device
-    cells = cells or WarpCells.of(avatar.rig, pose.joint_rotations, device=device)
+    cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
     world_from_body = avatar.rig.world_from_body(pose)
     width, height = camera.size_px
-    if samples_along is None:
+    if sample_rays is None:
         grid = avatar.rendering_grid()
-        cells = pruned(cells, grid)
-        rows, columns = window(cells, camera, world_from_body)
-        strays = Strays.of(avatar.rig, pose.joint_rotations, cells, device)
-        colors_of = partial(traced, avatar.field, grid=grid, strays=strays, step_m=avatar.step_m)
+        cells = cull_cells(cells, grid)
+        rows, columns = screen_bounds(cells, camera, world_from_body)
+        strays = CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device)
+        colors_of = partial(trace_rays, avatar.field, grid=grid, check=strays, sample_step_m=avatar.sample_step_m)
     else:
         rows, columns = slice(0, height), slice(0, width)
-        colors_of = partial(_seen, avatar.field, samples_along, step_m=avatar.step_m)
-    tables = cell_tables(cells, avatar.field.table.device)
+        colors_of = partial(_render_given_samples, avatar.field, sample_rays, sample_step_m=avatar.sample_step_m)
+    tables = correspondence_tables(cells, avatar.field.table.device)
     picture = np.zeros((height, width, 4), dtype=np.float32)
-    for part, pixels in _in_parts(picture[rows, columns], rows.start, columns.start):
-        rays = BodyRays.through(pixels, camera, world_from_body)
-        colors = colors_of(_batch(rays, tables.low.device), tables)
+    for part, pixels in _pixel_chunks(picture[rows, columns], rows.start, columns.start):
+        rays = BodyFrameRays.through(pixels, camera, world_from_body)
+        colors = colors_of(_ray_batch(rays, tables.low.device), tables)
         part[:] = colors.cpu().numpy().reshape(part.shape)
     return picture
 
 
-def _in_parts(
-    inside: Float32[np.ndarray, "height width 4"], top: int, left: int
+def _pixel_chunks(
+    image: Float32[np.ndarray, "height width 4"], top: int, left: int
 ) -> Iterator[tuple[Float32[np.ndarray, "rows width 4"], Float[np.ndarray, "pixels 2"]]]:
     """Some rows of a part of the picture after the other, and the centres of their pixels."""
-    x = left + np.arange(inside.shape[1]) + 0.5
-    rows = max(1, RAYS_AT_ONCE // max(len(x), 1))
-    for first in range(0, len(inside), rows):
-        part = inside[first : first + rows]
+    x = left + np.arange(image.shape[1]) + 0.5
+    rows = max(1, RAYS_PER_CHUNK // max(len(x), 1))
+    for first in range(0, len(image), rows):
+        part = image[first : first + rows]
         y = top + first + np.arange(len(part)) + 0.5
         yield part, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def traced(
-    field: Field,
-    rays: Rays,
-    cells: CellTables,
+def trace_rays(
+    field: RadianceField,
+    rays: RayBatch,
+    cells: CorrespondenceTables,
     *,
-    grid: Grid,
-    strays: Strays,
-    step_m: float,
+    grid: DensityGrid,
+    check: CorrespondenceCheck,
+    sample_step_m: float,
 ) -> Float32[Tensor, "rays 4"]:
     """Premultiplied colour and alpha along rays.
 
@@ -112,32 +112,32 @@ def traced(
     colors = torch.zeros(len(rays.slots), 4, device=rays.origins.device)
     alive = torch.arange(len(colors), device=colors.device)
     while len(alive):
-        most = min(max(SAMPLES_AT_ONCE // len(alive), FEWEST), MOST)
-        how = Marching(step_m, math.inf, most)
-        samples, jitter = field.backend.march_on(rays, cells, grid, how)
+        most = min(max(SAMPLES_PER_CHUNK // len(alive), MIN_SAMPLES_PER_PASS), MAX_SAMPLES_PER_PASS)
+        how = MarchSettings(sample_step_m, math.inf, most)
+        samples, jitter = field.backend.march_resumable(rays, cells, grid, how)
         nearer = colors[alive]
-        raw = field.raw_at(samples.points)
-        raw[strays.among(samples, rays), 3] = EMPTY_LOG_DENSITY
-        part = field.backend.composite(raw, samples, step_m)
+        raw = field.raw_outputs_at(samples.points)
+        raw[check.find_spurious(samples, rays), 3] = EMPTY_LOG_DENSITY
+        part = field.backend.composite(raw, samples, sample_step_m)
         nearer = nearer + (1.0 - nearer[:, 3:]) * part
         colors[alive] = nearer
-        on = ((samples.count == most) & (nearer[:, 3] < 1.0 - UNSEEN)).nonzero()[:, 0]
-        rays = Rays(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
+        on = ((samples.counts == most) & (nearer[:, 3] < 1.0 - MIN_TRANSMITTANCE)).nonzero()[:, 0]
+        rays = RayBatch(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
         alive = alive[on]
     return colors
 
 
-def _seen(
-    field: Field,
-    samples_along: Callable[[Rays, CellTables], Samples],
-    rays: Rays,
-    cells: CellTables,
+def _render_given_samples(
+    field: RadianceField,
+    samples_along: Callable[[RayBatch, CorrespondenceTables], RaySamples],
+    rays: RayBatch,
+    cells: CorrespondenceTables,
     *,
-    step_m: float,
+    sample_step_m: float,
 ) -> Float32[Tensor, "rays 4"]:
     """Premultiplied colour and alpha along rays whose samples another scheme chooses.
 
-    The field is asked front to back here, too: of what `UNSEEN` hides nothing is known.
+    The field is asked front to back here, too: of what `MIN_TRANSMITTANCE` hides nothing is known.
     """
     samples = samples_along(rays, cells)
     points, first, count, _ = samples
@@ -146,21 +146,21 @@ def _seen(
     raw = points.new_zeros(len(points), 4)
     raw[:, 3] = EMPTY_LOG_DENSITY
     optical = points.new_zeros(len(count))
-    for start in range(0, int(count.max()) if len(count) else 0, MOST):
-        lit = (rank >= start) & (rank < start + MOST) & (optical[ray] < -math.log(UNSEEN))
+    for start in range(0, int(count.max()) if len(count) else 0, MAX_SAMPLES_PER_PASS):
+        lit = (rank >= start) & (rank < start + MAX_SAMPLES_PER_PASS) & (optical[ray] < -math.log(MIN_TRANSMITTANCE))
         seen = lit.nonzero()[:, 0]
-        values = field.raw_at(points[seen])
+        values = field.raw_outputs_at(points[seen])
         raw[seen] = values
         density = torch.exp(values[:, 3].clamp(max=MAX_LOG_DENSITY))
-        optical.index_add_(0, ray[seen], density * step_m)
-    return field.backend.composite(raw, samples, step_m)
+        optical.index_add_(0, ray[seen], density * sample_step_m)
+    return field.backend.composite(raw, samples, sample_step_m)
 
 
-def _batch(rays: BodyRays, device: torch.device) -> Rays:
+def _ray_batch(rays: BodyFrameRays, device: torch.device) -> RayBatch:
     """Rays of one frame, whose samples lie in the middle of their steps."""
     directions = torch.from_numpy(rays.directions).to(device)
     count = len(directions)
-    return Rays(
+    return RayBatch(
         torch.from_numpy(rays.origin).to(device).expand(count, 3).contiguous(),
         directions,
         torch.zeros(count, dtype=torch.int32, device=device),
@@ -168,12 +168,12 @@ def _batch(rays: BodyRays, device: torch.device) -> Rays:
     )
 
 
-def cell_tables(cells: WarpCells, device: torch.device) -> CellTables:
+def correspondence_tables(cells: CorrespondenceGrid, device: torch.device) -> CorrespondenceTables:
     """One frame's warp cells as tables of a single slot."""
-    return CellTables(
-        torch.from_numpy(cells.index.reshape(1, -1)).to(device),
+    return CorrespondenceTables(
+        torch.from_numpy(cells.packed_cells.reshape(1, -1)).to(device),
         torch.from_numpy(cells.roots[None]).to(device),
         torch.from_numpy(cells.low[None]).to(device),
-        torch.tensor([cells.index.shape], dtype=torch.int32, device=device),
+        torch.tensor([cells.packed_cells.shape], dtype=torch.int32, device=device),
         cells.cell_m,
     )

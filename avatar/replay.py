@@ -1,4 +1,4 @@
-"""Replay: the key frames that stay, and the rays drawn from them.
+"""ReplayBuffer: the key frames that stay, and the rays drawn from them.
 
 Training on the newest frames alone loses 5-9 dB on the oldest. Half of the rays are drawn from
 all kept frames alike, half in proportion to each frame's running error; a new frame enters with
@@ -12,15 +12,15 @@ import torch
 from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
-from avatar.cells import CELL_M, WarpCells
-from avatar.kernels.backend import CellTables, Rays
-from avatar.likeness import likeness
-from avatar.prepare import PreparedFrame, Sight
+from avatar.cells import CORRESPONDENCE_CELL_M, CorrespondenceGrid
+from avatar.kernels.backend import CorrespondenceTables, RayBatch
+from avatar.likeness import view_descriptor
+from avatar.prepare import TrainingFrame, RayView
 from preprocess.pose import BodyPose
 
-NEAR_SHARE = 0.9
+NEAR_PERSON_RAY_SHARE = 0.9
 """Of the rays, how many go through pixels near the person."""
-ERROR_MEMORY = 0.9
+ERROR_EMA_DECAY = 0.9
 
 
 class RootCorrection(NamedTuple):
@@ -39,7 +39,7 @@ class RootCorrection(NamedTuple):
     pivot: Float[np.ndarray, "3"]
 
 
-class KeyFrame(NamedTuple):
+class ReplayFrame(NamedTuple):
     """What must be kept of a frame to learn from it again.
 
     Attributes:
@@ -51,11 +51,11 @@ class KeyFrame(NamedTuple):
 
     index: int
     pose: BodyPose
-    sight: Sight
+    view: RayView
     colors: UInt8[np.ndarray, "pixels 4"]
 
 
-class Batch(NamedTuple):
+class TrainingBatch(NamedTuple):
     """Rays and what the video shows along them.
 
     Attributes:
@@ -63,12 +63,12 @@ class Batch(NamedTuple):
         target: Premultiplied colour and alpha, in [0, 1].
     """
 
-    rays: Rays
+    rays: RayBatch
     target: Float32[Tensor, "rays 4"]
 
 
 @final
-class Replay:
+class ReplayBuffer:
     """A bounded store of prepared frames, one slot each, kept for distinct views and poses.
 
     Attributes:
@@ -79,10 +79,10 @@ class Replay:
         """An empty store for at most `capacity` frames."""
         self.capacity = capacity
         self.device = device
-        self.indices: list[int] = []
-        self._seen: list[tuple[BodyPose, Sight | None]] = []
-        self._likeness = np.zeros((capacity, 3 + 69))
-        self._gap = np.full((capacity, capacity), np.inf)
+        self.frame_indices: list[int] = []
+        self._poses_and_views: list[tuple[BodyPose, RayView | None]] = []
+        self._descriptors = np.zeros((capacity, 3 + 69))
+        self._descriptor_distances = np.full((capacity, capacity), np.inf)
         self._error = torch.zeros(capacity, device=device)
         self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
@@ -98,14 +98,14 @@ class Replay:
 
     def __len__(self) -> int:
         """How many frames are kept."""
-        return len(self.indices)
+        return len(self.frame_indices)
 
     @property
-    def cells(self) -> CellTables:
+    def correspondences(self) -> CorrespondenceTables:
         """The warp cells of all slots."""
-        return CellTables(self._index, self._roots, self._low, self._shape, CELL_M)
+        return CorrespondenceTables(self._index, self._roots, self._low, self._shape, CORRESPONDENCE_CELL_M)
 
-    def add(self, frame: PreparedFrame) -> int:
+    def add(self, frame: TrainingFrame) -> int:
         """Takes a frame in; when full, the more replaceable of the two most alike goes.
 
         Returns:
@@ -113,43 +113,43 @@ class Replay:
         """
         if len(self) < self.capacity:
             slot = len(self)
-            self.indices.append(frame.index)
-            self._seen.append((frame.pose, frame.sight))
+            self.frame_indices.append(frame.index)
+            self._poses_and_views.append((frame.pose, frame.view))
         else:
-            slot = self._most_alike()
-            self.indices[slot] = frame.index
-            self._seen[slot] = frame.pose, frame.sight
-        self._compare(slot, likeness(frame.origin, frame.pose))
-        self._fill(slot, frame)
+            slot = self._most_redundant_slot()
+            self.frame_indices[slot] = frame.index
+            self._poses_and_views[slot] = frame.pose, frame.view
+        self._update_distances(slot, view_descriptor(frame.origin, frame.pose))
+        self._store_frame(slot, frame)
         held = self._error[: len(self)]
         self._error[slot] = held.max() if float(held.max()) > 0 else 1.0
         return slot
 
-    def key_frames(self) -> list[KeyFrame]:
+    def replay_frames(self) -> list[ReplayFrame]:
         """What must be kept of the frames to learn from them again."""
         kept = []
-        for slot, (pose, sight) in enumerate(self._seen):
+        for slot, (pose, sight) in enumerate(self._poses_and_views):
             if sight is not None:
                 pixels = int(self._near[slot] + self._far[slot])
                 colors = self._colors[slot, :pixels].cpu().numpy().copy()
-                kept.append(KeyFrame(self.indices[slot], pose, sight, colors))
+                kept.append(ReplayFrame(self.frame_indices[slot], pose, sight, colors))
         return kept
 
-    def put_cells(self, slot: int, cells: WarpCells) -> None:
+    def set_correspondences(self, slot: int, correspondences: CorrespondenceGrid) -> None:
         """Gives a slot the warp of its frame's pose."""
-        self._index = self._write(self._index, slot, cells.index.reshape(-1))
-        self._roots = self._write(self._roots, slot, cells.roots)
-        self._low[slot] = torch.from_numpy(cells.low).to(self.device)
-        self._shape[slot] = torch.tensor(cells.index.shape, dtype=torch.int32)
+        self._index = self._store_rows(self._index, slot, correspondences.packed_cells.reshape(-1))
+        self._roots = self._store_rows(self._roots, slot, correspondences.roots)
+        self._low[slot] = torch.from_numpy(correspondences.low).to(self.device)
+        self._shape[slot] = torch.tensor(correspondences.packed_cells.shape, dtype=torch.int32)
 
-    def move_root(self, slot: int, root: RootCorrection) -> None:
+    def correct_root(self, slot: int, correction: RootCorrection) -> None:
         """Lets a slot's rays follow its corrected root."""
-        turn = root.rotation.T
-        origin = root.pivot + turn @ (self._given_origins[slot] - root.pivot - root.shift)
+        turn = correction.rotation.T
+        origin = correction.pivot + turn @ (self._given_origins[slot] - correction.pivot - correction.shift)
         self._origins[slot] = torch.from_numpy(origin).to(self._origins)
         self._turns[slot] = torch.from_numpy(turn).to(self._turns)
 
-    def draw(self, count: int, generator: torch.Generator) -> Batch:
+    def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
         """Draws rays from the kept frames.
 
         Args:
@@ -165,19 +165,19 @@ class Replay:
 
         slot = torch.multinomial(chance, count, replacement=True, generator=generator).sort()[0]
         near, far = self._near[slot], self._far[slot]
-        wants_near = (uniform(count) < NEAR_SHARE) | (far == 0)
+        wants_near = (uniform(count) < NEAR_PERSON_RAY_SHARE) | (far == 0)
         place = uniform(count)
         pixel = torch.where(wants_near, (place * near).long(), near + (place * far).long())
         pixel = torch.minimum(pixel, near + far - 1)
-        rays = Rays(
+        rays = RayBatch(
             self._origins[slot],
             (self._turns[slot] @ self._directions[slot, pixel][..., None])[..., 0],
             slot.int(),
             uniform(count),
         )
-        return Batch(rays, self._colors[slot, pixel].float() / 255.0)
+        return TrainingBatch(rays, self._colors[slot, pixel].float() / 255.0)
 
-    def learn_errors(self, slots: Int64[Tensor, "rays"], loss: Float32[Tensor, "rays"]) -> None:
+    def update_errors(self, slots: Int64[Tensor, "rays"], loss: Float32[Tensor, "rays"]) -> None:
         """Updates the running error of the frames that the rays came from."""
         held = len(self)
         count = torch.bincount(slots, minlength=held)[:held]
@@ -185,19 +185,19 @@ class Replay:
         seen = count > 0
         mean = (total / count.clamp(min=1)).to(self._error)
         error = self._error[:held]
-        error[seen] = ERROR_MEMORY * error[seen] + (1.0 - ERROR_MEMORY) * mean[seen]
+        error[seen] = ERROR_EMA_DECAY * error[seen] + (1.0 - ERROR_EMA_DECAY) * mean[seen]
 
-    def _fill(self, slot: int, frame: PreparedFrame) -> None:
-        self.put_cells(slot, frame.cells)
-        self._directions = self._write(self._directions, slot, frame.directions)
-        self._colors = self._write(self._colors, slot, frame.colors)
+    def _store_frame(self, slot: int, frame: TrainingFrame) -> None:
+        self.set_correspondences(slot, frame.correspondences)
+        self._directions = self._store_rows(self._directions, slot, frame.directions)
+        self._colors = self._store_rows(self._colors, slot, frame.colors)
         self._given_origins[slot] = frame.origin
         self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
         self._turns[slot] = torch.eye(3, device=self.device)
-        self._near[slot] = frame.near
-        self._far[slot] = len(frame.colors) - frame.near
+        self._near[slot] = frame.near_count
+        self._far[slot] = len(frame.colors) - frame.near_count
 
-    def _write(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
+    def _store_rows(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
         """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""
         needed = len(values)
         if needed > store.shape[1]:
@@ -212,17 +212,17 @@ class Replay:
         store[slot, :needed] = torch.from_numpy(values).to(self.device)
         return store
 
-    def _compare(self, slot: int, numbers: Float[np.ndarray, " 72"]) -> None:
+    def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:
         """Notes how far a slot's frame is from every other."""
         held = len(self)
-        self._likeness[slot] = numbers
-        gap = np.linalg.norm(self._likeness[:held] - numbers, axis=1)
+        self._descriptors[slot] = descriptor
+        gap = np.linalg.norm(self._descriptors[:held] - descriptor, axis=1)
         gap[slot] = np.inf
-        self._gap[slot, :held] = self._gap[:held, slot] = gap
+        self._descriptor_distances[slot, :held] = self._descriptor_distances[:held, slot] = gap
 
-    def _most_alike(self) -> int:
+    def _most_redundant_slot(self) -> int:
         """Of the two frames that differ least, the one nearer to a third."""
-        first, second = np.unravel_index(self._gap.argmin(), self._gap.shape)
-        pair = self._gap[[first, second]]
+        first, second = np.unravel_index(self._descriptor_distances.argmin(), self._descriptor_distances.shape)
+        pair = self._descriptor_distances[[first, second]]
         pair[:, [first, second]] = np.inf
         return int((first, second)[int(pair.min(axis=1).argmin())])

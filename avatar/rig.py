@@ -9,16 +9,16 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
 from scipy.ndimage import maximum_filter
 
 from avatar.normals import vertex_normals
-from avatar.skinning import distance_volume, skinning_volume
+from avatar.skinning import skin_distance_volume, skinning_weight_volume
 from preprocess.body import ShapedBody
 from preprocess.kinematics import body_from_rest, world_from_body
 from preprocess.pose import BodyPose
 
-PARTS = np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13])
+PART_OF_JOINT = np.array([0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13])
 """Which of 14 body parts each joint moves: root finding starts once in every near part."""
 SEED_SPACING_M = 0.02
-WEIGHT_CELL_M = 0.023
-OCCUPANCY_CELL_M = 0.015
+SKINNING_CELL_M = 0.023
+DISTANCE_CELL_M = 0.015
 
 
 def canonical_rotations() -> Float[np.ndarray, "23 3"]:
@@ -31,7 +31,7 @@ def canonical_rotations() -> Float[np.ndarray, "23 3"]:
     return body_pose.reshape(23, 3)
 
 
-class NearNodes(NamedTuple):
+class SparseSkinningNodes(NamedTuple):
     """Nodes of the weight volume, and the joints that move them.
 
     Attributes:
@@ -41,10 +41,10 @@ class NearNodes(NamedTuple):
         shares: Weights of these joints, in (0, 1].
     """
 
-    nodes: Int64[np.ndarray, "nodes"]
-    first: Int64[np.ndarray, "nodes+1"]
+    node_indices: Int64[np.ndarray, "node_indices"]
+    offsets: Int64[np.ndarray, "node_indices+1"]
     joints: Int32[np.ndarray, "moving"]
-    shares: Float32[np.ndarray, "moving"]
+    weights: Float32[np.ndarray, "moving"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,14 +71,14 @@ class Rig:
     box_low: Float32[np.ndarray, "3"]
     box_high: Float32[np.ndarray, "3"]
     weights: Float32[np.ndarray, "x y z 24"]
-    distance: Float32[np.ndarray, "cx cy cz"]
-    inside: Bool[np.ndarray, "cx cy cz"]
+    skin_distance: Float32[np.ndarray, "cx cy cz"]
+    inside_skin: Bool[np.ndarray, "cx cy cz"]
     seeds: Float32[np.ndarray, "seeds 3"]
     seed_weights: Float32[np.ndarray, "seeds 24"]
     seed_parts: Int32[np.ndarray, "seeds"]
 
     @classmethod
-    def of(cls, shaped: ShapedBody, *, margin_m: float = 0.17) -> "Rig":
+    def from_shaped_body(cls, shaped: ShapedBody, *, margin_m: float = 0.17) -> "Rig":
         """The rig of a shaped body.
 
         Args:
@@ -91,10 +91,10 @@ class Rig:
         vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
         low = (vertices.min(axis=0) - margin_m).astype(np.float32)
         high = (vertices.max(axis=0) + margin_m).astype(np.float32)
-        seeds = _seeds(vertices, body.weights)
+        seeds = _seed_vertices(vertices, body.weights)
         normals, _ = vertex_normals(vertices, body.faces)
-        distance, inside = distance_volume(
-            vertices, normals, low, high, OCCUPANCY_CELL_M, margin_m + 0.02
+        distance, inside = skin_distance_volume(
+            vertices, normals, low, high, DISTANCE_CELL_M, margin_m + 0.02
         )
         return cls(
             rest_joints=shaped.joints,
@@ -102,35 +102,35 @@ class Rig:
             canonical_rotations=rotations,
             box_low=low,
             box_high=high,
-            weights=skinning_volume(
-                vertices, body.weights, low, high, WEIGHT_CELL_M, margin_m + 0.05
+            weights=skinning_weight_volume(
+                vertices, body.weights, low, high, SKINNING_CELL_M, margin_m + 0.05
             ),
             distance=distance,
             inside=inside,
             seeds=vertices[seeds].astype(np.float32),
             seed_weights=body.weights[seeds].astype(np.float32),
-            seed_parts=PARTS[body.weights[seeds].argmax(axis=1)].astype(np.int32),
+            seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
 
-    def near_nodes(self, reach_m: float) -> NearNodes:
+    def skinning_nodes_within(self, reach_m: float) -> SparseSkinningNodes:
         """What moves the weight volume's nodes about all that is nearer to the skin than this."""
-        if reach_m not in self._near_nodes:
-            shape, cells = np.array(self.weights.shape[:3]), np.array(self.distance.shape)
+        if reach_m not in self._nodes_by_reach:
+            shape, cells = np.array(self.weights.shape[:3]), np.array(self.skin_distance.shape)
             nearest = [
                 np.minimum(np.linspace(0, cells[k], shape[k]).astype(int), cells[k] - 1)
                 for k in range(3)
             ]
-            near = maximum_filter(self.distance[np.ix_(*nearest)] < reach_m, 3)
+            near = maximum_filter(self.skin_distance[np.ix_(*nearest)] < reach_m, 3)
             nodes = np.flatnonzero(near)
             weights = self.weights.reshape(-1, 24)[nodes]
             moving = weights > 0.0
             first = np.concatenate([[0], moving.sum(axis=1).cumsum()])
             joints = moving.nonzero()[1].astype(np.int32)
-            self._near_nodes[reach_m] = NearNodes(nodes, first, joints, weights[moving])
-        return self._near_nodes[reach_m]
+            self._nodes_by_reach[reach_m] = SparseSkinningNodes(nodes, first, joints, weights[moving])
+        return self._nodes_by_reach[reach_m]
 
     @cached_property
-    def _near_nodes(self) -> dict[float, NearNodes]:
+    def _nodes_by_reach(self) -> dict[float, SparseSkinningNodes]:
         return {}
 
     def body_from_canonical(
@@ -163,10 +163,10 @@ class Rig:
         return weights
 
 
-def _seeds(
+def _seed_vertices(
     vertices: Float[np.ndarray, "vertices 3"], weights: Float[np.ndarray, "vertices 24"]
 ) -> Int[np.ndarray, "seeds"]:
     """Vertices to start from: the first of each 2-cm voxel and body part."""
     voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
-    keys = np.column_stack([voxels, PARTS[weights.argmax(axis=1)]])
+    keys = np.column_stack([voxels, PART_OF_JOINT[weights.argmax(axis=1)]])
     return np.unique(keys, axis=0, return_index=True)[1]

@@ -5,18 +5,18 @@ from typing import Any
 
 import torch
 
-from capture.atomic_files import whole_file
+from capture.atomic_files import atomic_file
 
 
-def save_whole(state: dict[str, Any], path: Path) -> None:
+def save_atomically(state: dict[str, Any], path: Path) -> None:
     """Writes plain data and tensors as a file that appears whole or not at all.
 
     Raises:
-        BadInput: If the folder's list says that the file there is not ours.
+        InputError: If the folder's list says that the file there is not ours.
         OSError: If the disk is full, or the folder cannot be written; what was there before stays.
     """
     try:
-        with whole_file(path) as part, part.open("wb") as file:
+        with atomic_file(path) as part, part.open("wb") as file:
             torch.save(state, file)
     except RuntimeError as error:  # torch stumbles once more after the disk has failed
         if isinstance(error.__context__, OSError):

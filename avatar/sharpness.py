@@ -40,22 +40,22 @@ from jaxtyping import Bool, Float32
 
 from avatar.metrics import psnr
 
-Verdict = Literal["sharp", "soft", "blurred", "failed"]
+SharpnessVerdict = Literal["sharp", "soft", "blurred", "failed"]
 """From the best to the worst."""
 
-SHARP, SOFT, BLURRED = 0.0075, 0.0125, 0.08
+MAX_SHARP_BLUR, MAX_SOFT_BLUR, MAX_MEASURABLE_BLUR = 0.0075, 0.0125, 0.08
 """The largest equivalent blur of each verdict, as a share of the person's height."""
-LEAST_OVERLAP = 0.5
+MIN_OVERLAP = 0.5
 """Below it the picture does not show the body that the mask shows."""
-WIDTHS = (0.0025, 0.005, 0.01, 0.02, 0.04, BLURRED)
+CALIBRATION_BLURS = (0.0025, 0.005, 0.01, 0.02, 0.04, MAX_MEASURABLE_BLUR)
 """Blurs of the yardstick, as shares of the person's height."""
-SHRUNK_FROM_PX = 4.0
+DOWNSAMPLE_SIGMA_PX = 4.0
 """A picture that is blurred by this many pixels or more is shrunk first: quicker, and it loses
 nothing that the blur would have left."""
 
 
 @runtime_checkable
-class Sharpness(Protocol):
+class SharpnessScore(Protocol):
     """A scored picture.
 
     Attributes:
@@ -74,22 +74,22 @@ class Sharpness(Protocol):
         ...
 
 
-Yardstick = tuple[float, ...]
-"""PSNR of the truth blurred by each of `WIDTHS`, where alpha > 0.5, dB."""
+BlurCalibration = tuple[float, ...]
+"""PSNR of the truth blurred by each of `CALIBRATION_BLURS`, where alpha > 0.5, dB."""
 
 
-def yardstick(
+def calibrate_blur(
     truth: Float32[np.ndarray, "height width 3"], silhouette: Bool[np.ndarray, "height width"]
-) -> Yardstick:
+) -> BlurCalibration:
     """Scores blurred copies of a frame on white; empty if the silhouette is."""
     rows = np.flatnonzero(silhouette.any(axis=1))
     if not rows.size:
         return ()
     height_px = float(rows[-1] - rows[0] + 1)
-    return tuple(psnr(_blurred(truth, width * height_px), truth, silhouette) for width in WIDTHS)
+    return tuple(psnr(_gaussian_blur(truth, width * height_px), truth, silhouette) for width in CALIBRATION_BLURS)
 
 
-def equivalent_blur(psnr_mask: float, scale: Yardstick) -> float:
+def equivalent_blur(psnr_mask: float, calibration: BlurCalibration) -> float:
     """The blur that costs a frame as many decibels, as a share of the person's height.
 
     Args:
@@ -97,63 +97,63 @@ def equivalent_blur(psnr_mask: float, scale: Yardstick) -> float:
         scale: Of the same frame.
 
     Returns:
-        No less than the first of `WIDTHS`; infinite beyond the last; NaN without a silhouette.
+        No less than the first of `CALIBRATION_BLURS`; infinite beyond the last; NaN without a silhouette.
     """
-    if not scale or isnan(psnr_mask):
+    if not calibration or isnan(psnr_mask):
         return nan
-    if psnr_mask >= scale[0]:
-        return WIDTHS[0]
-    for (narrow, better), (wide, worse) in pairwise(zip(WIDTHS, scale, strict=True)):
+    if psnr_mask >= calibration[0]:
+        return CALIBRATION_BLURS[0]
+    for (narrow, better), (wide, worse) in pairwise(zip(CALIBRATION_BLURS, calibration, strict=True)):
         if psnr_mask >= worse:
             share = (better - psnr_mask) / (better - worse)
             return exp(log(narrow) + share * (log(wide) - log(narrow)))
     return inf
 
 
-def verdict(blur: float | None, overlap: float | None) -> Verdict | None:
+def sharpness_verdict(blur: float | None, overlap: float | None) -> SharpnessVerdict | None:
     """The word for an equivalent blur and an overlap; None if neither was measured."""
-    if overlap is not None and overlap < LEAST_OVERLAP:
+    if overlap is not None and overlap < MIN_OVERLAP:
         return "failed"
     if blur is None or isnan(blur):
         return None
-    if blur > BLURRED:
+    if blur > MAX_MEASURABLE_BLUR:
         return "failed"
-    return "sharp" if blur <= SHARP else "soft" if blur <= SOFT else "blurred"
+    return "sharp" if blur <= MAX_SHARP_BLUR else "soft" if blur <= MAX_SOFT_BLUR else "blurred"
 
 
-def typical_blur(blurs: Iterable[float]) -> float | None:
+def median_blur(blurs: Iterable[float]) -> float | None:
     """The blur that at least half of the frames stay within; None if none was measured."""
     known = [blur for blur in blurs if not isnan(blur)]
     return median_low(known) if known else None
 
 
-def typical_overlap(overlaps: Iterable[float]) -> float | None:
+def median_overlap(overlaps: Iterable[float]) -> float | None:
     """The overlap that at least half of the frames reach; None if none was measured."""
     known = [overlap for overlap in overlaps if not isnan(overlap)]
     return median_high(known) if known else None
 
 
-def verdict_of(scores: Iterable[Sharpness]) -> Verdict | None:
+def overall_verdict(scores: Iterable[SharpnessScore]) -> SharpnessVerdict | None:
     """The word for several pictures: at least half of them are this good; None without any."""
     scores = list(scores)
-    return verdict(
-        typical_blur(score.blur for score in scores),
-        typical_overlap(score.overlap for score in scores),
+    return sharpness_verdict(
+        median_blur(score.blur for score in scores),
+        median_overlap(score.overlap for score in scores),
     )
 
 
-def better(one: Verdict | None, other: Verdict | None) -> Verdict | None:
+def better_verdict(one: SharpnessVerdict | None, other: SharpnessVerdict | None) -> SharpnessVerdict | None:
     """The better of two verdicts on one avatar: poses that are off are not its fault."""
-    known: list[Verdict] = [word for word in (one, other) if word is not None]
-    return min(known, key=get_args(Verdict).index) if known else None
+    known: list[SharpnessVerdict] = [word for word in (one, other) if word is not None]
+    return min(known, key=get_args(SharpnessVerdict).index) if known else None
 
 
-def _blurred(
+def _gaussian_blur(
     picture: Float32[np.ndarray, "height width 3"], sigma_px: float
 ) -> Float32[np.ndarray, "height width 3"]:
     """A Gaussian blur; beyond the border the picture is mirrored."""
     height, width = picture.shape[:2]
-    factor = int(sigma_px / SHRUNK_FROM_PX)
+    factor = int(sigma_px / DOWNSAMPLE_SIGMA_PX)
     if factor < 2:
         return np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma_px))
     small = (max(1, width // factor), max(1, height // factor))

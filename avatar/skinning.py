@@ -5,13 +5,13 @@ from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
-NEIGHBOURS = 10
+BLENDED_VERTICES = 10
 """Vertices blended at each node; 1 would be the paper's variant (nearest vertex)."""
-CLOSEST_M = 2e-3
+MIN_VERTEX_DISTANCE_M = 2e-3
 """Distances below this count as this, so that a node on a vertex does not take it alone."""
 SMOOTHED_BEYOND_M = 0.03
 """Nodes farther from the skin than this are smoothed; nearer ones, where clothes hang, are not."""
-SMOOTHINGS = 2
+SMOOTHING_PASSES = 2
 
 
 def volume_shape(
@@ -22,7 +22,7 @@ def volume_shape(
     return int(x), int(y), int(z)
 
 
-def skinning_volume(
+def skinning_weight_volume(
     vertices: Float[np.ndarray, "vertices 3"],
     vertex_weights: Float[np.ndarray, "vertices 24"],
     low: Float[np.ndarray, "3"],
@@ -55,25 +55,25 @@ def skinning_volume(
     weights = np.zeros((len(nodes), 24), dtype=np.float32)
     weights[:, 0] = 1.0
     for chunk in np.array_split(near, max(1, len(near) // 8192)):
-        distance_m, index = tree.query(nodes[chunk], k=NEIGHBOURS, workers=-1)
-        share = 1.0 / np.maximum(distance_m, CLOSEST_M) ** 2
+        distance_m, index = tree.query(nodes[chunk], k=BLENDED_VERTICES, workers=-1)
+        share = 1.0 / np.maximum(distance_m, MIN_VERTEX_DISTANCE_M) ** 2
         share /= share.sum(axis=1, keepdims=True)
         weights[chunk] = np.einsum("nk,nkj->nj", share, vertex_weights[index])
     far = (~(nearest_m <= SMOOTHED_BEYOND_M)).reshape(*shape, 1)
-    return _smoothed(weights.reshape(*shape, 24), far)
+    return _smooth_far_weights(weights.reshape(*shape, 24), far)
 
 
-def _smoothed(
+def _smooth_far_weights(
     weights: Float32[np.ndarray, "x y z 24"], far: Bool[np.ndarray, "x y z 1"]
 ) -> Float32[np.ndarray, "x y z 24"]:
-    for _ in range(SMOOTHINGS):
+    for _ in range(SMOOTHING_PASSES):
         mean = uniform_filter(weights, 3, axes=(0, 1, 2))
         weights = np.where(far, mean, weights)
     weights[weights < 1e-4] = 0.0
     return np.ascontiguousarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)
 
 
-def distance_volume(
+def skin_distance_volume(
     vertices: Float[np.ndarray, "vertices 3"],
     normals: Float[np.ndarray, "vertices 3"],
     low: Float[np.ndarray, "3"],
@@ -88,7 +88,7 @@ def distance_volume(
         normals: Outward, at the vertices.
         low, high: Corners of the box, metres.
         cell_m: About the edge of a cell, metres.
-        reach_m: Cells farther than this from every vertex count as 1 m away, and outside.
+        reach_m: SolvedCorrespondences farther than this from every vertex count as 1 m away, and outside.
 
     Returns:
         Unsigned distance to the nearest vertex, metres; and whether the centre is on the inner side

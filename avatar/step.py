@@ -9,11 +9,11 @@ from torch import Tensor
 
 from avatar import priors
 from avatar.config import TrainConfig
-from avatar.field import Field
-from avatar.kernels.backend import CellTables, Grid, Samples
-from avatar.refine import PULLING_M, PoseTable
-from avatar.replay import Batch
-from avatar.sampling import Sampler
+from avatar.field import RadianceField
+from avatar.kernels.backend import CorrespondenceTables, DensityGrid, RaySamples
+from avatar.refine import MIN_POSE_GRADIENT_CELL_M, PoseOptimizer
+from avatar.replay import TrainingBatch
+from avatar.sampling import RaySampler
 
 
 class StepResult(NamedTuple):
@@ -25,21 +25,21 @@ class StepResult(NamedTuple):
     """
 
     loss: Float32[Tensor, "rays"]
-    samples: int
+    sample_count: int
 
 
 @torch.no_grad()
-def gradients(
-    field: Field,
-    sampler: Sampler,
-    cells: CellTables,
-    batch: Batch,
+def compute_gradients(
+    field: RadianceField,
+    sampler: RaySampler,
+    correspondences: CorrespondenceTables,
+    batch: TrainingBatch,
     config: TrainConfig,
     *,
-    hard_share: float,
-    firm_share: float = 0.0,
-    remember: Grid | None = None,
-    poses: PoseTable | None = None,
+    hard_surface_share: float,
+    surface_share: float = 0.0,
+    density_cache: DensityGrid | None = None,
+    poses: PoseOptimizer | None = None,
     generator: torch.Generator,
 ) -> StepResult:
     """Renders a batch and leaves the gradient of its mean loss in the field's parameters.
@@ -50,36 +50,36 @@ def gradients(
         cells: Warp cells of the frames that the batch's slots name.
         batch: Rays and what the video shows along them.
         config: The recipe.
-        hard_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
+        hard_surface_share: Share of the hard-surface loss's weight, in [0, 1]: it grows in, for a surface
             must be found before it can be hard.
-        firm_share: How far, in [0, 1], surfaces have come from being found (smooth, and fog where
+        surface_share: How far, in [0, 1], surfaces have come from being found (smooth, and fog where
             poses do not agree yet) to being firm.
         remember: Whose cached densities the samples' raise, if any.
         poses: Whose wrenches take up what pulls the samples, if poses are refined.
         generator: Of backgrounds and of the points that are asked, on the field's device.
     """
-    samples = sampler.samples(batch.rays, cells)
-    asked = _asked(sampler, samples.points, config, generator)
+    samples = sampler.sample_rays(batch.rays, correspondences)
+    asked = _regularization_points(sampler, samples.points, config, generator)
     seen = field.forward(torch.cat([samples.points, *asked]))
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
     background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
     _, loss, grad = field.backend.composite_loss(
-        raw, samples, config.step_m, batch.target, background,
-        config.alpha_weight, config.hard_weight * hard_share,
+        raw, samples, config.sample_step_m, batch.target, background,
+        config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
-    grads = [grad, *_grads_asked(raw_asked, asked, config, firm_share)]
+    grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
     grad_features = field.backward(seen, torch.cat(grads))
     if poses is not None and count:
-        _pull(poses, field, samples, grad_features[:count], batch.rays.slots, cells, loss)
-    if remember is not None:
+        _accumulate_pose_gradients(poses, field, samples, grad_features[:count], batch.rays.slots, correspondences, loss)
+    if density_cache is not None:
         log_density = raw[:, 3].contiguous()
-        field.backend.keep_highest(seen.points[:count], log_density, remember)
+        field.backend.scatter_max_density(seen.points[:count], log_density, density_cache)
     return StepResult(loss, count)
 
 
-def _asked(
-    sampler: Sampler,
+def _regularization_points(
+    sampler: RaySampler,
     points: Float32[Tensor, "samples 3"],
     config: TrainConfig,
     generator: torch.Generator,
@@ -87,59 +87,59 @@ def _asked(
     """Points that are asked besides the rays': empty, pairs, solid, close pairs, gaps."""
     none = points[:0]
     return [
-        sampler.empty_points(config.empty_points, generator).to(points)
-        if config.empty_weight
+        sampler.sample_empty(config.empty_space_points, generator).to(points)
+        if config.empty_space_weight
         else none,
-        priors.pairs(points, config, generator),
-        sampler.solid_points(config.solid_points, generator).to(points)
-        if config.solid_weight
+        priors.sample_tv_pairs(points, config, generator),
+        sampler.sample_interior(config.interior_points, generator).to(points)
+        if config.interior_weight
         else none,
-        priors.close_pairs(points, config, generator),
-        sampler.gap_points(config.gap_points, generator).to(points) if config.gap_weight else none,
+        priors.sample_smoothness_pairs(points, config, generator),
+        sampler.sample_inner_leg(config.inner_leg_points, generator).to(points) if config.inner_leg_weight else none,
     ]
 
 
-def _grads_asked(
+def _regularization_gradients(
     raw: list[Float32[Tensor, "_ 4"]],
     points: list[Float32[Tensor, "_ 3"]],
     config: TrainConfig,
-    firm_share: float,
+    surface_share: float,
 ) -> list[Float32[Tensor, "_ 4"]]:
     """The gradients of what `_asked` asks, in its order."""
     empty, pairs, solid, close, gaps = raw
-    grad_pairs = priors.variation(pairs, config.variation_at(firm_share))
-    if config.firm_weight:
-        grad_pairs += priors.double_well(pairs, config.firm_weight * firm_share)
-    grad_close = priors.steepness(
-        close, points[3], config.steepest_per_m, config.soft_weight * firm_share
+    grad_pairs = priors.density_tv_gradient(pairs, config.density_tv_weight_at(surface_share))
+    if config.double_well_weight:
+        grad_pairs += priors.double_well_gradient(pairs, config.double_well_weight * surface_share)
+    grad_close = priors.density_slope_gradient(
+        close, points[3], config.max_log_density_slope_per_m, config.density_slope_weight * surface_share
     )
-    grad_close += priors.unevenness(close, config.even_weight * firm_share)
+    grad_close += priors.color_tv_gradient(close, config.color_tv_weight * surface_share)
     return [
-        priors.emptiness(empty, config.empty_weight),
+        priors.empty_space_gradient(empty, config.empty_space_weight),
         grad_pairs,
-        priors.solidity(solid, config.solid_weight),
+        priors.interior_gradient(solid, config.interior_weight),
         grad_close,
-        priors.needlessness(gaps, config.gap_weight),
+        priors.log_density_l1_gradient(gaps, config.inner_leg_weight),
     ]
 
 
-def _pull(
-    poses: PoseTable,
-    field: Field,
-    samples: Samples,
+def _accumulate_pose_gradients(
+    poses: PoseOptimizer,
+    field: RadianceField,
+    samples: RaySamples,
     grad_features: Float32[Tensor, "samples width"],
     slots: Int32[Tensor, "rays"],
-    cells: CellTables,
+    cells: CorrespondenceTables,
     loss: Float32[Tensor, "rays"],
 ) -> None:
     """Lets the samples pull at the poses that they were warped with."""
-    backend, levels = field.backend, field.levels.no_finer_than(PULLING_M)
-    each = grad_features[:, : levels.width] * len(loss)  # of each ray's own loss, not of the mean
+    backend, levels = field.backend, field.levels.coarser_than(MIN_POSE_GRADIENT_CELL_M)
+    each = grad_features[:, : levels.feature_width] * len(loss)  # of each ray's own loss, not of the mean
     grad_points = backend.encode_points_backward(samples.points, each, field.table, levels)
-    wrenches = backend.wrenches(samples, grad_points, slots, cells, poses.skin, poses.bones)
-    poses.feel(slots.long(), wrenches, loss)
+    wrenches = backend.bone_wrenches(samples, grad_points, slots, cells, poses.skinning, poses.bones)
+    poses.accumulate(slots.long(), wrenches, loss)
 
 
-def cosine(progress: float) -> float:
+def cosine_decay(progress: float) -> float:
     """The learning rate's factor: 1 at progress 0, 0.05 at 1."""
     return max(0.05, 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))

@@ -1,4 +1,4 @@
-"""Samples that a warp cell invents: skinning does not carry them to their ray.
+"""RaySamples that a warp cell invents: skinning does not carry them to their ray.
 
 A cell's warp is a root at its centre and how that moves about it. In the folds of armpits and
 elbows the root of a centre ends within its cell, and what the warp says beyond that is no root at
@@ -13,19 +13,19 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
-from avatar.cells import BAND_M, WarpCells
-from avatar.kernels.backend import Rays, Samples
-from avatar.kernels.cpu_cells import REACH_M, posed_volume
-from avatar.kernels.cpu_skin import LANES
-from avatar.kernels.cpu_stray import doubt, stray
+from avatar.cells import CLOTHING_BAND_M, CorrespondenceGrid
+from avatar.kernels.backend import RayBatch, RaySamples
+from avatar.kernels.cpu_cells import SEARCH_MARGIN_M, blended_transform_volume
+from avatar.kernels.cpu_skin import MATRIX_LANES
+from avatar.kernels.cpu_stray import find_unreliable_roots, find_off_ray_points
 from avatar.rig import Rig
 
-FAR_M = 0.005
+MAX_RAY_DISTANCE_M = 0.005
 """A point that is carried farther than this from its ray is none of it: about a pixel."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Strays:
+class CorrespondenceCheck:
     """Finds such samples in one pose.
 
     Attributes:
@@ -34,19 +34,19 @@ class Strays:
         low, nodes_per_m: Where these lie.
     """
 
-    doubtful: Bool[Tensor, "rows"]
+    unreliable_rows: Bool[Tensor, "rows"]
     transforms: Float32[np.ndarray, "x y z lanes"]
     low: Float32[np.ndarray, "3"]
     nodes_per_m: Float32[np.ndarray, "3"]
 
     @classmethod
-    def of(
+    def for_pose(
         cls,
         rig: Rig,
         joint_rotations: Float[np.ndarray, "23 3"],
-        cells: WarpCells,
+        cells: CorrespondenceGrid,
         device: torch.device,
-    ) -> "Strays":
+    ) -> "CorrespondenceCheck":
         """Looks at every cell that is not empty.
 
         Args:
@@ -56,11 +56,11 @@ class Strays:
             device: Where samples will be.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
-        volume = posed_volume(rig, bones.astype(np.float32), BAND_M + 2.0 * REACH_M)
+        volume = blended_transform_volume(rig, bones.astype(np.float32), CLOTHING_BAND_M + 2.0 * SEARCH_MARGIN_M)
         doubtful = np.zeros(len(cells.roots), dtype=bool)
-        doubt(
-            cells.index, cells.roots[None], cells.low, np.float32(cells.cell_m), *volume,
-            np.float32(FAR_M), doubtful, np.empty(LANES, dtype=np.float32),
+        find_unreliable_roots(
+            cells.packed_cells, cells.roots[None], cells.low, np.float32(cells.cell_m), *volume,
+            np.float32(MAX_RAY_DISTANCE_M), doubtful, np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
         transforms, low, nodes_per_m = volume
         return cls(
@@ -70,14 +70,14 @@ class Strays:
             nodes_per_m=nodes_per_m,
         )
 
-    def among(self, samples: Samples, rays: Rays) -> Int64[Tensor, "strays"]:
+    def find_spurious(self, samples: RaySamples, rays: RayBatch) -> Int64[Tensor, "strays"]:
         """Numbers of the samples that are not on their rays."""
-        asked = self.doubtful[samples.rows.long()].nonzero()[:, 0]
-        ray = torch.searchsorted(samples.first, asked, right=True) - 1
+        asked = self.unreliable_rows[samples.root_rows.long()].nonzero()[:, 0]
+        ray = torch.searchsorted(samples.offsets, asked, right=True) - 1
         parts = (samples.points[asked], rays.origins[ray], rays.directions[ray])
         found = np.empty(len(asked), dtype=bool)
-        stray(
+        find_off_ray_points(
             *(part.cpu().numpy() for part in parts), self.transforms, self.low, self.nodes_per_m,
-            np.float32(FAR_M), found, np.empty(LANES, dtype=np.float32),
+            np.float32(MAX_RAY_DISTANCE_M), found, np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
         return asked[torch.from_numpy(found).to(asked.device)]

@@ -10,26 +10,26 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from avatar.adam import Adam
-from avatar.average import follow
-from avatar.cells import WarpCells
+from avatar.adam import UncompiledAdam
+from avatar.average import update_ema
+from avatar.cells import CorrespondenceGrid
 from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.field import Field
+from avatar.field import RadianceField
 from avatar.kernels.backend import Backend
 from avatar.kernels.choice import backend_for
 from avatar.levels import HashLevels
 from avatar.model import Avatar
-from avatar.occupancy import DECAY, FIRST_DECAY, Occupancy
+from avatar.occupancy import OCCUPANCY_DECAY, INITIAL_OCCUPANCY_DECAY, OccupancyGrid
 from avatar.paper.variants import sampler_for
-from avatar.prepare import PreparedFrame
-from avatar.refine import PoseTable
-from avatar.replay import Replay
+from avatar.prepare import TrainingFrame
+from avatar.refine import PoseOptimizer
+from avatar.replay import ReplayBuffer
 from avatar.rig import Rig
-from avatar.step import StepResult, gradients
+from avatar.step import StepResult, compute_gradients
 
-NETWORK_RATE = 0.3
+NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
-CLEARING_STEPS = 300
+INITIAL_OCCUPANCY_STEPS = 300
 """Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
 CORRECTIONS_PER_STEP = 2
 
@@ -50,40 +50,40 @@ class Trainer:
             most twice as many are kept as frames in replay.
         steps, rays, samples: How much has been done.
         wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
-        frames_seen: Frames taken in so far, whether or not they are still kept.
+        frames_seen: EvaluationFrames taken in so far, whether or not they are still kept.
         stepping_wall, stepping_cpu: Seconds inside steps of this process, by the wall clock and of
             CPU time.
-        held_up_wall, held_up_cpu: Seconds for which somebody held training up (`held_up`).
+        paused_wall_seconds, paused_cpu_seconds: Seconds for which somebody held training up (`paused`).
     """
 
     def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
         """A trainer that has seen nothing."""
         self.config = config
         self.backend: Backend = backend_for(device)
-        levels = HashLevels.over(
+        levels = HashLevels.spanning(
             rig.box_low, rig.box_high, coarsest_m=COARSEST_M, finest_m=config.finest_m,
             levels=config.levels, table_size=config.table_size,
         )  # fmt: skip
         start = torch.Generator().manual_seed(config.seed)
-        self.field = Field(levels, self.backend, device, start)
+        self.field = RadianceField(levels, self.backend, device, start)
         learner = Avatar(
-            rig=rig, field=self.field, occupancy=Occupancy(rig, device), step_m=config.step_m
+            rig=rig, field=self.field, occupancy=OccupancyGrid(rig, device), sample_step_m=config.sample_step_m
         )
         self.sampler = sampler_for(config, learner)
-        self.avatar = replace(learner, field=self.field.copied())
-        self.replay = Replay(config.key_frames, device)
-        self.poses = PoseTable(rig, config.key_frames, device)
-        self.corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
+        self.avatar = replace(learner, field=self.field.clone())
+        self.replay = ReplayBuffer(config.replay_capacity, device)
+        self.poses = PoseOptimizer(rig, config.replay_capacity, device)
+        self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
-        self.stepping_wall = self.stepping_cpu = 0.0
-        self.held_up_wall = self.held_up_cpu = 0.0
+        self.step_wall_seconds = self.step_cpu_seconds = 0.0
+        self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
         self._generator = torch.Generator(device=device).manual_seed(config.seed)
         rate = config.learning_rate
-        self.optimizer = Adam(
+        self.optimizer = UncompiledAdam(
             [
                 {"params": [self.field.table], "lr": rate, "eps": 1e-15},
-                {"params": self.field.layers, "lr": rate * NETWORK_RATE},
+                {"params": self.field.layers, "lr": rate * NETWORK_RATE_FACTOR},
             ],
             betas=(0.9, 0.99),
             fused=True,
@@ -96,7 +96,7 @@ class Trainer:
             return self.steps / NOMINAL_STEPS_PER_S
         return self.wall_seconds
 
-    def add(self, frame: PreparedFrame, *, again: bool = False) -> None:
+    def add_frame(self, frame: TrainingFrame, *, is_restored: bool = False) -> None:
         """Takes in a frame to learn from.
 
         Args:
@@ -104,100 +104,100 @@ class Trainer:
             again: It was learnt from before a checkpoint, and counts no second time.
         """
         slot = self.replay.add(frame)
-        known = self.corrections.get(frame.index)
-        step = 0 if again else self.steps
-        self.poses.put(slot, frame.pose, correction=known, frame=frame.index, step=step)
+        known = self.pose_corrections.get(frame.index)
+        step = 0 if is_restored else self.steps
+        self.poses.set_pose(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
-            rebuild_warp(self.avatar.rig, self.replay, self.poses, slot)
-        self.sampler.admit(slot, self.replay.cells, self.poses.bones[slot])
-        self.frames_seen += not again
-        if not again:
-            self._forget_corrections()
+            resolve_correspondences(self.avatar.rig, self.replay, self.poses, slot)
+        self.sampler.add_frame(slot, self.replay.correspondences, self.poses.bones[slot])
+        self.frames_seen += not is_restored
+        if not is_restored:
+            self._discard_old_corrections()
 
     @contextmanager
-    def held_up(self) -> Iterator[None]:
+    def paused(self) -> Iterator[None]:
         """Time that passes in this block does not count as training."""
         wall, cpu = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
-            self.held_up_wall += time.perf_counter() - wall
-            self.held_up_cpu += time.process_time() - cpu
+            self.paused_wall_seconds += time.perf_counter() - wall
+            self.paused_cpu_seconds += time.process_time() - cpu
 
-    def step(self, *, rate: float, hard_share: float, pose_rate: float | None = None) -> StepResult:
+    def step(self, *, rate: float, hard_surface_share: float, pose_rate: float | None = None) -> StepResult:
         """Draws rays, follows their gradient once, and keeps the occupancy up to date.
 
         Args:
             rate: Factor of the learning rates, in (0, 1].
-            hard_share: Share of the hard-surface loss's weight, in [0, 1].
+            hard_surface_share: Share of the hard-surface loss's weight, in [0, 1].
             pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None. As it falls,
                 surfaces become firm.
         """
         config, field = self.config, self.field
         falling = rate if pose_rate is None else pose_rate
-        batch = self.replay.draw(config.rays, self._generator)
-        remembers = self.steps % config.occupancy_every < 2
-        refines = config.refine_poses and self.steps % self.poses.every == 0
-        refines = refines and self.poses.settle(self.steps)
-        result = gradients(
-            field, self.sampler, self.replay.cells, batch, config,
-            hard_share=hard_share,
-            firm_share=1.0 - falling,
-            remember=self.avatar.occupancy.grid if remembers else None,
+        batch = self.replay.sample_rays(config.rays, self._generator)
+        remembers = self.steps % config.occupancy_interval < 2
+        refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
+        refines = refines and self.poses.freeze_converged(self.steps)
+        result = compute_gradients(
+            field, self.sampler, self.replay.correspondences, batch, config,
+            hard_surface_share=hard_surface_share,
+            surface_share=1.0 - falling,
+            density_cache=self.avatar.occupancy.density_grid if remembers else None,
             poses=self.poses if refines else None,
             generator=self._generator,
         )  # fmt: skip
-        for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE), strict=True):
+        for group, base in zip(self.optimizer.param_groups, (1.0, NETWORK_RATE_FACTOR), strict=True):
             group["lr"] = config.learning_rate * base * rate
         self.optimizer.step()
         field.table_grad.zero_()
         if refines:
             self._correct_poses(falling)
-        self.replay.learn_errors(batch.rays.slots.long(), result.loss)
-        if self.steps % config.occupancy_every == 0:
+        self.replay.update_errors(batch.rays.slots.long(), result.loss)
+        if self.steps % config.occupancy_interval == 0:
             self._update_occupancy(1.0 - falling)
-        self.sampler.update(self.steps, self.replay.cells, self._generator)
+        self.sampler.update(self.steps, self.replay.correspondences, self._generator)
         self.steps += 1
-        follow(self.avatar.field, field, self.steps)
+        update_ema(self.avatar.field, field, self.steps)
         self.rays += config.rays
-        self.samples += result.samples
+        self.samples += result.sample_count
         return result
 
-    def _forget_corrections(self) -> None:
+    def _discard_old_corrections(self) -> None:
         """Of frames that are long gone from replay, so that memory stays bounded."""
-        if len(self.corrections) > 2 * self.replay.capacity:
-            kept = set(self.replay.indices)
-            self.corrections = {i: c for i, c in self.corrections.items() if i in kept}
+        if len(self.pose_corrections) > 2 * self.replay.capacity:
+            kept = set(self.replay.frame_indices)
+            self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
         for _ in range(CORRECTIONS_PER_STEP):
-            slot = let_follow(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
+            slot = correct_one_pose(self.avatar.rig, self.backend, self.replay, self.poses, rate=rate)
             if slot is not None:
                 correction = self.poses.corrections[slot].copy()
-                self.corrections[self.replay.indices[slot]] = correction
+                self.pose_corrections[self.replay.frame_indices[slot]] = correction
 
-    def _update_occupancy(self, firm_share: float) -> None:
-        clearing = self.steps < CLEARING_STEPS
+    def _update_occupancy(self, surface_share: float) -> None:
+        clearing = self.steps < INITIAL_OCCUPANCY_STEPS
         self.avatar.occupancy.update(
-            lambda points: self.field.raw_at(points)[:, 3],
+            lambda points: self.field.raw_outputs_at(points)[:, 3],
             share=0.5 if clearing else 0.25,
-            decay=FIRST_DECAY if clearing else DECAY,
-            thinnest=self.config.thin_density * firm_share,
-            drop_specks=not clearing,
-            step_m=self.config.step_m,
+            decay=INITIAL_OCCUPANCY_DECAY if clearing else OCCUPANCY_DECAY,
+            min_density=self.config.min_occupied_density * surface_share,
+            drop_floaters=not clearing,
+            sample_step_m=self.config.sample_step_m,
             generator=self._generator,
         )
 
 
-def rebuild_warp(rig: Rig, replay: Replay, poses: PoseTable, slot: int) -> None:
+def resolve_correspondences(rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, slot: int) -> None:
     """Solves a frame's warp cells again and moves its rays to its corrected pose."""
     joints = poses.pose(slot).joint_rotations
-    replay.put_cells(slot, WarpCells.of(rig, joints, device=replay.device))
-    replay.move_root(slot, poses.root(slot))
+    replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints, device=replay.device))
+    replay.correct_root(slot, poses.root_correction(slot))
 
 
-def let_follow(
-    rig: Rig, backend: Backend, replay: Replay, poses: PoseTable, *, rate: float
+def correct_one_pose(
+    rig: Rig, backend: Backend, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
 ) -> int | None:
     """Corrects one pose; its frame's warp and rays follow.
 
@@ -211,12 +211,12 @@ def let_follow(
     Returns:
         The slot whose pose moved, or None if too little is known about any.
     """
-    slot = poses.correct_one(rate=rate)
+    slot = poses.correct_next(rate=rate)
     if slot is None:
         return None
-    if poses.strayed(slot):
-        rebuild_warp(rig, replay, poses, slot)
+    if poses.needs_resolve(slot):
+        resolve_correspondences(rig, replay, poses, slot)
     else:
-        backend.follow(replay.cells, slot, poses.skin, poses.bones[slot])
-        replay.move_root(slot, poses.root(slot))
+        backend.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
+        replay.correct_root(slot, poses.root_correction(slot))
     return slot

@@ -19,49 +19,49 @@ from typing import NamedTuple
 import torch
 import tyro
 
-from apps.recording.recording import Recording
-from avatar.hold import HeldOut
+from apps.recording.recording import Capture
+from avatar.hold import HeldOutFrame
 from avatar.model import Avatar
-from avatar.prepare import PreparedFrame
+from avatar.prepare import TrainingFrame
 from avatar.rig import Rig
-from benchmarks.ablation_page import Page, written
+from benchmarks.ablation_page import AblationPage, written
 from benchmarks.hardware import Hardware
-from benchmarks.in_turns import Budget, Outcome, Run, Variant, outcome, trained
-from benchmarks.quality import NOISE, novel_pictures, truly_posed
-from benchmarks.schemes import Drawn, drawn
-from benchmarks.stage import assembled, filmed, opened, recipe
-from benchmarks.stopwatch import use_threads
+from benchmarks.in_turns import TrainingBudget, VariantOutcome, VariantRun, Variant, score_variant, train_variants
+from benchmarks.quality import NOISE, novel_pose_frames, with_true_poses
+from benchmarks.schemes import SchemeTiming, time_scheme
+from benchmarks.stage import load_trainer, film_sample, open_sample, training_config
+from benchmarks.stopwatch import limit_threads
 
-DRAWN = 3
-"""Novel poses that every scheme draws."""
+TIMED_POSES = 3
+"""NovelPoseScores poses that every scheme draws."""
 PAPER = "union grid, Broyden (the paper)"
-GIVEN = {"refine_poses": False}
-LOSSES = [
-    Variant(name="full", changes=GIVEN),
-    Variant(name="w/o alpha loss", changes={**GIVEN, "alpha_weight": 0.0}),
-    Variant(name="w/o hard surface", changes={**GIVEN, "hard_weight": 0.0}),
-    Variant(name="w/o occupancy-based regulariser", changes={**GIVEN, "empty_weight": 0.0}),
-    Variant(name="w/o total variation", changes={**GIVEN, "variation_weight": 0.0}),
-    Variant(name="global sparsity instead", changes={**GIVEN, "empty_term": "global"}),
+POSES_AS_GIVEN = {"refine_poses": False}
+LOSS_VARIANTS = [
+    Variant(name="full", changes=POSES_AS_GIVEN),
+    Variant(name="w/o alpha loss", changes={**POSES_AS_GIVEN, "alpha_weight": 0.0}),
+    Variant(name="w/o hard surface", changes={**POSES_AS_GIVEN, "hard_weight": 0.0}),
+    Variant(name="w/o occupancy-based regulariser", changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0}),
+    Variant(name="w/o total variation", changes={**POSES_AS_GIVEN, "density_tv_weight": 0.0}),
+    Variant(name="global sparsity instead", changes={**POSES_AS_GIVEN, "empty_term": "global"}),
 ]
-CELLS = [
-    Variant(name="union grid, cells", changes={**GIVEN, "skipping": "union"}),
-    Variant(name="per-frame grids, cells", changes={**GIVEN, "skipping": "frame"}),
-    Variant(name="no skipping, cells", changes={**GIVEN, "skipping": "none", "empty_weight": 0.0}),
+CORRESPONDENCE_VARIANTS = [
+    Variant(name="union grid, cells", changes={**POSES_AS_GIVEN, "skipping": "union"}),
+    Variant(name="per-frame grids, cells", changes={**POSES_AS_GIVEN, "skipping": "frame"}),
+    Variant(name="no skipping, cells", changes={**POSES_AS_GIVEN, "skipping": "none", "empty_space_weight": 0.0}),
 ]
-BROYDEN = [
-    Variant(name="canonical occupancy, Broyden", changes={**GIVEN, "roots": "broyden"}),
+BROYDEN_VARIANTS = [
+    Variant(name="canonical occupancy, Broyden", changes={**POSES_AS_GIVEN, "roots": "broyden"}),
     Variant(
         name=PAPER,
-        changes={**GIVEN, "roots": "broyden", "skipping": "union"},
+        changes={**POSES_AS_GIVEN, "roots": "broyden", "skipping": "union"},
     ),
     Variant(
         name="no skipping, Broyden",
-        changes={**GIVEN, "roots": "broyden", "skipping": "none", "empty_weight": 0.0},
+        changes={**POSES_AS_GIVEN, "roots": "broyden", "skipping": "none", "empty_space_weight": 0.0},
     ),
 ]
-REFINEMENT = [
-    Variant(name="poses as given", changes=GIVEN),
+REFINEMENT_VARIANTS = [
+    Variant(name="poses as given", changes=POSES_AS_GIVEN),
     Variant(name="poses refined", changes={"refine_poses": True}),
 ]
 
@@ -88,14 +88,14 @@ class Ablation:
     """Folder for what is filmed; what lies there is used again."""
 
 
-class Scene(NamedTuple):
+class AblationData(NamedTuple):
     """What is trained on, and what is scored."""
 
-    recording: Recording
+    recording: Capture
     rig: Rig
-    frames: list[PreparedFrame]
-    held: list[HeldOut]
-    novel: list[HeldOut]
+    frames: list[TrainingFrame]
+    held_out: list[HeldOutFrame]
+    novel: list[HeldOutFrame]
 
 
 def main() -> None:
@@ -105,99 +105,99 @@ def main() -> None:
         job = Ablation(**{**vars(job), "seconds": 2.0, "steps": 20})
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        page = measured(job, hardware, job.keep or Path(temporary))
+        page = run_ablation(job, hardware, job.keep or Path(temporary))
     print("\n".join(page.lines()))
     if job.json is not None:
-        job.json.write_text(json.dumps(asdict(page), indent=1) + "\n")
+        job.json.write_text_atomically(json.dumps(asdict(page), indent=1) + "\n")
     if job.write is not None:
-        job.write.write_text(written(page, job.write))
+        job.write.write_text_atomically(written(page, job.write))
 
 
-def measured(job: Ablation, hardware: Hardware, folder: Path) -> Page:
+def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:
     """Everything, table after table; each row is told on standard error as it comes."""
     began, device = time.process_time(), torch.device(job.device)
-    scene = staged(filmed(folder / f"sample{job.size}", job.size), device)
-    runs = trained_on(scene, [*LOSSES, *CELLS, *BROYDEN], Budget(seconds=job.seconds), device)
-    by_time = told(runs, scene)
-    occupancy_ms, ours = upkeep_ms(runs[0]), runs[0].trainer.avatar
+    scene = load_data(film_sample(folder / f"sample{job.size}", job.size), device)
+    runs = train_variants(scene, [*LOSS_VARIANTS, *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], TrainingBudget(seconds=job.seconds), device)
+    by_time = outcomes_of(runs, scene)
+    occupancy_ms, ours = occupancy_update_ms(runs[0]), runs[0].trainer.avatar
     del runs
-    counted = Budget(steps=job.steps)
-    runs = trained_on(scene, [LOSSES[0], *CELLS, *BROYDEN], counted, device)
-    by_steps = told(runs, scene)
-    schemes = by_schemes(ours, _of(runs, PAPER).trainer.avatar, scene)
+    counted = TrainingBudget(steps=job.steps)
+    runs = train_variants(scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted, device)
+    by_steps = outcomes_of(runs, scene)
+    schemes = time_schemes(ours, _run_named(runs, PAPER).trainer.avatar, scene)
     del runs
-    noisy_capture = filmed(folder / f"noisy{job.size}", job.size, **NOISE)
-    noisy = staged(noisy_capture, device)
-    noisy = noisy._replace(held=truly_posed(noisy_capture, noisy.held, noisy.rig))
-    budget = Budget(seconds=job.seconds)
-    return Page(
+    noisy_capture = film_sample(folder / f"noisy{job.size}", job.size, **NOISE)
+    noisy = load_data(noisy_capture, device)
+    noisy = noisy._replace(held_out=with_true_poses(noisy_capture, noisy.held_out, noisy.rig))
+    budget = TrainingBudget(seconds=job.seconds)
+    return AblationPage(
         hardware=hardware.lines(),
         size=job.size,
         seconds=job.seconds,
         steps=job.steps,
-        pictures=(len(scene.frames), len(scene.held), len(scene.novel), DRAWN),
+        pictures=(len(scene.frames), len(scene.held_out), len(scene.novel), TIMED_POSES),
         occupancy_ms=occupancy_ms,
-        losses=by_time[: len(LOSSES)],
-        by_time=[by_time[0], *by_time[len(LOSSES) :]],
+        losses=by_time[: len(LOSS_VARIANTS)],
+        by_time=[by_time[0], *by_time[len(LOSS_VARIANTS) :]],
         by_steps=by_steps,
-        drawn=schemes,
-        exact=told(trained_on(scene, REFINEMENT, budget, device), scene),
-        noisy=told(trained_on(noisy, REFINEMENT, budget, device), noisy),
+        scheme_timings=schemes,
+        exact=outcomes_of(train_variants(scene, REFINEMENT_VARIANTS, budget, device), scene),
+        noisy=outcomes_of(train_variants(noisy, REFINEMENT_VARIANTS, budget, device), noisy),
         core_minutes=(time.process_time() - began) / 60.0,
     )
 
 
-def staged(capture: Path, device: torch.device) -> Scene:
+def load_data(capture: Path, device: torch.device) -> AblationData:
     """A filmed sample, every frame made ready."""
-    use_threads(1)
-    recording = opened(capture)
-    rig = Rig.of(recording.shaped)
-    seen = assembled(recording, rig, recipe(recording, 60.0), device)
-    return Scene(recording, rig, seen.frames, seen.held, novel_pictures(capture, rig))
+    limit_threads(1)
+    recording = open_sample(capture)
+    rig = Rig.from_shaped_body(recording.shaped)
+    seen = load_trainer(recording, rig, training_config(recording, 60.0), device)
+    return AblationData(recording, rig, seen.frames, seen.held_out, novel_pose_frames(capture, rig))
 
 
-def trained_on(
-    scene: Scene, variants: list[Variant], budget: Budget, device: torch.device
-) -> list[Run]:
+def train_variants(
+    scene: AblationData, variants: list[Variant], budget: TrainingBudget, device: torch.device
+) -> list[VariantRun]:
     """Every variant after its budget."""
-    return trained(variants, budget, scene.recording, scene.rig, scene.frames, device)
+    return train_variants(variants, budget, scene.recording, scene.rig, scene.frames, device)
 
 
-def told(runs: Iterable[Run], scene: Scene) -> list[Outcome]:
+def outcomes_of(runs: Iterable[VariantRun], scene: AblationData) -> list[VariantOutcome]:
     """What became of them."""
     outcomes = []
     for run in runs:
-        outcomes.append(outcome(run, scene.held, scene.novel))
+        outcomes.append(score_variant(run, scene.held_out, scene.novel))
         print(outcomes[-1], file=sys.stderr, flush=True)
     return outcomes
 
 
-def upkeep_ms(run: Run) -> float:
+def occupancy_update_ms(run: VariantRun) -> float:
     """What keeping the canonical occupancy costs a step: every variant pays it, ours alone must."""
-    every = run.trainer.config.occupancy_every
+    every = run.trainer.config.occupancy_interval
     began = time.process_time()
     for _ in range(3):
         run.trainer._update_occupancy(0.0)
     return 1000.0 * (time.process_time() - began) / 3 / every
 
 
-def _of(runs: list[Run], name: str) -> Run:
+def _run_named(runs: list[VariantRun], name: str) -> VariantRun:
     return next(run for run in runs if run.variant.name == name)
 
 
-def by_schemes(ours: Avatar, theirs: Avatar, scene: Scene) -> list[Drawn]:
+def time_schemes(ours: Avatar, theirs: Avatar, scene: AblationData) -> list[SchemeTiming]:
     """Two avatars, ours and that of the paper's own training, drawn by each scheme."""
-    step = max(1, len(scene.novel) // DRAWN)
-    pictures = scene.novel[::step][:DRAWN]
+    step = max(1, len(scene.novel) // TIMED_POSES)
+    pictures = scene.novel[::step][:TIMED_POSES]
     rows = [
-        drawn("canonical occupancy, cells", ours, pictures, skipping="canonical", roots="cells"),
-        drawn("per-frame grid, cells", ours, pictures, skipping="frame", roots="cells"),
-        drawn("no skipping, cells", ours, pictures, skipping="none", roots="cells"),
-        drawn(
+        time_scheme("canonical occupancy, cells", ours, pictures, skipping="canonical", roots="cells"),
+        time_scheme("per-frame grid, cells", ours, pictures, skipping="frame", roots="cells"),
+        time_scheme("no skipping, cells", ours, pictures, skipping="none", roots="cells"),
+        time_scheme(
             "per-frame grid, Broyden (the paper)", theirs, pictures,
             skipping="frame", roots="broyden",
         ),
-        drawn("no skipping, Broyden", theirs, pictures, skipping="none", roots="broyden"),
+        time_scheme("no skipping, Broyden", theirs, pictures, skipping="none", roots="broyden"),
     ]  # fmt: skip
     for row in rows:
         print(row, file=sys.stderr, flush=True)

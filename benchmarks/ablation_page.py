@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.in_turns import Outcome
-from benchmarks.marks import written as number
-from benchmarks.schemes import Drawn
+from benchmarks.in_turns import VariantOutcome
+from benchmarks.marks import format_value as number
+from benchmarks.schemes import SchemeTiming
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 COMMAND = "python -m benchmarks.ablation --write docs/ablation.md"
@@ -14,14 +14,14 @@ SCORES = ("novel PSNR", "in the mask", "SSIM", "held-out PSNR", "in the mask", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Page:
+class AblationPage:
     """All figures of a run.
 
     Attributes:
         hardware: Where and when.
         size: Of the pictures, pixels.
         seconds, steps: What each variant was given.
-        pictures: Frames learnt, held out; novel poses scored, and drawn by each scheme.
+        pictures: EvaluationFrames learnt, held out; novel poses scored, and drawn by each scheme.
         occupancy_ms: What keeping the canonical occupancy costs a step.
         losses: One by one.
         by_time, by_steps: Skipping and root finding, for both budgets.
@@ -38,12 +38,12 @@ class Page:
     steps: int
     pictures: tuple[int, int, int, int]
     occupancy_ms: float
-    losses: list[Outcome]
-    by_time: list[Outcome]
-    by_steps: list[Outcome]
-    drawn: list[Drawn]
-    exact: list[Outcome]
-    noisy: list[Outcome]
+    losses: list[VariantOutcome]
+    by_time: list[VariantOutcome]
+    by_steps: list[VariantOutcome]
+    scheme_timings: list[SchemeTiming]
+    exact: list[VariantOutcome]
+    noisy: list[VariantOutcome]
     core_minutes: float
 
     def lines(self) -> list[str]:
@@ -101,7 +101,7 @@ class Page:
             "",
         ]
 
-    def _paced(self, rows: Sequence[Outcome]) -> list[str]:
+    def _paced(self, rows: Sequence[VariantOutcome]) -> list[str]:
         head = ("", "ms a step", "late ones", "samples a ray", "steps", *SCORES)
         full = self.by_time[0].name
         return _table(
@@ -117,15 +117,15 @@ class Page:
         )  # fmt: skip
 
     def _rendering(self, some: int) -> list[str]:
-        if not self.drawn:
+        if not self.scheme_timings:
             return []
         rows = [
             (
-                row.name, number(row.ready_ms), number(row.draw_ms),
+                row.name, number(row.setup_ms), number(row.render_ms),
                 f"{row.quality.psnr:.2f}", f"{row.quality.psnr_mask:.2f}",
                 f"{row.quality.ssim:.4f}",
             )
-            for row in self.drawn
+            for row in self.scheme_timings
         ]  # fmt: skip
         return [
             f"## Skipping in rendering ({some} novel poses, core-ms, medians)",
@@ -156,7 +156,7 @@ class Page:
         ]
 
 
-def written(page: Page, path: Path) -> str:
+def written(page: AblationPage, path: Path) -> str:
     """The file's text with its tables written anew; what is said around them stays."""
     before, after = "# The paper's ablations, repeated\n\n", "\n"
     if path.exists():
@@ -166,14 +166,14 @@ def written(page: Page, path: Path) -> str:
     return before + "\n".join([BEGIN, *page.lines(), END]) + after
 
 
-def _named(rows: Sequence[Outcome], name: str) -> Outcome:
+def _named(rows: Sequence[VariantOutcome], name: str) -> VariantOutcome:
     return next(row for row in rows if row.name == name)
 
 
-def _scored(row: Outcome, *first: str, name: str | None = None) -> tuple[str, ...]:
+def _scored(row: VariantOutcome, *first: str, name: str | None = None) -> tuple[str, ...]:
     scores = [
         text
-        for quality in (row.novel, row.held)
+        for quality in (row.novel, row.held_out)
         for text in (f"{quality.psnr:.2f}", f"{quality.psnr_mask:.2f}", f"{quality.ssim:.4f}")
     ]
     return (name or row.name, *first, *scores)

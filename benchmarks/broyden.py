@@ -1,4 +1,4 @@
-"""Fast-SNARF's own way, compiled for the CPU: Broyden's method for every sample.
+"""Fast-SNARF's own way, compiled for the CPU: BroydenLookup's method for every sample.
 
 Nine starts a sample, one for each of InstantAvatar's bones; each ends as soon as it is within
 1e-4 m, after twelve iterations, or when it has left the body (the solver that builds warp cells).
@@ -7,29 +7,29 @@ Nine starts a sample, one for each of InstantAvatar's bones; each ends as soon a
 import numpy as np
 from jaxtyping import Float, Float32
 
-from avatar.kernels.backend import Grid
-from avatar.kernels.cpu_broyden import solve
-from avatar.kernels.cpu_skin import LANES, moved
-from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.backend import DensityGrid
+from avatar.kernels.cpu_broyden import solve_root
+from avatar.kernels.cpu_skin import MATRIX_LANES, transform_point
+from avatar.kernels.jit import FAST_MATH, compile_kernel
 from avatar.kernels.roots import START_BONES
 from avatar.rig import Rig
 
 F32, I32 = np.float32, np.int32
 
 
-@compile_kernel(cache=False, **FAST)  # what it calls lies in another folder
-def _solve_all(
+@compile_kernel(cache=False, **FAST_MATH)  # what it calls lies in another folder
+def _nearest_density_roots(
     points, transforms, low, nodes_per_m, inverse_bones, occupied, density, cells_per_m, out
 ):
-    blend, inverse = np.empty(LANES, np.float32), np.empty(9, np.float32)
+    blend, inverse = np.empty(MATRIX_LANES, np.float32), np.empty(9, np.float32)
     x = np.empty(3, np.float32)
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         best = F32(-1)
         out[i, 0] = out[i, 1] = out[i, 2] = F32(1e3)
         for bone in range(inverse_bones.shape[0]):
-            x[0], x[1], x[2] = moved(inverse_bones[bone], px, py, pz)
-            if not solve(transforms, low, nodes_per_m, points[i], x, blend, inverse, True):
+            x[0], x[1], x[2] = transform_point(inverse_bones[bone], px, py, pz)
+            if not solve_root(transforms, low, nodes_per_m, points[i], x, blend, inverse, True):
                 continue
             a = I32(np.floor((x[0] - low[0]) * cells_per_m[0]))
             b = I32(np.floor((x[1] - low[1]) * cells_per_m[1]))
@@ -43,12 +43,12 @@ def _solve_all(
                 out[i, 0], out[i, 1], out[i, 2] = x[0], x[1], x[2]
 
 
-class Broyden:
+class BroydenLookup:
     """Root finding in one pose; of several roots the one of highest cached density counts."""
 
-    def __init__(self, rig: Rig, joint_rotations: Float[np.ndarray, "23 3"], grid: Grid) -> None:
+    def __init__(self, rig: Rig, joint_rotations: Float[np.ndarray, "23 3"], grid: DensityGrid) -> None:
         bones = rig.body_from_canonical(joint_rotations)
-        flat = np.zeros((24, LANES), dtype=np.float32)
+        flat = np.zeros((24, MATRIX_LANES), dtype=np.float32)
         flat[:, :12] = bones[:, :3].reshape(24, 12)
         inverses = np.linalg.inv(bones[list(START_BONES)])[:, :3].reshape(-1, 12)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
@@ -65,5 +65,5 @@ class Broyden:
     def __call__(self, points: Float32[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 3"]:
         """Canonical points; far outside the box where nothing was found."""
         out = np.empty_like(points)
-        _solve_all(points, *self._given, out)
+        _nearest_density_roots(points, *self._given, out)
         return out

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.rig import Rig
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Mark
-from benchmarks.stage import opened
-from benchmarks.stopwatch import interleaved
+from benchmarks.marks import Measurement
+from benchmarks.stage import open_sample
+from benchmarks.stopwatch import time_interleaved
 from preprocess.pose_file import read_motion
 
 BANDS_M = (0.08, 0.15)
@@ -28,40 +28,40 @@ def main() -> None:
 
 def built(capture: Path) -> dict[str, float]:
     """Milliseconds of CPU time in two poses, and how many roots there are, for each band."""
-    recording = opened(capture)
-    rig = Rig.of(recording.shaped)
+    recording = open_sample(capture)
+    rig = Rig.from_shaped_body(recording.shaped)
     novel = read_motion(capture / "truth" / "novel" / "poses.npz")
     poses = {
         "training": recording.motion[len(recording.motion) // 3].joint_rotations,
         "novel": novel[len(novel) // 2].joint_rotations,
     }
     work = {
-        f"{name} {band_m}": lambda pose=pose, band_m=band_m: WarpCells.of(rig, pose, band_m=band_m)
+        f"{name} {band_m}": lambda pose=pose, band_m=band_m: CorrespondenceGrid.solve(rig, pose, band_m=band_m)
         for name, pose in poses.items()
         for band_m in BANDS_M
     }
-    times = interleaved(work, torch.device("cpu"), rounds=ROUNDS)
+    times = time_interleaved(work, torch.device("cpu"), rounds=ROUNDS)
     roots = {
         f"roots {band_m}": float(
-            (WarpCells.of(rig, poses["training"], band_m=band_m).index & 3).sum()
+            (CorrespondenceGrid.solve(rig, poses["training"], band_m=band_m).packed_cells & 3).sum()
         )
         for band_m in BANDS_M
     }
     return {name: 1000.0 * time for name, time in times.items()} | roots
 
 
-def build_marks(capture: Path) -> list[Mark]:
+def build_marks(capture: Path) -> list[Measurement]:
     """One row for each band."""
     told = _apart(capture)
     marks = []
     for band_m, least, moonshot in zip(BANDS_M, ("≤ 30", "printed"), ("≤ 12", ""), strict=True):
         marks.append(
-            Mark(
+            Measurement(
                 name=f"build of a frame's cells, {100 * band_m:.0f}-cm band, core-ms",
                 value=told[f"training {band_m}"],
-                least=least,
-                moonshot=moonshot,
-                beside=f"training pose, {told[f'roots {band_m}']:,.0f} roots; novel pose "
+                required=least,
+                stretch_goal=moonshot,
+                context=f"training pose, {told[f'roots {band_m}']:,.0f} roots; novel pose "
                 f"{told[f'novel {band_m}']:.1f} ms",
             )
         )

@@ -19,23 +19,23 @@ import numpy as np
 from rich.console import Console as RichConsole
 from scipy.spatial.transform import Rotation
 
-from apps.recording.opening import open_recording
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
+from apps.recording.opening import open_capture
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
 from apps.solving.job import SolveJob
-from apps.solving.joining import joined
-from apps.solving.solving import Solving
-from apps.studio.writer import ShootConfig, shoot
+from apps.solving.joining import apply_camera_solution
+from apps.solving.solving import SolverProcess
+from apps.studio.writer import ShootConfig, film_capture
 from apps.terminal.console import Console
 from benchmarks.hardware import Hardware
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.camera_file import CameraTrack, read_cameras
-from preprocess.doctor.claim import Claim
-from preprocess.fit.stature import as_tall, farther, height_of
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.fit.stature import scale_to_height, rescale_motion, body_height_m
 from preprocess.pose_file import read_motion
-from preprocess.solve.gates import similarity
-from preprocess.solve.solved import Solved
+from preprocess.solve.gates import fit_similarity
+from preprocess.solve.solved import CameraSolution
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
 MOST_PSNR_LOSS = 0.5
@@ -47,7 +47,7 @@ ROOMS: tuple[Room, ...] = ("room", "tiles")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Errors:
+class CameraErrors:
     """Of a capture's cameras against the true ones.
 
     Attributes:
@@ -64,9 +64,9 @@ class Errors:
     focal: float
 
     @classmethod
-    def of(cls, found: tuple[Camera, ...], true: tuple[Camera, ...]) -> "Errors":
+    def of(cls, found: tuple[Camera, ...], true: tuple[Camera, ...]) -> "CameraErrors":
         a, b = (np.stack([camera.center_world for camera in track]) for track in (found, true))
-        scale, turn, shift = similarity(a, b)
+        scale, turn, shift = fit_similarity(a, b)
         off = 100.0 * np.linalg.norm(scale * a @ turn.T + shift - b, axis=1)
         here, there = (
             np.stack([camera.camera_from_world[:3, :3] for camera in track])
@@ -98,7 +98,7 @@ class Errors:
         )
 
 
-def filmed(folder: Path, background: Room, seed: int, given: argparse.Namespace) -> Path:
+def film_or_reuse(folder: Path, background: Room, seed: int, given: argparse.Namespace) -> Path:
     """A capture, unless it lies there already."""
     capture = folder / f"{background}{seed}-{given.size}-{given.frames}"
     if not capture.exists():
@@ -106,82 +106,82 @@ def filmed(folder: Path, background: Room, seed: int, given: argparse.Namespace)
             frames=given.frames, size=given.size, seed=seed, motion="walkaround",
             background=background, subject=2 if seed % 2 else 1,
         )  # fmt: skip
-        shoot(capture, config)
+        film_capture(capture, config)
     return capture
 
 
 def job_of(capture: Path) -> SolveJob:
     """As `ia-ingest CAPTURE/video.mp4 --poses CAPTURE/poses.npz --cameras solve`."""
-    named = RecordingPaths(
+    named = CaptureInputs(
         video=capture / "video.mp4", poses=capture / "poses.npz", masks=capture / "masks",
         cameras="solve",
     )  # fmt: skip
     return SolveJob(paths=named, seed=0, threads=1)
 
 
-def truth(capture: Path, recording: Recording) -> CameraTrack:
+def truth(capture: Path, recording: Capture) -> CameraTrack:
     return read_cameras(capture / "truth" / "cameras.npz", recording.source.size_px)
 
 
-def solved_film(capture: Path, runs: Path) -> tuple[Solved, Recording]:
+def solve_film(capture: Path, runs: Path) -> tuple[CameraSolution, Capture]:
     """By the process that ia-ingest starts.
 
     Raises:
-        BadInput: If it refuses.
+        InputError: If it refuses.
     """
     job = job_of(capture)
-    with Solving(job, runs / capture.name) as solving:
+    with SolverProcess(job, runs / capture.name) as solving:
         solved = solving.wait(Console(RichConsole(stderr=True, quiet=True)))
     assert solved is not None
-    return solved, joined(open_recording(job.paths), solved)
+    return solved, apply_camera_solution(open_capture(job.paths), solved)
 
 
-def told(capture: Path, runs: Path) -> tuple[str, bool | None]:
+def measure_film(capture: Path, runs: Path) -> tuple[str, bool | None]:
     """A line for one film, and whether it is good; None if the cameras were refused."""
     try:
-        solved, recording = solved_film(capture, runs)
-    except BadInput as refusal:
+        solved, recording = solve_film(capture, runs)
+    except InputError as refusal:
         return f"refused: {str(refusal).split(';')[0]}", None
-    errors = Errors.of(recording.cameras.cameras, truth(capture, recording).cameras)
+    errors = CameraErrors.of(recording.cameras.cameras, truth(capture, recording).cameras)
     costs = solved.costs
-    assert recording.solved is not None
-    frames = recording.solved["frames"]
+    assert recording.camera_report is not None
+    frames = recording.camera_report["frames"]
     return (
         f"{errors}; {solved.keys} key frames + {frames['placed']}; {costs['cpu_seconds']:.0f} "
-        f"core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.solved['scale']['cues']}",
+        f"core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.camera_report['scale']['cues']}",
         errors.good,
     )
 
 
-def heights(capture: Path, runs: Path) -> tuple[float, float]:
-    """Errors of the scale if the tracker's body is too tall: without, and with the height."""
-    solved, _ = solved_film(capture, runs)
-    plain = open_recording(job_of(capture).paths)
-    tall = height_of(plain.shaped)
+def scale_errors_by_height(capture: Path, runs: Path) -> tuple[float, float]:
+    """CameraErrors of the scale if the tracker's body is too tall: without, and with the height."""
+    solved, _ = solve_film(capture, runs)
+    plain = open_capture(job_of(capture).paths)
+    tall = body_height_m(plain.shaped)
 
-    def sized(recording: Recording, height_m: float) -> Recording:
-        body = as_tall(recording.shaped, height_m)
-        claim = Claim.of(recording.motion, recording.cameras, recording.source)
-        return replace(recording, shaped=body, motion=farther(claim, recording.shaped, body))
+    def sized(recording: Capture, height_m: float) -> Capture:
+        body = scale_to_height(recording.shaped, height_m)
+        claim = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
+        return replace(recording, shaped=body, motion=rescale_motion(claim, recording.shaped, body))
 
     biased = sized(plain, TOO_TALL * tall)
     stated = sized(biased, round(tall, 2))  # people know theirs to a centimetre
     true = truth(capture, plain).cameras
-    found = [joined(each, solved).cameras.cameras for each in (biased, stated)]
-    return Errors.of(found[0], true).scale, Errors.of(found[1], true).scale
+    found = [apply_camera_solution(each, solved).cameras.cameras for each in (biased, stated)]
+    return CameraErrors.of(found[0], true).scale, CameraErrors.of(found[1], true).scale
 
 
-def losses(capture: Path, runs: Path) -> dict[str, float]:
+def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
     """Held-out PSNR, dB, of short runs that differ in their cameras alone."""
     import torch
 
     from avatar.rig import Rig
     from avatar.warm import warm_up
-    from benchmarks.quality import quality
-    from benchmarks.stage import assembled, recipe, train_for_core_seconds
-    from benchmarks.stopwatch import use_threads
+    from benchmarks.quality import mean_psnr
+    from benchmarks.stage import load_trainer, training_config, train_for_core_seconds
+    from benchmarks.stopwatch import limit_threads
 
-    _, recording = solved_film(capture, runs)
+    _, recording = solve_film(capture, runs)
     paths, true = recording.paths, truth(capture, recording)
     exact = read_motion(capture / "truth" / "poses.npz")
     # Stricter than what anybody does, and not asked: exact poses of the true world, seen by solved
@@ -190,7 +190,7 @@ def losses(capture: Path, runs: Path) -> dict[str, float]:
         np.stack([camera.center_world for camera in track.cameras])
         for track in (recording.cameras, true)
     )
-    scale, turn, shift = similarity(a, b)
+    scale, turn, shift = fit_similarity(a, b)
     there = tuple(_moved(camera, scale, turn, shift) for camera in recording.cameras.cameras)
     variants = {
         "true cameras": replace(recording, cameras=true, motion=exact),
@@ -201,14 +201,14 @@ def losses(capture: Path, runs: Path) -> dict[str, float]:
     }
     found = {}
     for name, each in variants.items():
-        use_threads(1)
+        limit_threads(1)
         each = replace(each, paths=paths, size_px=TRAINED_PX)
-        rig = Rig.of(each.shaped)
-        config = replace(recipe(each, TRAINED_CORE_S), refine_poses=False)
-        seen = assembled(each, rig, config, torch.device("cpu"))
+        rig = Rig.from_shaped_body(each.shaped)
+        config = replace(training_config(each, TRAINED_CORE_S), refine_poses=False)
+        seen = load_trainer(each, rig, config, torch.device("cpu"))
         warm_up(seen.trainer)
         train_for_core_seconds(seen.trainer, TRAINED_CORE_S)
-        found[name] = quality(seen.trainer.avatar, seen.held).psnr
+        found[name] = mean_psnr(seen.trainer.avatar, seen.held_out).psnr
     return found
 
 
@@ -235,12 +235,12 @@ def main() -> None:
         runs = folder / "runs"
         for background in ROOMS:
             for seed in range(given.seeds):
-                said, good = told(filmed(folder, background, seed, given), runs)
+                said, good = measure_film(film_or_reuse(folder, background, seed, given), runs)
                 fine &= good is True or (good is None and background == "tiles")
                 mark = "✓" if good else "✗" if good is False else "·"
                 print(f"{mark} {background:<5} seed {seed}: {said}", flush=True)
-        first = filmed(folder, "room", 0, given)
-        without, stated = heights(first, runs)
+        first = film_or_reuse(folder, "room", 0, given)
+        without, stated = scale_errors_by_height(first, runs)
         fine &= abs(stated) < MOST_SCALE_STATED
         tall = f"{100.0 * (TOO_TALL - 1.0):.0f} % too tall"
         print(
@@ -248,7 +248,7 @@ def main() -> None:
             f"with the stated height {100.0 * stated:+.2f} % (asked: under 1 %)"
         )
         if not given.no_psnr:
-            scores = losses(first, runs)
+            scores = psnr_by_cameras(first, runs)
             for name, psnr in scores.items():
                 lost = scores["true cameras"] - psnr
                 fine &= name != "solved" or lost < MOST_PSNR_LOSS

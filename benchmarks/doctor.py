@@ -1,6 +1,6 @@
 """Whether the doctor names what is wrong: 44 spoilt copies of samples, and 10 good ones.
 
-    python -m benchmarks.doctor [--keep DIR]
+    python -m benchmarks.capture_check [--keep DIR]
 
 A mistake is found if the doctor's first cause is one that was made; of two that were made at once,
 whether it names both is counted, too. A good capture must be called good, with no cause. Seconds
@@ -13,14 +13,14 @@ import tempfile
 import time
 from pathlib import Path
 
-from apps.checking.examine import examine
-from apps.recording.wanted import RecordingPaths
-from apps.studio.writer import ShootConfig, shoot
+from apps.checking.examine import check_capture
+from apps.recording.wanted import CaptureInputs
+from apps.studio.writer import ShootConfig, film_capture
 from benchmarks import spoils
 from benchmarks.hardware import Hardware
-from benchmarks.spoils import Case
+from benchmarks.capture_corruptions import CorruptedCapture
 
-FILMS = {
+CAPTURES = {
     "turn": ShootConfig(frames=120, size=256),
     "dance": ShootConfig(frames=120, size=256, motion="dance", subject=2),
     "noisy": ShootConfig(frames=90, size=192, pose_noise_deg=2.0, pose_noise_cm=1.0, seed=3),
@@ -28,100 +28,100 @@ FILMS = {
     "small": ShootConfig(frames=48, size=128, motion="dance", seed=5),
 }
 
-SPOILT = (
-    Case(film="turn", spoils=(("frame_offset", spoils.late(3)),)),
-    Case(film="dance", spoils=(("frame_offset", spoils.late(-7)),)),
-    Case(film="noisy", spoils=(("frame_offset", spoils.late(20)),)),
-    Case(film="rough", spoils=(("frame_offset", spoils.cut(6)),)),
-    Case(film="turn", spoils=(("frame_rate", spoils.resampled(0.5)),)),
-    Case(film="dance", spoils=(("frame_rate", spoils.slow_clock(30.0 / 25.0)),)),
-    Case(film="noisy", spoils=(("frame_rate", spoils.resampled(25.0 / 30.0)),)),
-    Case(film="turn", spoils=(("opengl_axes", spoils.opengl_poses),)),
-    Case(film="noisy", spoils=(("opengl_axes", spoils.opengl_cameras),)),
-    Case(film="dance", spoils=(("opengl_axes", spoils.y_up_places),)),
-    Case(film="turn", spoils=(("root_rotation", spoils.turned_pictures(90)),)),
-    Case(film="dance", spoils=(("root_rotation", spoils.turned_pictures(180)),)),
-    Case(film="noisy", spoils=(("root_rotation", spoils.turned_pictures(270)),)),
-    Case(film="rough", spoils=(("root_rotation", spoils.z_up),)),
-    Case(film="turn", spoils=(("world_frame", spoils.camera_space_twice),)),
-    Case(film="noisy", spoils=(("world_frame", spoils.world_from_camera),)),
-    Case(film="dance", spoils=(("world_frame", spoils.camera_forgotten),)),
-    Case(film="dance", spoils=(("focal", spoils.focal(0.6)),)),
-    Case(film="small", spoils=(("focal", spoils.focal(1.35)),)),
-    Case(film="turn", spoils=(("left_right", spoils.exchanged),)),
-    Case(film="dance", spoils=(("left_right", spoils.mirrored_pictures),)),
-    Case(film="noisy", spoils=(("root_origin", spoils.about_the_origin),)),
-    Case(film="dance", spoils=(("body_scale", spoils.other_size(0.75)),)),
-    Case(film="rough", spoils=(("body_scale", spoils.in_units(1000.0)),)),
-    Case(film="noisy", spoils=(("mask_polarity", spoils.inverted_masks),)),
-    Case(
-        film="turn",
-        spoils=(("frame_offset", spoils.late(10)), ("focal", spoils.focal(1.4))),
+CORRUPTED = (
+    CorruptedCapture(capture="turn", corruptions=(("frame_offset", spoils.delay_poses(3)),)),
+    CorruptedCapture(capture="dance", corruptions=(("frame_offset", spoils.delay_poses(-7)),)),
+    CorruptedCapture(capture="noisy", corruptions=(("frame_offset", spoils.delay_poses(20)),)),
+    CorruptedCapture(capture="rough", corruptions=(("frame_offset", spoils.drop_first_poses(6)),)),
+    CorruptedCapture(capture="turn", corruptions=(("frame_rate", spoils.resample_poses(0.5)),)),
+    CorruptedCapture(capture="dance", corruptions=(("frame_rate", spoils.scale_timestamps(30.0 / 25.0)),)),
+    CorruptedCapture(capture="noisy", corruptions=(("frame_rate", spoils.resample_poses(25.0 / 30.0)),)),
+    CorruptedCapture(capture="turn", corruptions=(("opengl_axes", spoils.use_opengl_poses),)),
+    CorruptedCapture(capture="noisy", corruptions=(("opengl_axes", spoils.use_opengl_cameras),)),
+    CorruptedCapture(capture="dance", corruptions=(("opengl_axes", spoils.flip_translation_y),)),
+    CorruptedCapture(capture="turn", corruptions=(("root_rotation", spoils.rotate_tracker_input(90)),)),
+    CorruptedCapture(capture="dance", corruptions=(("root_rotation", spoils.rotate_tracker_input(180)),)),
+    CorruptedCapture(capture="noisy", corruptions=(("root_rotation", spoils.rotate_tracker_input(270)),)),
+    CorruptedCapture(capture="rough", corruptions=(("root_rotation", spoils.use_z_up_poses),)),
+    CorruptedCapture(capture="turn", corruptions=(("world_frame", spoils.apply_extrinsics_twice),)),
+    CorruptedCapture(capture="noisy", corruptions=(("world_frame", spoils.invert_extrinsics),)),
+    CorruptedCapture(capture="dance", corruptions=(("world_frame", spoils.reset_extrinsics),)),
+    CorruptedCapture(capture="dance", corruptions=(("focal", spoils.scale_focal(0.6)),)),
+    CorruptedCapture(capture="small", corruptions=(("focal", spoils.scale_focal(1.35)),)),
+    CorruptedCapture(capture="turn", corruptions=(("left_right", spoils.swap_left_right),)),
+    CorruptedCapture(capture="dance", corruptions=(("left_right", spoils.mirror_tracker_input),)),
+    CorruptedCapture(capture="noisy", corruptions=(("root_origin", spoils.root_about_origin),)),
+    CorruptedCapture(capture="dance", corruptions=(("body_scale", spoils.scale_translations(0.75)),)),
+    CorruptedCapture(capture="rough", corruptions=(("body_scale", spoils.change_units(1000.0)),)),
+    CorruptedCapture(capture="noisy", corruptions=(("mask_polarity", spoils.invert_masks),)),
+    CorruptedCapture(
+        capture="turn",
+        corruptions=(("frame_offset", spoils.delay_poses(10)), ("focal", spoils.scale_focal(1.4))),
     ),
-    Case(
-        film="dance",
-        spoils=(("opengl_axes", spoils.opengl_poses), ("frame_offset", spoils.late(5))),
+    CorruptedCapture(
+        capture="dance",
+        corruptions=(("opengl_axes", spoils.use_opengl_poses), ("frame_offset", spoils.delay_poses(5))),
     ),
-    Case(
-        film="noisy",
-        spoils=(("root_rotation", spoils.turned_pictures(90)), ("left_right", spoils.exchanged)),
+    CorruptedCapture(
+        capture="noisy",
+        corruptions=(("root_rotation", spoils.rotate_tracker_input(90)), ("left_right", spoils.swap_left_right)),
     ),
-    Case(
-        film="rough",
-        spoils=(("mask_polarity", spoils.inverted_masks), ("root_origin", spoils.about_the_origin)),
+    CorruptedCapture(
+        capture="rough",
+        corruptions=(("mask_polarity", spoils.invert_masks), ("root_origin", spoils.root_about_origin)),
     ),
-    Case(
-        film="turn",
-        spoils=(("body_scale", spoils.in_units(100.0)), ("frame_rate", spoils.resampled(0.5))),
+    CorruptedCapture(
+        capture="turn",
+        corruptions=(("body_scale", spoils.change_units(100.0)), ("frame_rate", spoils.resample_poses(0.5))),
     ),
-    Case(film="turn", spoils=(("root_rotation", spoils.z_up_about_the_origin),)),
-    Case(film="small", spoils=(("frame_offset", spoils.unnumbered_end(30)),)),
-    Case(film="dance", spoils=(("second_person", spoils.second_person),)),
-    Case(film="turn", spoils=(("film_rotation", spoils.rotated_film(1)),)),
-    Case(film="rough", spoils=(("film_rotation", spoils.rotated_film(2)),)),
-    Case(film="dance", spoils=(("film_rotation", spoils.rotated_film(3)),)),
-    Case(film="turn", spoils=(("film_mirrored", spoils.mirrored_film),)),
-    Case(film="noisy", spoils=(("film_mirrored", spoils.mirrored_film),)),
-    Case(film="dance", spoils=(("film_crop", spoils.cropped_film(0.05, 0.08, 0.87)),)),
-    Case(film="rough", spoils=(("film_crop", spoils.cropped_film(-0.15, -0.15, 1.3)),)),
-    Case(film="turn", spoils=(("film_offset", spoils.trimmed_film(12)),)),
-    Case(film="noisy", spoils=(("film_offset", spoils.delayed_film(4)),)),
-    Case(film="small", spoils=(("film_offset", spoils.reversed_film),)),
-    Case(
-        film="dance",
-        spoils=(("frame_offset", spoils.late(5)), ("film_mirrored", spoils.mirrored_film)),
+    CorruptedCapture(capture="turn", corruptions=(("root_rotation", spoils.use_z_up_poses_without_pelvis),)),
+    CorruptedCapture(capture="small", corruptions=(("frame_offset", spoils.keep_last_poses(30)),)),
+    CorruptedCapture(capture="dance", corruptions=(("add_second_person", spoils.add_second_person),)),
+    CorruptedCapture(capture="turn", corruptions=(("video_rotation", spoils.rotate_video(1)),)),
+    CorruptedCapture(capture="rough", corruptions=(("video_rotation", spoils.rotate_video(2)),)),
+    CorruptedCapture(capture="dance", corruptions=(("video_rotation", spoils.rotate_video(3)),)),
+    CorruptedCapture(capture="turn", corruptions=(("undo_video_mirroring", spoils.mirror_video),)),
+    CorruptedCapture(capture="noisy", corruptions=(("undo_video_mirroring", spoils.mirror_video),)),
+    CorruptedCapture(capture="dance", corruptions=(("video_crop", spoils.crop_video(0.05, 0.08, 0.87)),)),
+    CorruptedCapture(capture="rough", corruptions=(("video_crop", spoils.crop_video(-0.15, -0.15, 1.3)),)),
+    CorruptedCapture(capture="turn", corruptions=(("video_offset", spoils.trim_video(12)),)),
+    CorruptedCapture(capture="noisy", corruptions=(("video_offset", spoils.delay_video(4)),)),
+    CorruptedCapture(capture="small", corruptions=(("video_offset", spoils.reverse_video),)),
+    CorruptedCapture(
+        capture="dance",
+        corruptions=(("frame_offset", spoils.delay_poses(5)), ("undo_video_mirroring", spoils.mirror_video)),
     ),
 )
 
-GOOD = (
-    *(Case(film=name, spoils=()) for name in FILMS),
-    *(Case(film=name, spoils=(("", spoils.in_camera_space),)) for name in FILMS),
+INTACT = (
+    *(CorruptedCapture(capture=name, corruptions=()) for name in CAPTURES),
+    *(CorruptedCapture(capture=name, corruptions=(("", spoils.convert_to_camera_space),)) for name in CAPTURES),
 )
 """As filmed, and told in the camera's own frame."""
 
-ASKED, MOST_SECONDS = 40, 10.0
+REQUIRED_FIRST, MAX_CORE_SECONDS = 40, 10.0
 """Right first causes, and core seconds of the slowest."""
 
 
-def films(folder: Path) -> Path:
+def shoot_captures(folder: Path) -> Path:
     """Films the samples that are not there yet."""
-    for name, config in FILMS.items():
+    for name, config in CAPTURES.items():
         if not (folder / name).exists():
-            shoot(folder / name, config)
+            film_capture(folder / name, config)
     return folder
 
 
-def judged(case: Case, folder: Path) -> tuple[bool, bool, float, str]:
+def check_capture(case: CorruptedCapture, folder: Path) -> tuple[bool, bool, float, str]:
     """Whether the first cause is right, whether all are, core seconds, and a line of words."""
     began, core = time.perf_counter(), time.process_time()
-    examined = examine(RecordingPaths(video=folder))
+    examined = check_capture(CaptureInputs(video=folder))
     seconds, wall = time.process_time() - core, time.perf_counter() - began
     named = examined.causes
     right = named[:1] == () if not case.causes - {""} else bool(set(named[:1]) & case.causes)
     if not case.causes - {""}:
         right = right and examined.verdict == "good"
     whole = set(named) == case.causes - {""}
-    agreed = f"{examined.now:.2f} -> {examined.after:.2f}"
+    agreed = f"{examined.stored_iou:.2f} -> {examined.corrected_iou:.2f}"
     said = f"({wall:4.1f}) {examined.verdict:<8} {agreed}  {', '.join(named)}"
     return right, whole, seconds, said
 
@@ -131,27 +131,27 @@ def main() -> None:
     arguments.add_argument("--keep", type=Path, help="folder for the samples, kept and used again")
     keep = arguments.parse_args().keep
     print("\n".join(Hardware.here().lines()))
-    with tempfile.TemporaryDirectory(dir=keep and _made(keep)) as scratch:
-        samples = films(keep or Path(scratch) / "films")
+    with tempfile.TemporaryDirectory(dir=keep and _make_folder(keep)) as scratch:
+        samples = shoot_captures(keep or Path(scratch) / "films")
         found = whole = quiet = 0
         slowest = 0.0
-        for number, case in enumerate((*SPOILT, *GOOD)):
-            folder = case.make(samples, Path(scratch) / f"case{number}")
-            right, all_named, seconds, said = judged(case, folder)
+        for number, case in enumerate((*CORRUPTED, *INTACT)):
+            folder = case.write(samples, Path(scratch) / f"case{number}")
+            right, all_named, seconds, said = check_capture(case, folder)
             slowest = max(slowest, seconds)
-            spoilt = number < len(SPOILT)
+            spoilt = number < len(CORRUPTED)
             found, quiet = found + (right and spoilt), quiet + (right and not spoilt)
             whole += all_named and spoilt
-            wanted = " + ".join(cause for cause, _ in case.spoils if cause) or "good"
+            wanted = " + ".join(cause for cause, _ in case.corruptions if cause) or "good"
             mark = " " if right else "✗"
-            print(f"{mark} {case.film:<6} {wanted:<30} {seconds:4.1f} s  {said}", flush=True)
-    print(f"right cause first: {found} of {len(SPOILT)} (asked: {ASKED}); all causes: {whole}")
-    print(f"good ones called good: {quiet} of {len(GOOD)} (asked: all)")
-    print(f"slowest: {slowest:.1f} core-s (asked: {MOST_SECONDS:.0f})")
-    sys.exit(0 if found >= ASKED and quiet == len(GOOD) and slowest <= MOST_SECONDS else 1)
+            print(f"{mark} {case.capture:<6} {wanted:<30} {seconds:4.1f} s  {said}", flush=True)
+    print(f"right cause first: {found} of {len(CORRUPTED)} (asked: {REQUIRED_FIRST}); all causes: {whole}")
+    print(f"good ones called good: {quiet} of {len(INTACT)} (asked: all)")
+    print(f"slowest: {slowest:.1f} core-s (asked: {MAX_CORE_SECONDS:.0f})")
+    sys.exit(0 if found >= REQUIRED_FIRST and quiet == len(INTACT) and slowest <= MAX_CORE_SECONDS else 1)
 
 
-def _made(folder: Path) -> Path:
+def _make_folder(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 

@@ -12,31 +12,31 @@ from pathlib import Path
 
 
 def main() -> None:
-    from apps.recording.opening import open_recording
-    from apps.recording.wanted import RecordingPaths
+    from apps.recording.opening import open_capture
+    from apps.recording.wanted import CaptureInputs
 
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
-    recording = open_recording(RecordingPaths(video=capture))
+    recording = open_capture(CaptureInputs(video=capture))
 
     import torch
 
-    from apps.terminal.threads import use_threads
+    from apps.terminal.threads import set_threads
     from avatar.config import TrainConfig
     from avatar.events import Stepped
-    from avatar.hold import HeldOut, prepared
+    from avatar.hold import HeldOutFrame, prepare_stream
     from avatar.rig import Rig
     from avatar.train import Trainer, train
     from avatar.warm import warm_up
     from capture.inbox import Inbox
 
-    use_threads(None)
-    rig = Rig.of(recording.shaped)
-    config = TrainConfig.within(60.0, footprint_m=recording.footprint_m())
+    set_threads(None)
+    rig = Rig.from_shaped_body(recording.shaped)
+    config = TrainConfig.for_budget(60.0, footprint_m=recording.pixel_footprint_m())
     trainer = Trainer(rig, config, torch.device("cpu"))
     warm_up(trainer)
-    total, held = recording.source.frame_count, list[HeldOut]()
+    total, held = recording.source.frame_count, list[HeldOutFrame]()
     begun = time.time()
-    inbox = Inbox(prepared(recording.observations(), rig, every=config.hold_every, total=total))
+    inbox = Inbox(prepare_stream(recording.observations(), rig, stride=config.held_out_stride, total=total))
     for event in train(trainer, inbox, held):
         if isinstance(event, Stepped):
             now = time.time()

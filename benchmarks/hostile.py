@@ -27,17 +27,17 @@ import numpy as np
 
 from benchmarks.hardware import Hardware
 from benchmarks.hostile_seeds import make_seeds
-from benchmarks.mutations import bomb, changed
+from benchmarks.mutations import decompression_bomb, mutate_file
 
-SHARES = {
+FILES_PER_HUNDRED = {
     "pickles": 30, "poses": 25, "masks": 12, "cameras": 12, "bodies": 7, "captures": 6,
     "pictures": 5, "packages": 3,
 }  # fmt: skip
 """Files of each reader, of a hundred."""
 BOMB_EVERY = 500
-CAP_MB = 1100
+MAX_MEMORY_MB = 1100
 """Of one file: 1 GiB, which is what a stranger's file may unpack to, and some for its records."""
-HANGS_AFTER_S = 60
+TIMEOUT_S = 60
 RUNS = (
     "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.", "socket.",
     "webbrowser.",
@@ -60,7 +60,7 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
 # --- files ---------------------------------------------------------------------------------------
 
 
-def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Generator) -> Path:
+def write_mutated_file(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Generator) -> Path:
     """Writes one; returns what its reader is given."""
     shutil.rmtree(folder, ignore_errors=True)
     places = sorted((seeds / kind).iterdir())
@@ -76,7 +76,7 @@ def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Ge
         file = target
     others = [other.read_bytes() for other in places if other.is_file()] or [b"PK"]
     is_bomb = number % BOMB_EVERY == 1 and kind in ("pickles", "poses", "masks", "bodies")
-    data = bomb(rng) if is_bomb else changed(file.read_bytes(), file.name, others, rng)
+    data = decompression_bomb(rng) if is_bomb else mutate_file(file.read_bytes(), file.name, others, rng)
     file.write_bytes(data)
     return target
 
@@ -86,22 +86,22 @@ def hostile(kind: str, seeds: Path, folder: Path, number: int, rng: np.random.Ge
 
 def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     """What each kind of file is read by, as the commands do."""
-    from apps.checking.examine import examine
-    from apps.recording.opening import open_recording
-    from apps.recording.wanted import RecordingPaths
+    from apps.checking.examine import check_capture
+    from apps.recording.opening import open_capture
+    from apps.recording.wanted import CaptureInputs
     from capture.opening import open_source
     from export.player import Player
-    from preprocess.body_file import load_body
+    from preprocess.body_file import load_body_model
     from preprocess.camera_file import read_cameras
-    from preprocess.content import read_content
+    from preprocess.content import read_untrusted_file
     from preprocess.masks.files import open_masks, read_mask
-    from preprocess.person_file import read_person
+    from preprocess.person_file import read_shaped_body
     from preprocess.poses import read_poses
 
-    embedded, film = load_body(), open_source(seeds / "captures" / "film")
+    embedded, film = load_body_model(), open_source(seeds / "captures" / "film")
 
     def bodies(path: Path) -> object:
-        return read_person(path, embedded) if path.stem == "person" else load_body(path)
+        return read_shaped_body(path, embedded) if path.stem == "person" else load_body_model(path)
 
     def masks(path: Path) -> object:
         if path.suffix == ".png":
@@ -111,8 +111,8 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
 
     def captures(path: Path) -> object:
         if len(path.read_bytes() if path.is_file() else path.name) % 7 == 0:
-            examine(RecordingPaths(video=path))
-        recording = open_recording(RecordingPaths(video=path))
+            check_capture(CaptureInputs(video=path))
+        recording = open_capture(CaptureInputs(video=path))
         return list(recording.observations())
 
     def pictures(path: Path) -> object:
@@ -127,14 +127,14 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
         return read_cameras(path, film.size_px, film)
 
     return {
-        "pickles": read_content, "poses": read_poses, "masks": masks, "cameras": cameras,
+        "pickles": read_untrusted_file, "poses": read_poses, "masks": masks, "cameras": cameras,
         "bodies": bodies, "captures": captures, "pictures": pictures, "packages": packages,
     }  # fmt: skip
 
 
 def outcome(path: Path, read: Callable[[Path], object]) -> str:
     """How reading one file ended."""
-    from capture.errors import BadInput
+    from capture.errors import InputError
 
     global _watched
     _seen.clear()
@@ -142,7 +142,7 @@ def outcome(path: Path, read: Callable[[Path], object]) -> str:
     _watched = RUNS if (path / "images.bin").exists() or (path / "images.txt").exists() else WATCHED
     try:
         read(path)
-    except BadInput as refusal:
+    except InputError as refusal:
         words, joined = str(refusal), path.is_dir()  # of what does not fit together, the parts
         named = joined or str(path.parent) in words or path.name in words
         ended = "refused" if named else f"nameless: {words}"
@@ -168,24 +168,24 @@ def _memory_mb(key: str) -> float:
 def batch(seeds: Path, start: int, stop: int, seed: int) -> None:
     """Reads some of the files, and says of each what came of it, a line of JSON."""
     reads = readers(seeds)
-    kinds = [kind for kind, share in SHARES.items() for _ in range(share)]
+    kinds = [kind for kind, share in FILES_PER_HUNDRED.items() for _ in range(share)]
     kinds = [kind for kind in kinds if (seeds / kind).is_dir()]
     for kind, read in reads.items():  # whole files first: what is loaded late is loaded now
         for path in sorted((seeds / kind).iterdir()) if (seeds / kind).is_dir() else ():
             ended = outcome(path, read)
             assert ended == "read" or ended.startswith("RAN"), (path, ended)
     sys.addaudithook(_audit)
-    limit = int((_memory_mb("VmSize") + 2.0 * CAP_MB) * (1 << 20))
+    limit = int((_memory_mb("VmSize") + 2.0 * MAX_MEMORY_MB) * (1 << 20))
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     with tempfile.TemporaryDirectory() as scratch:
         for number in range(start, stop):
             rng = np.random.default_rng([seed, number])
             kind = kinds[int(rng.integers(0, len(kinds)))]
-            path = hostile(kind, seeds, Path(scratch) / "file", number, rng)
+            path = write_mutated_file(kind, seeds, Path(scratch) / "file", number, rng)
             print(json.dumps({"number": number, "kind": kind}), flush=True)
-            Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
+            Path("/proc/self/clear_refs").write_text_atomically("5", encoding="utf-8")
             before, began = _memory_mb("VmRSS"), time.process_time()
-            signal.alarm(HANGS_AFTER_S)
+            signal.alarm(TIMEOUT_S)
             ended = outcome(path, reads[kind])
             signal.alarm(0)
             told = {"ended": ended, "mb": _memory_mb("VmHWM") - before, "name": path.name}
@@ -245,10 +245,10 @@ def main() -> None:
             (seeds / "packages").mkdir()
             shutil.copy(package, seeds / "packages" / "avatar.iavatar")
         found = batches(seeds, given.files, given.seed)
-    sys.exit(0 if told(found) else 1)
+    sys.exit(0 if print_summary(found) else 1)
 
 
-def told(found: list[dict[str, Any]]) -> bool:
+def print_summary(found: list[dict[str, Any]]) -> bool:
     """Prints a row for each reader and whatever went wrong; whether nothing did."""
     by_kind: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for each in found:
@@ -267,7 +267,7 @@ def told(found: list[dict[str, Any]]) -> bool:
         print(f"{word}: {each['number']} {each['kind']}/{each['name']}: {each['ended']}")
     wrong = [
         each for each in found
-        if each["ended"] not in ("read", "refused") or each["mb"] > CAP_MB
+        if each["ended"] not in ("read", "refused") or each["mb"] > MAX_MEMORY_MB
     ]  # fmt: skip
     for each in wrong[:60]:
         print(f"✗ {each['number']} {each['kind']}/{each['name']}: {each['ended']} {each['mb']:.0f}")

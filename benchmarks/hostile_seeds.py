@@ -13,11 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from apps.studio.writer import ShootConfig, shoot
+from apps.studio.writer import ShootConfig, film_capture
 from capture.opening import open_source
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 from preprocess.masks.files import open_masks
-from preprocess.person_file import write_person
+from preprocess.person_file import write_shaped_body
 
 ROWS, SIDE = 6, 64
 
@@ -25,7 +25,7 @@ ROWS, SIDE = 6, 64
 def make_seeds(folder: Path) -> None:
     """Writes a folder for each reader, with files (or folders) whose names are theirs."""
     film = folder / "captures" / "film"
-    shoot(film, ShootConfig(frames=ROWS, size=SIDE, background="plain"))
+    film_capture(film, ShootConfig(frames=ROWS, size=SIDE, background="plain"))
     (film / "dance.npz").unlink(missing_ok=True)
     shutil.rmtree(film / "truth", ignore_errors=True)
     alpha = folder / "captures" / "alpha"
@@ -54,19 +54,19 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def npz(**arrays: Any) -> bytes:
+def npz_bytes(**arrays: Any) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
 
 
-def npy(thing: Any) -> bytes:
+def npy_bytes(thing: Any) -> bytes:
     stream = io.BytesIO()
     np.save(stream, thing, allow_pickle=True)
     return stream.getvalue()
 
 
-def torched(thing: Any, *, new: bool = True) -> bytes:
+def torch_bytes(thing: Any, *, new: bool = True) -> bytes:
     import torch
 
     stream = io.BytesIO()
@@ -107,15 +107,15 @@ def _poses(folder: Path, film: Path) -> None:
                 "smpl_betas": list(betas), "cam_trans": list(place)}}  # fmt: skip
     files = {
         "wham.pkl": pickle.dumps(wham, 4), "vibe.pkl": pickle.dumps(vibe, 2),
-        "phalp.pkl": zlib.compress(pickle.dumps(phalp, 3)), "gvhmr.pt": torched(gvhmr),
-        "tram.npy": npy(tram), "prompthmr.pkl": pickle.dumps(prompt),
-        "romp.npz": npz(results=np.array({}, dtype=object),
+        "phalp.pkl": zlib.compress(pickle.dumps(phalp, 3)), "gvhmr.pt": torch_bytes(gvhmr),
+        "tram.npy": npy_bytes(tram), "prompthmr.pkl": pickle.dumps(prompt),
+        "romp.npz": npz_bytes(results=np.array({}, dtype=object),
                         sequence_results=np.array(romp, dtype=object)),
-        "amass.npz": npz(poses=np.zeros((ROWS, 156)), trans=place, betas=np.zeros(16),
+        "amass.npz": npz_bytes(poses=np.zeros((ROWS, 156)), trans=place, betas=np.zeros(16),
                          mocap_framerate=np.array(120.0)),
         "aist.pkl": pickle.dumps({"smpl_poses": theta, "smpl_scaling": np.float32([93.0]),
                                   "smpl_trans": place}, 2),
-        "slahmr.npz": npz(trans=place[None], root_orient=theta[None, :, :3],
+        "slahmr.npz": npz_bytes(trans=place[None], root_orient=theta[None, :, :3],
                           pose_body=theta[None, :, 3:66], betas=betas[:1],
                           cam_R=turn[None, :, 0], cam_t=place[None], intrins=np.ones(4)),
         "emdb.pkl": pickle.dumps({"gender": "male", "camera": {"intrinsics": np.eye(3)},
@@ -140,10 +140,10 @@ def _pickles(folder: Path) -> None:
     plain = {"a": np.arange(6.0).reshape(2, 3), "l": [1, 2.5, "x", None, (True,)], "s": {1, 2}}
     tensors = {**plain, "t": torch.ones(2, 3)}
     files = {f"protocol{n}.pkl": pickle.dumps(plain, n) for n in range(6)}
-    files |= {"zlib.pkl": zlib.compress(pickle.dumps(plain)), "object.npy": npy(tensors)}
-    files |= {"gzip.pkl": gzip.compress(pickle.dumps(plain)), "new.pt": torched(tensors)}
-    files |= {"old.pt": torched(tensors, new=False)}
-    files |= {"object.npz": npz(results=np.array({"deep": plain}, dtype=object))}
+    files |= {"zlib.pkl": zlib.compress(pickle.dumps(plain)), "object.npy": npy_bytes(tensors)}
+    files |= {"gzip.pkl": gzip.compress(pickle.dumps(plain)), "new.pt": torch_bytes(tensors)}
+    files |= {"old.pt": torch_bytes(tensors, new=False)}
+    files |= {"object.npz": npz_bytes(results=np.array({"deep": plain}, dtype=object))}
     for name, data in files.items():
         (folder / name).write_bytes(data)
 
@@ -154,9 +154,9 @@ def _masks(folder: Path, film: Path) -> None:
     stack = np.stack([masks.alpha(row, masks.size_px) > 0.5 for row in range(masks.count)])
     runs = [_coded(mask) for mask in stack]
     files = {
-        "masks.npz": npz(masks=stack), "masks.npy": npy(stack.astype(np.uint8)),
+        "masks.npz": npz_bytes(masks=stack), "masks.npy": npy_bytes(stack.astype(np.uint8)),
         "coded.json": json.dumps(runs).encode(), "coded.pkl": pickle.dumps(runs),
-        "coded.npy": npy(np.array(runs, dtype=object)),
+        "coded.npy": npy_bytes(np.array(runs, dtype=object)),
     }  # fmt: skip
     for name, data in files.items():
         (folder / name).write_bytes(data)
@@ -187,7 +187,7 @@ def _cameras(folder: Path, film: Path) -> None:
     lens = {"w": SIDE, "h": SIDE, "fl_x": 50.0, "cx": 32.0, "cy": 32.0}
     record = {"poses": [[0, 0, 0, 1, 0, 0, 0]] * ROWS, "K": [50, 0, 0, 0, 50, 0, 32, 32, 1],
               "w": SIDE, "h": SIDE, "fps": 30}  # fmt: skip
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    (folder / "transforms.json").write_text_atomically(json.dumps({**lens, "frames": frames}))
     with zipfile.ZipFile(folder / "record.r3d", "w") as archive:
         archive.writestr("metadata.json", json.dumps(record))
         archive.writestr("metadata", json.dumps(record))
@@ -196,7 +196,7 @@ def _cameras(folder: Path, film: Path) -> None:
     for number in range(ROWS):
         place = folder / "polycam" / "keyframes" / "cameras" / f"{number}.json"
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(json.dumps(numbers))
+        place.write_text_atomically(json.dumps(numbers))
     studio = _made(folder / "studio")
     for file, parts in (("intri", {"K": 50.0 * np.eye(3)}), ("extri", {"Rot": np.eye(3),
                         "T": np.zeros((3, 1))})):  # fmt: skip
@@ -207,7 +207,7 @@ def _cameras(folder: Path, film: Path) -> None:
     rig = {"K": [50.0 * np.eye(3)], "D": [np.zeros((5, 1))], "R": [np.eye(3)],
            "T": [np.zeros((3, 1))]}  # fmt: skip
     zju = {"cams": rig, "ims": [{"ims": ["Camera_B1/000000.jpg"]}]}
-    (folder / "annots.npy").write_bytes(npy(np.array(zju, dtype=object)))
+    (folder / "annots.npy").write_bytes(npy_bytes(np.array(zju, dtype=object)))
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
@@ -218,12 +218,12 @@ def _cameras(folder: Path, film: Path) -> None:
         image = pycolmap.Image(name=f"{number}.png", camera_id=1, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.eye(4)[:3]))
     model.write_binary(_made(folder / "binary"))
-    model.write_text(_made(folder / "text"))
+    model.write_text_atomically(_made(folder / "text"))
 
 
 def _bodies(folder: Path) -> None:
     """A body of few vertices, in both containers; and an avatar's person."""
-    body = load_body()
+    body = load_body_model()
     few = np.linspace(0, len(body.template) - 1, 60).astype(int)
     arrays = {
         "v_template": body.template[few], "shapedirs": body.shape_directions[few],
@@ -232,7 +232,7 @@ def _bodies(folder: Path) -> None:
     }  # fmt: skip
     regressor = np.full((24, 60), 1.0 / 60.0)
     (folder / "body.npz").write_bytes(
-        npz(**arrays, J=body.joints, J_shapedirs=body.joint_directions)
+        npz_bytes(**arrays, J=body.joints, J_shapedirs=body.joint_directions)
     )
     (folder / "SMPL.pkl").write_bytes(pickle.dumps({**arrays, "J_regressor": regressor}, 2))
-    write_person(folder / "person.npz", body.with_shape())
+    write_shaped_body(folder / "person.npz", body.with_shape())

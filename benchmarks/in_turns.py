@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from avatar.events import Score
-from avatar.hold import HeldOut, score
-from avatar.prepare import PreparedFrame
+from avatar.events import HeldOutScore
+from avatar.hold import HeldOutFrame, score_frame
+from avatar.prepare import TrainingFrame
 from avatar.rig import Rig
-from avatar.step import cosine
+from avatar.step import cosine_decay
 from avatar.trainer import Trainer
 from avatar.warm import warm_up
-from benchmarks.stage import recipe
-from benchmarks.stopwatch import use_threads
+from benchmarks.stage import training_config
+from benchmarks.stopwatch import limit_threads
 
-LATE = 0.8
+LATE_PHASE_START = 0.8
 """Share of the budget after which steps count as late ones."""
 SLICE_S = 0.5
 """Core time after which it is the next one's turn."""
@@ -33,7 +33,7 @@ class Variant:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Budget:
+class TrainingBudget:
     """How long each trains: so many seconds of one core, or so many steps."""
 
     seconds: float = 0.0
@@ -41,7 +41,7 @@ class Budget:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quality:
+class VariantQuality:
     """Means over pictures: dB on white, dB in the mask, SSIM."""
 
     psnr: float
@@ -49,7 +49,7 @@ class Quality:
     ssim: float
 
     @classmethod
-    def of(cls, scores: Sequence[Score]) -> "Quality":
+    def of(cls, scores: Sequence[HeldOutScore]) -> "Quality":
         return cls(
             psnr=float(np.mean([s.psnr for s in scores])),
             psnr_mask=float(np.mean([s.psnr_mask for s in scores])),
@@ -58,7 +58,7 @@ class Quality:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class VariantOutcome:
     """What became of a variant.
 
     Attributes:
@@ -67,7 +67,7 @@ class Outcome:
         step_ms: Core milliseconds each, all that a step brings with it included.
         late_ms: The same over the last fifth.
         samples: Of a ray, mean over all steps.
-        held: Frames of the video that were not learnt.
+        held: EvaluationFrames of the video that were not learnt.
         novel: Poses that were never filmed.
     """
 
@@ -76,12 +76,12 @@ class Outcome:
     step_ms: float
     late_ms: float
     samples: float
-    held: Quality
-    novel: Quality
+    held_out: VariantQuality
+    novel: VariantQuality
 
 
 @dataclass(kw_only=True)
-class Run:
+class VariantRun:
     """A variant under way."""
 
     variant: Variant
@@ -90,57 +90,57 @@ class Run:
     late_s: float = 0.0
     late_steps: int = 0
 
-    def progress(self, budget: Budget) -> float:
+    def progress(self, budget: TrainingBudget) -> float:
         """Share of the budget that is used up."""
         if budget.steps:
             return self.trainer.steps / budget.steps
         return self.spent_s / budget.seconds
 
-    def go_on(self, budget: Budget) -> None:
+    def train_slice(self, budget: TrainingBudget) -> None:
         """One turn."""
         began = now = time.process_time()
         while now - began < SLICE_S and (done := self.progress(budget)) < 1.0:
-            self.trainer.step(rate=cosine(done), hard_share=min(1.0, 4.0 * done))
+            self.trainer.step(rate=cosine_decay(done), hard_surface_share=min(1.0, 4.0 * done))
             before, now = now, time.process_time()
             self.spent_s += now - before
-            if done >= LATE:
+            if done >= LATE_PHASE_START:
                 self.late_s += now - before
                 self.late_steps += 1
 
 
-def trained(
+def train_variants(
     variants: Sequence[Variant],
-    budget: Budget,
+    budget: TrainingBudget,
     recording: Any,
     rig: Rig,
-    frames: Sequence[PreparedFrame],
+    frames: Sequence[TrainingFrame],
     device: torch.device,
-) -> list[Run]:
+) -> list[VariantRun]:
     """Every variant after its budget, with one thread."""
-    use_threads(1)
+    limit_threads(1)
     runs = []
     for variant in variants:
         seconds = budget.seconds or 60.0
-        trainer = Trainer(rig, recipe(recording, seconds, **variant.changes), device)
+        trainer = Trainer(rig, training_config(recording, seconds, **variant.changes), device)
         for frame in frames:
-            trainer.add(frame)
+            trainer.add_frame(frame)
         warm_up(trainer)
-        runs.append(Run(variant=variant, trainer=trainer))
+        runs.append(VariantRun(variant=variant, trainer=trainer))
     while under_way := [run for run in runs if run.progress(budget) < 1.0]:
         for run in under_way:
             run.go_on(budget)
     return runs
 
 
-def outcome(run: Run, held: Sequence[HeldOut], novel: Sequence[HeldOut]) -> Outcome:
+def score_variant(run: VariantRun, held: Sequence[HeldOutFrame], novel: Sequence[HeldOutFrame]) -> VariantOutcome:
     """Scores of the exact renderer, the same for every row."""
     trainer = run.trainer
-    return Outcome(
+    return VariantOutcome(
         name=run.variant.name,
         steps=trainer.steps,
         step_ms=1000.0 * run.spent_s / trainer.steps,
         late_ms=1000.0 * run.late_s / max(run.late_steps, 1),
         samples=trainer.samples / trainer.rays,
-        held=Quality.of([score(trainer.avatar, frame) for frame in held]),
-        novel=Quality.of([score(trainer.avatar, frame) for frame in novel]),
+        held_out=VariantQuality.of([score_frame(trainer.avatar, frame) for frame in held]),
+        novel=VariantQuality.of([score_frame(trainer.avatar, frame) for frame in novel]),
     )

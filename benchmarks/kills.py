@@ -15,13 +15,13 @@ import torch
 
 from avatar import checkpoint
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Mark
+from benchmarks.marks import Measurement
 from export.player import Player
 
 SECONDS = 15.0
 
 
-class Survivor(NamedTuple):
+class ResumedRun(NamedTuple):
     """What became of a killed run.
 
     Attributes:
@@ -37,17 +37,17 @@ class Survivor(NamedTuple):
     training_seconds: float
 
 
-def command(capture: Path, run: Path, *more: str) -> list[str]:
+def ingest_command(capture: Path, run: Path, *more: str) -> list[str]:
     """ia-ingest on a small capture."""
     words = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
     return [*words, "--seconds", str(SECONDS), *more]
 
 
-def finished(capture: Path, run: Path, *more: str) -> tuple[int, float, float]:
+def run_to_end(capture: Path, run: Path, *more: str) -> tuple[int, float, float]:
     """A run to its end: exit code, held-out PSNR, and how long it took."""
     began = time.perf_counter()
     done = subprocess.run(
-        command(capture, run, *more), cwd=ROOT, stdout=subprocess.DEVNULL,
+        ingest_command(capture, run, *more), cwd=ROOT, stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL, check=False,
     )  # fmt: skip
     took = time.perf_counter() - began
@@ -58,10 +58,10 @@ def finished(capture: Path, run: Path, *more: str) -> tuple[int, float, float]:
     return done.returncode, psnr, took
 
 
-def killed(capture: Path, run: Path, after_s: float) -> Survivor:
+def kill_and_resume(capture: Path, run: Path, after_s: float) -> ResumedRun:
     """Kills a run after so many seconds, reads what it left, and resumes it."""
     with subprocess.Popen(
-        command(capture, run), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ingest_command(capture, run), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:
         time.sleep(after_s)
         process.kill()
@@ -76,29 +76,29 @@ def killed(capture: Path, run: Path, after_s: float) -> Survivor:
                 json.loads(path.read_text())
         except Exception as error:  # whatever it is, it must not be
             unreadable.append(f"{path.name}: {error}")
-    code, psnr, _ = finished(capture, run, *(["--resume"] if run.exists() else []))
-    return Survivor(tuple(unreadable), code, psnr, had_s)
+    code, psnr, _ = run_to_end(capture, run, *(["--resume"] if run.exists() else []))
+    return ResumedRun(tuple(unreadable), code, psnr, had_s)
 
 
-def kill_marks(capture: Path, folder: Path, *, kills: int) -> Iterator[Mark]:
+def measure_kills(capture: Path, folder: Path, *, kills: int) -> Iterator[Measurement]:
     """So many kills at moments spread at random over a whole run."""
-    _, unbroken, whole_s = finished(capture, folder / "unbroken")
-    _, unbroken, whole_s = finished(capture, folder / "again")  # compiled code is kept now
-    chance, ended = random.Random(0), list[Survivor]()
+    _, unbroken, whole_s = run_to_end(capture, folder / "unbroken")
+    _, unbroken, whole_s = run_to_end(capture, folder / "again")  # compiled code is kept now
+    chance, ended = random.Random(0), list[ResumedRun]()
     for number in range(kills):
         after_s = chance.uniform(0.0, whole_s)
-        survivor = killed(capture, folder / f"{number}", after_s)
+        survivor = kill_and_resume(capture, folder / f"{number}", after_s)
         ended.append(survivor)
         print(f"  killed after {after_s:.1f} of {whole_s:.1f} s: {survivor}", file=sys.stderr)
         shutil.rmtree(folder / f"{number}", ignore_errors=True)
     well = [s for s in ended if s.code == 0 and not s.unreadable]
     psnr = [s.psnr for s in ended if s.code == 0]
-    yield Mark(
+    yield Measurement(
         name=f"killed {kills} times at random moments, resumed to the end",
         value=float(len(well)),
-        least=f"{kills}",
-        moonshot="± 0.2 dB",
-        beside=f"{sum(len(s.unreadable) for s in ended)} unreadable files; unbroken run "
+        required=f"{kills}",
+        stretch_goal="± 0.2 dB",
+        context=f"{sum(len(s.unreadable) for s in ended)} unreadable files; unbroken run "
         f"{unbroken:.2f} dB, resumed ones {min(psnr, default=float('nan')):.2f} to "
         f"{max(psnr, default=float('nan')):.2f}, median "
         f"{statistics.median(psnr) if psnr else float('nan'):.2f}",

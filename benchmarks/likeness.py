@@ -7,31 +7,31 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from apps.recording.recording import Recording
-from avatar.config import HOLD_EVERY
-from avatar.hold import HeldOut, on_white, prepared, truth_on_white
+from apps.recording.recording import Capture
+from avatar.config import HELD_OUT_STRIDE
+from avatar.hold import HeldOutFrame, composite_on_white, prepare_stream, ground_truth_on_white
 from avatar.metrics import psnr
 from avatar.model import Avatar
 from avatar.render import render
-from benchmarks.main_job import observations
-from benchmarks.marks import Mark
-from benchmarks.stage import opened
+from benchmarks.main_job import novel_observations
+from benchmarks.marks import Measurement
+from benchmarks.stage import open_sample
 from capture.camera import Camera
-from export.player import Player, premultiplied
-from export.tiers import TIERS
+from export.player import Player, premultiply
+from export.tiers import QUALITY_TIERS
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose
 from preprocess.poses import read_poses
 
-DANCES = 16
-ASKED = {"hq": (("≥ 40", "≥ 43"), ("< 0.4", "< 0.1")), "lite": (("", ""), ("< 1.2", "< 0.5"))}
+DANCE_POSES = 16
+TARGETS = {"hq": (("≥ 40", "≥ 43"), ("< 0.4", "< 0.1")), "lite": (("", ""), ("< 1.2", "< 0.5"))}
 """By tier: "at least" and "moonshot" of the PSNR to the renderer and of the loss."""
 
-Picture = Float32[np.ndarray, "height width 3"]
+RgbPicture = Float32[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shot:
+class ComparedView:
     """A pose, seen by a camera: what the studio filmed and what the volume renderer shows.
 
     Attributes:
@@ -41,11 +41,11 @@ class Shot:
 
     pose: BodyPose
     camera: Camera
-    exact: Picture
-    truth: Picture | None = None
+    rendered: RgbPicture
+    truth: RgbPicture | None = None
 
 
-def shots_of(capture: Path, avatar: Avatar, *, frames: int, every: int) -> dict[str, list[Shot]]:
+def views_of_sample(capture: Path, avatar: Avatar, *, frames: int, stride: int) -> dict[str, list[ComparedView]]:
     """Held-out frames of a video, and poses that were never filmed.
 
     Args:
@@ -54,14 +54,14 @@ def shots_of(capture: Path, avatar: Avatar, *, frames: int, every: int) -> dict[
         frames: How many frames were learnt from or held out.
         every: Every so manyth picture is looked at.
     """
-    recording = opened(capture, frames=slice(0, frames))
-    found = {"held out": _held(recording, avatar, frames), "novel poses": observations(capture)}
-    return {name: [_shot(s, avatar) for s in seen[::every]] for name, seen in found.items()}
+    recording = open_sample(capture, frames=slice(0, frames))
+    found = {"held out": _held_out_observations(recording, avatar, frames), "novel poses": novel_observations(capture)}
+    return {name: [_filmed_view(s, avatar) for s in seen[::stride]] for name, seen in found.items()}
 
 
-def shots_of_person(
+def views_of_person(
     capture: Path, avatar: Avatar, dance: Path, *, size: int
-) -> dict[str, list[Shot]]:
+) -> dict[str, list[ComparedView]]:
     """Held-out frames of a real person, and the same person dancing in the place of each.
 
     Nobody filmed the dances: they say how near the player is to the volume renderer, no more.
@@ -70,67 +70,67 @@ def shots_of_person(
         capture: A folder that `ia-ingest` reads.
         avatar: Learnt from it.
         size: Longer side of its pictures, in pixels, as it was learnt from.
-        dance: A pose file; of `DANCES` of its poses, evenly spread, the joints are taken.
+        dance: A pose file; of `DANCE_POSES` of its poses, evenly spread, the joints are taken.
     """
-    recording = opened(capture, size=size)
-    held = _held(recording, avatar, recording.source.frame_count)
+    recording = open_sample(capture, size=size)
+    held = _held_out_observations(recording, avatar, recording.source.frame_count)
     motion = read_poses(dance)
-    chosen = np.linspace(0, len(motion) - 1, DANCES).round().astype(int)
+    chosen = np.linspace(0, len(motion) - 1, DANCE_POSES).round().astype(int)
     dances = []
     for position, row in enumerate(chosen):
         seen = held[position % len(held)]
         pose = replace(seen.pose, joint_rotations=motion[row].joint_rotations)
-        dances.append(_unfilmed(pose, seen.camera, avatar))
-    return {"held out": [_shot(seen, avatar) for seen in held], "dancing": dances}
+        dances.append(_unfilmed_view(pose, seen.camera, avatar))
+    return {"held out": [_filmed_view(seen, avatar) for seen in held], "dancing": dances}
 
 
-def _held(recording: Recording, avatar: Avatar, frames: int | None) -> list[Observation]:
-    items = prepared(recording.observations(), avatar.rig, every=HOLD_EVERY, total=frames)
-    return [item.observation for item in items if isinstance(item, HeldOut)]
+def _held_out_observations(recording: Capture, avatar: Avatar, frames: int | None) -> list[Observation]:
+    items = prepare_stream(recording.observations(), avatar.rig, stride=HELD_OUT_STRIDE, total=frames)
+    return [item.observation for item in items if isinstance(item, HeldOutFrame)]
 
 
-def _shot(seen: Observation, avatar: Avatar) -> Shot:
-    return replace(_unfilmed(seen.pose, seen.camera, avatar), truth=truth_on_white(seen))
+def _filmed_view(seen: Observation, avatar: Avatar) -> ComparedView:
+    return replace(_unfilmed_view(seen.pose, seen.camera, avatar), truth=ground_truth_on_white(seen))
 
 
-def _unfilmed(pose: BodyPose, camera: Camera, avatar: Avatar) -> Shot:
+def _unfilmed_view(pose: BodyPose, camera: Camera, avatar: Avatar) -> ComparedView:
     straight = replace(camera, distortion=())
-    return Shot(pose=pose, camera=straight, exact=on_white(render(avatar, pose, straight)))
+    return ComparedView(pose=pose, camera=straight, rendered=composite_on_white(render(avatar, pose, straight)))
 
 
-def likeness_marks(name: str, package: Path, shots: Mapping[str, Sequence[Shot]]) -> Iterator[Mark]:
+def fidelity_marks(name: str, package: Path, shots: Mapping[str, Sequence[ComparedView]]) -> Iterator[Measurement]:
     """For each tier and each kind of picture, how near and how far behind."""
-    for tier in TIERS:
+    for tier in QUALITY_TIERS:
         player = Player.load(package, tier=tier)
         for kind, some in shots.items():
-            drawn = [on_white(premultiplied(player.render(s.pose, s.camera))) for s in some]
-            yield _nearness(f"{name}, {tier}, {kind}", tier, some, drawn)
-            filmed = [(s.exact, d, s.truth) for s, d in zip(some, drawn, strict=True)]
+            drawn = [composite_on_white(premultiply(player.render(s.pose, s.camera))) for s in some]
+            yield _renderer_mark(f"{name}, {tier}, {kind}", tier, some, drawn)
+            filmed = [(s.rendered, d, s.truth) for s, d in zip(some, drawn, strict=True)]
             told = [(exact, d, truth) for exact, d, truth in filmed if truth is not None]
             if told:
-                yield _loss(f"{name}, {tier}, {kind}", tier, told)
+                yield _truth_mark(f"{name}, {tier}, {kind}", tier, told)
 
 
-def _nearness(name: str, tier: str, shots: Sequence[Shot], drawn: Sequence[Picture]) -> Mark:
-    near = [psnr(d, s.exact) for d, s in zip(drawn, shots, strict=True)]
-    least, moonshot = ASKED[tier][0]
-    return Mark(
+def _renderer_mark(name: str, tier: str, shots: Sequence[ComparedView], drawn: Sequence[RgbPicture]) -> Measurement:
+    near = [psnr(d, s.rendered) for d, s in zip(drawn, shots, strict=True)]
+    least, moonshot = TARGETS[tier][0]
+    return Measurement(
         name=f"{name}: PSNR to the volume renderer, dB",
         value=float(np.mean(near)),
-        least=least,
-        moonshot=moonshot,
-        beside=f"{len(shots)} pictures, {min(near):.1f} to {max(near):.1f}",
+        required=least,
+        stretch_goal=moonshot,
+        context=f"{len(shots)} pictures, {min(near):.1f} to {max(near):.1f}",
     )
 
 
-def _loss(name: str, tier: str, told: Sequence[tuple[Picture, Picture, Picture]]) -> Mark:
+def _truth_mark(name: str, tier: str, told: Sequence[tuple[RgbPicture, RgbPicture, RgbPicture]]) -> Measurement:
     of_field = np.mean([psnr(exact, truth) for exact, _, truth in told])
     of_player = np.mean([psnr(drawn, truth) for _, drawn, truth in told])
-    least, moonshot = ASKED[tier][1]
-    return Mark(
+    least, moonshot = TARGETS[tier][1]
+    return Measurement(
         name=f"{name}: loss against the truth, dB",
         value=float(of_field - of_player),
-        least=least,
-        moonshot=moonshot,
-        beside=f"volume renderer {of_field:.2f}, player {of_player:.2f}",
+        required=least,
+        stretch_goal=moonshot,
+        context=f"volume renderer {of_field:.2f}, player {of_player:.2f}",
     )

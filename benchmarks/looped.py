@@ -20,8 +20,8 @@ from apps.learning.run_folder import RunFolder
 from apps.terminal.console import Console
 from avatar.warm import warm_up
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Mark
-from benchmarks.stage import opened
+from benchmarks.marks import Measurement
+from benchmarks.stage import open_sample
 from capture.opening import open_source
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
@@ -32,7 +32,7 @@ SECONDS = 60.0
 MIB = 1 << 20
 
 
-def loop(capture: Path, out: Path) -> Path:
+def write_looped_capture(capture: Path, out: Path) -> Path:
     """A capture folder that holds another's frames several times over."""
     if out.exists():
         return out
@@ -61,23 +61,23 @@ def loop(capture: Path, out: Path) -> Path:
     return out
 
 
-def growth_marks(capture: Path, looped: Path) -> Iterator[Mark]:
+def measure_memory_growth(capture: Path, looped: Path) -> Iterator[Measurement]:
     """Memory of a process that learns from the looped clip."""
-    long = loop(capture, looped)
+    long = write_looped_capture(capture, looped)
     command = [sys.executable, "-m", "benchmarks.looped", str(long), str(long / "run")]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     first, last, read = (float(word) for word in done.stdout.split()[-3:])
-    yield Mark(
+    yield Measurement(
         name=f"memory growth from frame {FIRST} to frame {LAST:,}, MiB",
         value=(last - first) / MIB,
-        least="≤ 100",
-        moonshot="≤ 20",
-        beside=f"resident: {first / MIB:.0f} MiB at the first, {last / MIB:.0f} at the last; "
+        required="≤ 100",
+        stretch_goal="≤ 20",
+        context=f"resident: {first / MIB:.0f} MiB at the first, {last / MIB:.0f} at the last; "
         f"{read:.0f} frames read as fast as the trainer takes them",
     )
 
 
-def resident() -> int:
+def resident_bytes() -> int:
     """Bytes of this process that are in memory now (Linux)."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
@@ -87,25 +87,25 @@ def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
     import torch
 
-    from apps.learning.learn import Lesson, new_trainer
+    from apps.learning.learn import TrainingSession, new_trainer
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
-    recording, device = opened(capture), torch.device("cpu")
+    recording, device = open_sample(capture), torch.device("cpu")
     trainer = new_trainer(recording, seconds=SECONDS, seed=0, refine_poses=True, device=device)
     warm_up(trainer)
     at: dict[int, int] = {}
-    add = trainer.add
+    add = trainer.add_frame
 
     def counted(*arguments: Any, **more: Any) -> None:
         add(*arguments, **more)
-        at[lesson.meter.read] = resident()
+        at[lesson.meter.frames_read] = resident_bytes()
 
-    trainer.add = counted
-    lesson = Lesson(trainer, recording, run, Console(), threading.Event(), {})
-    lesson.learn()
+    trainer.add_frame = counted
+    lesson = TrainingSession(trainer, recording, run, Console(), threading.Event(), {})
+    lesson.train()
     shutil.rmtree(run.path, ignore_errors=True)
     early = min((count for count in at if count >= FIRST), default=max(at))
-    print(at[early], at[max(at)], lesson.meter.read)
+    print(at[early], at[max(at)], lesson.meter.frames_read)
 
 
 if __name__ == "__main__":

@@ -17,25 +17,25 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
-from apps.reporting.curve import CurvePoint, largest_fall
-from apps.studio.writer import ShootConfig, shoot
-from avatar.hold import on_white, truth_on_white
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
+from apps.reporting.curve import CurvePoint, largest_drop
+from apps.studio.writer import ShootConfig, film_capture
+from avatar.hold import composite_on_white, ground_truth_on_white
 from avatar.metrics import psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
-from export.player import Player, premultiplied
+from export.player import Player, premultiply
 from preprocess.observation import Observation
 
 
 @dataclass(frozen=True, kw_only=True)
-class MainJob:
+class EndToEndJob:
     """Films a sample, learns it with ia-ingest, and scores the avatar in poses never seen."""
 
     size: int = 256
     """Width and height of the pictures."""
     frames: int = 120
-    """Frames of the video."""
+    """EvaluationFrames of the video."""
     seconds: float = 60.0
     """Seconds of training."""
     seed: int = 0
@@ -50,12 +50,12 @@ class MainJob:
     """Folder for capture and run; without it both are thrown away."""
     json: Path | None = None
     """File for the figures."""
-    more: list[str] = field(default_factory=list)
+    ingest_options: list[str] = field(default_factory=list)
     """More arguments of ia-ingest."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class EndToEndRow:
     """One figure.
 
     Attributes:
@@ -70,7 +70,7 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Novel:
+class NovelPoseScores:
     """How well poses are shown that were never filmed: means over all of them.
 
     Attributes:
@@ -86,22 +86,22 @@ class Novel:
 
 def main() -> None:
     """The benchmark."""
-    job = tyro.cli(MainJob, prog="python -m benchmarks.main_job", description=__doc__)
+    job = tyro.cli(EndToEndJob, prog="python -m benchmarks.main_job", description=__doc__)
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        rows = measured(job, job.keep or Path(temporary))
+        rows = measure_job(job, job.keep or Path(temporary))
     title = f"{job.frames} frames of {job.size} px, {job.seconds:g} s of training, seed {job.seed}"
-    print("\n".join([*hardware.lines(), title, "", *table(rows)]))
+    print("\n".join([*hardware.lines(), title, "", *markdown_lines(rows)]))
     if job.json is not None:
         content = {
             "hardware": asdict(hardware),
             "job": {k: v for k, v in vars(job).items() if k not in ("keep", "json")},
             "figures": {row.name: row.value for row in rows},
         }
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
 
 
-def measured(job: MainJob, folder: Path) -> list[Row]:
+def measure_job(job: EndToEndJob, folder: Path) -> list[EndToEndRow]:
     """Does the whole job in a folder."""
     capture, run = folder / "capture", folder / "run"
     config = ShootConfig(
@@ -109,29 +109,29 @@ def measured(job: MainJob, folder: Path) -> list[Row]:
         pose_noise_deg=job.pose_noise_deg, pose_noise_cm=job.pose_noise_cm,
     )  # fmt: skip
     began = time.perf_counter()
-    shoot(capture, config, overwrite=True)
+    film_capture(capture, config, overwrite=True)
     filmed = time.perf_counter() - began
-    report, whole = ingested(job, capture, run)
-    unseen = observations(capture)
-    rows = [*learning_rows(report), *novel_rows(run, unseen), *cost_rows(report, run)]
-    video = f"the video lasts {length(job):.1f} s"
+    report, whole = run_ingest(job, capture, run)
+    unseen = novel_observations(capture)
+    rows = [*training_rows(report), *novel_rows(run, unseen), *cost_rows(report, run)]
+    video = f"the video lasts {video_seconds(job):.1f} s"
     return [
         *rows,
-        Row(name="whole ia-ingest, s", value=whole, reference=video),
-        Row(name="filming the sample, s", value=filmed),
+        EndToEndRow(name="whole ia-ingest, s", value=whole, reference=video),
+        EndToEndRow(name="filming the sample, s", value=filmed),
     ]
 
 
-def length(job: MainJob) -> float:
+def video_seconds(job: EndToEndJob) -> float:
     """Of the video, seconds."""
     return job.frames / ShootConfig().fps
 
 
-def ingested(job: MainJob, capture: Path, run: Path) -> tuple[dict[str, Any], float]:
+def run_ingest(job: EndToEndJob, capture: Path, run: Path) -> tuple[dict[str, Any], float]:
     """Runs ia-ingest as a user does; its report, and how long all of it took."""
     command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4")]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite"]
-    command += ["--seconds", str(job.seconds), "--seed", str(job.seed), *job.more]
+    command += ["--seconds", str(job.seconds), "--seed", str(job.seed), *job.ingest_options]
     began = time.perf_counter()
     done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)
     took = time.perf_counter() - began
@@ -140,13 +140,13 @@ def ingested(job: MainJob, capture: Path, run: Path) -> tuple[dict[str, Any], fl
     return json.loads((run / "report.json").read_text()), took
 
 
-def observations(capture: Path) -> list[Observation]:
+def novel_observations(capture: Path) -> list[Observation]:
     """The poses that were never filmed, with their true pictures and masks."""
-    wanted = RecordingPaths(video=capture / "truth" / "novel", cameras=str(capture / "cameras.npz"))
-    return [seen for seen in open_recording(wanted).observations() if isinstance(seen, Observation)]
+    wanted = CaptureInputs(video=capture / "truth" / "novel", cameras=str(capture / "cameras.npz"))
+    return [seen for seen in open_capture(wanted).observations() if isinstance(seen, Observation)]
 
 
-def learning_rows(report: dict[str, Any]) -> list[Row]:
+def training_rows(report: dict[str, Any]) -> list[EndToEndRow]:
     """Held-out frames, and the way there."""
     rows = []
     for key, name in (("held_out", "held out"), ("held_out_refined", "held out, refined poses")):
@@ -154,20 +154,20 @@ def learning_rows(report: dict[str, Any]) -> list[Row]:
         if held is not None:
             frames = f"{len(held['frames'])} frames"
             rows += [
-                Row(name=f"{name}, PSNR dB", value=held["psnr"], reference=frames),
-                Row(name=f"{name}, PSNR in the mask dB", value=held["psnr_mask"]),
-                Row(name=f"{name}, SSIM", value=held["ssim"]),
+                EndToEndRow(name=f"{name}, PSNR dB", value=held["psnr"], reference=frames),
+                EndToEndRow(name=f"{name}, PSNR in the mask dB", value=held["psnr_mask"]),
+                EndToEndRow(name=f"{name}, SSIM", value=held["ssim"]),
             ]
     curve = [point for point in report["curve"] if point["psnr"] is not None]
     told = ", ".join(f"{point['wall_seconds']:.0f} s {point['psnr']:.1f}" for point in curve)
-    fall = largest_fall([CurvePoint.again(point) for point in curve])
+    fall = largest_drop([CurvePoint.from_checkpoint(point) for point in curve])
     return [
         *rows,
-        Row(name="largest fall of a frame from its best, dB", value=fall, reference=told),
+        EndToEndRow(name="largest fall of a frame from its best, dB", value=fall, reference=told),
     ]
 
 
-def novel_rows(run: Path, unseen: list[Observation]) -> list[Row]:
+def novel_rows(run: Path, unseen: list[Observation]) -> list[EndToEndRow]:
     """Poses never filmed: by the player, by the volume renderer, and as a white sheet."""
     import torch
 
@@ -175,35 +175,35 @@ def novel_rows(run: Path, unseen: list[Observation]) -> list[Row]:
     from avatar.render import render
 
     trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
-    exact = shown(unseen, lambda seen: on_white(render(trainer.avatar, seen.pose, seen.camera)))
-    sheet = shown(unseen, lambda seen: np.ones_like(truth_on_white(seen)))
+    exact = score_images(unseen, lambda seen: composite_on_white(render(trainer.avatar, seen.pose, seen.camera)))
+    sheet = score_images(unseen, lambda seen: np.ones_like(ground_truth_on_white(seen)))
     rows = [
-        Row(
+        EndToEndRow(
             name="novel poses, volume renderer, PSNR dB",
             value=exact.psnr,
             reference=f"{len(unseen)} poses; a white sheet: {sheet.psnr:.2f}",
         ),
-        Row(name="novel poses, volume renderer, PSNR in the mask dB", value=exact.psnr_mask),
-        Row(name="novel poses, volume renderer, SSIM", value=exact.ssim),
+        EndToEndRow(name="novel poses, volume renderer, PSNR in the mask dB", value=exact.psnr_mask),
+        EndToEndRow(name="novel poses, volume renderer, SSIM", value=exact.ssim),
     ]
     if not (run / "avatar.iavatar").exists():
         return rows
     player = Player.load(run / "avatar.iavatar")
-    played = shown(
-        unseen, lambda seen: on_white(premultiplied(player.render(seen.pose, seen.camera)))
+    played = score_images(
+        unseen, lambda seen: composite_on_white(premultiply(player.render(seen.pose, seen.camera)))
     )
     lost = f"{played.psnr - exact.psnr:+.2f} to the volume renderer"
     faster = f"volume renderer {exact.ms:.0f}: {exact.ms / played.ms:.1f} times"
     return [
-        Row(name="novel poses, player, PSNR dB", value=played.psnr, reference=lost),
-        Row(name="novel poses, player, PSNR in the mask dB", value=played.psnr_mask),
-        Row(name="novel poses, player, SSIM", value=played.ssim),
+        EndToEndRow(name="novel poses, player, PSNR dB", value=played.psnr, reference=lost),
+        EndToEndRow(name="novel poses, player, PSNR in the mask dB", value=played.psnr_mask),
+        EndToEndRow(name="novel poses, player, SSIM", value=played.ssim),
         *rows,
-        Row(name="player, CPU ms a picture", value=played.ms, reference=faster),
+        EndToEndRow(name="player, CPU ms a picture", value=played.ms, reference=faster),
     ]
 
 
-def shown(unseen: list[Observation], picture: Any) -> Novel:
+def score_images(unseen: list[Observation], picture: Any) -> NovelPoseScores:
     """Scores what `picture` shows of each observation, and times it."""
     picture(unseen[0])  # warms up
     scores, spent = [], 0.0
@@ -211,45 +211,45 @@ def shown(unseen: list[Observation], picture: Any) -> Novel:
         began = time.process_time()
         image = np.clip(picture(seen), 0.0, 1.0)
         spent += time.process_time() - began
-        truth, mask = truth_on_white(seen), seen.alpha > 0.5
+        truth, mask = ground_truth_on_white(seen), seen.alpha > 0.5
         scores.append((psnr(image, truth), psnr(image, truth, mask), ssim(image, truth)))
     whole, inside, alike = np.mean(scores, axis=0)
     milliseconds = 1000.0 * spent / len(unseen)
-    return Novel(psnr=float(whole), psnr_mask=float(inside), ssim=float(alike), ms=milliseconds)
+    return NovelPoseScores(psnr=float(whole), psnr_mask=float(inside), ssim=float(alike), ms=milliseconds)
 
 
-def cost_rows(report: dict[str, Any], run: Path) -> list[Row]:
+def cost_rows(report: dict[str, Any], run: Path) -> list[EndToEndRow]:
     """Time, work and bytes."""
     training, package = report["training"], report["package"]
     rows = [
-        Row(name="start-up, s", value=training["startup_seconds"]),
-        Row(
+        EndToEndRow(name="start-up, s", value=training["startup_seconds"]),
+        EndToEndRow(
             name="training, wall s",
             value=training["wall_seconds"],
             reference=f"CPU {training['cpu_seconds']:.1f}: "
             f"{training['cpu_seconds'] / max(training['wall_seconds'], 1e-6):.2f} cores",
         ),
-        Row(name="steps", value=training["steps"]),
-        Row(name="rays a second", value=training["rays_per_second"]),
-        Row(name="samples a ray", value=training["samples_per_ray"]),
-        Row(name="peak memory, MB", value=training["peak_memory_mb"]),
+        EndToEndRow(name="steps", value=training["steps"]),
+        EndToEndRow(name="rays a second", value=training["rays_per_second"]),
+        EndToEndRow(name="samples a ray", value=training["samples_per_ray"]),
+        EndToEndRow(name="peak memory, MB", value=training["peak_memory_mb"]),
     ]
     if package is None:
-        return [*rows, Row(name="package, MB", value=None, reference="refused")]
+        return [*rows, EndToEndRow(name="package, MB", value=None, reference="refused")]
     state = sum(path.stat().st_size for path in (run / "checkpoint").iterdir())
     smaller = f"the checkpoint is {state / package['bytes']:.1f} times as large"
     to_renderer = package["psnr_to_renderer"]["hq"]
     return [
         *rows,
-        Row(name="bake and checks, s", value=package["seconds"]),
-        Row(name="package, MB", value=package["bytes"] / 1e6, reference=smaller),
-        Row(name="player to volume renderer, dB", value=to_renderer),
+        EndToEndRow(name="bake and checks, s", value=package["seconds"]),
+        EndToEndRow(name="package, MB", value=package["bytes"] / 1e6, reference=smaller),
+        EndToEndRow(name="player to volume renderer, dB", value=to_renderer),
     ]
 
 
-def table(rows: list[Row]) -> list[str]:
+def markdown_lines(rows: list[EndToEndRow]) -> list[str]:
     """The rows as Markdown."""
-    values = ["-" if row.value is None else written(row.value) for row in rows]
+    values = ["-" if row.value is None else format_number(row.value) for row in rows]
     cells = [("figure", "value", "beside it")]
     cells += [(row.name, value, row.reference) for row, value in zip(rows, values, strict=True)]
     name, value, beside = (max(map(len, column)) for column in zip(*cells, strict=True))
@@ -257,7 +257,7 @@ def table(rows: list[Row]) -> list[str]:
     return [lines[0], f"|{'-' * (name + 2)}|{'-' * (value + 1)}:|{'-' * (beside + 2)}|", *lines[1:]]
 
 
-def written(value: float) -> str:
+def format_number(value: float) -> str:
     """A number with as many digits as anybody reads."""
     digits = 0 if float(value).is_integer() or abs(value) >= 1000 else 2 if abs(value) >= 1 else 3
     return f"{value:,.{digits}f}"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mark:
+class Measurement:
     """One figure.
 
     Attributes:
@@ -16,15 +16,15 @@ class Mark:
 
     name: str
     value: float | None
-    least: str = ""
-    moonshot: str = ""
-    beside: str = ""
+    required: str = ""
+    stretch_goal: str = ""
+    context: str = ""
 
 
-def table(marks: list[Mark]) -> list[str]:
+def markdown_rows(marks: list[Measurement]) -> list[str]:
     """The marks as Markdown."""
     cells = [("what", "measured", "at least", "moonshot", "beside it")]
-    cells += [(m.name, written(m.value), m.least, m.moonshot, m.beside) for m in marks]
+    cells += [(m.name, format_value(m.value), m.required, m.stretch_goal, m.context) for m in marks]
     *widths, _ = (max(map(len, column)) for column in zip(*cells, strict=True))
     lines = [
         "| " + " | ".join([a.ljust(widths[0]), b.rjust(widths[1]), c.ljust(widths[2]),
@@ -36,7 +36,7 @@ def table(marks: list[Mark]) -> list[str]:
     return [lines[0], "|" + "|".join(rule) + "|---|", *lines[1:]]
 
 
-def written(value: float | None) -> str:
+def format_value(value: float | None) -> str:
     """A number with as many digits as anybody reads."""
     if value is None:
         return "-"

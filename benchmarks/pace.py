@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.playing.bench import Benchmark, benchmark
+from apps.playing.bench import PlayerTiming, benchmark_player
 from benchmarks.hardware import ROOT
-from benchmarks.likeness import Shot
-from benchmarks.marks import Mark
+from benchmarks.likeness import ComparedView
+from benchmarks.marks import Measurement
 from export.player import Player
-from export.tiers import TIERS
+from export.tiers import QUALITY_TIERS
 
 ROUNDS = 5
-ASKED = {"hq": ("≤ 45", "≤ 25"), "lite": ("≤ 28", "≤ 15")}
-FIRST = """
+TARGETS = {"hq": ("≤ 45", "≤ 25"), "lite": ("≤ 28", "≤ 15")}
+FIRST_IMAGE_SCRIPT = """
 import sys, time
 import numpy as np
 import onnxruntime
@@ -34,50 +34,50 @@ print(loaded - began, time.process_time() - began)
 """Its own process: nothing has been loaded, compiled or cached before."""
 
 
-def pace_marks(name: str, package: Path, shots: Sequence[Shot]) -> Iterator[Mark]:
+def frame_time_marks(name: str, package: Path, shots: Sequence[ComparedView]) -> Iterator[Measurement]:
     """CPU time of a picture, and its ratio to the reference graph's, tiers in turns."""
-    players = {tier: Player.load(package, tier=tier) for tier in TIERS}
+    players = {tier: Player.load(package, tier=tier) for tier in QUALITY_TIERS}
     seen = [(shot.pose, shot.camera) for shot in shots]
-    rounds: dict[str, list[Benchmark]] = {tier: [] for tier in players}
+    rounds: dict[str, list[PlayerTiming]] = {tier: [] for tier in players}
     for _ in range(ROUNDS):
         for tier, player in players.items():
-            rounds[tier].append(benchmark(player, seen, tier=tier, load_ms=0.0))
+            rounds[tier].append(benchmark_player(player, seen, tier=tier, load_ms=0.0))
     for tier, found in rounds.items():
-        least, moonshot = ASKED[tier]
+        least, moonshot = TARGETS[tier]
         ms = float(np.median([turn.cpu_ms_per_frame for turn in found]))
         reference = [turn.reference_ms for turn in found]
         ratio = np.median([turn.cpu_ms_per_frame / turn.reference_ms for turn in found])
-        yield Mark(
+        yield Measurement(
             name=f"{name}, {tier}: CPU-ms a picture of {found[0].size} px, one thread",
             value=ms,
-            least=least,
-            moonshot=moonshot,
-            beside=f"{found[0].pixels_covered:.1%} covered; {len(seen)} pictures, {ROUNDS} times: "
+            required=least,
+            stretch_goal=moonshot,
+            context=f"{found[0].pixels_covered:.1%} covered; {len(seen)} pictures, {ROUNDS} times: "
             f"{min(t.cpu_ms_per_frame for t in found):.1f} to "
             f"{max(t.cpu_ms_per_frame for t in found):.1f}",
         )
-        yield Mark(
+        yield Measurement(
             name=f"{name}, {tier}: the same in runs of the reference graph",
             value=float(ratio),
-            beside=f"which takes {min(reference):.1f} to {max(reference):.1f} ms",
+            context=f"which takes {min(reference):.1f} to {max(reference):.1f} ms",
         )
 
 
-def load_marks(name: str, package: Path) -> Iterator[Mark]:
+def load_time_marks(name: str, package: Path) -> Iterator[Measurement]:
     """From the file to the first picture, in a fresh process whose imports are done."""
-    for tier in TIERS:
-        times = [_first(package, tier) for _ in range(3)]
+    for tier in QUALITY_TIERS:
+        times = [_time_first_image(package, tier) for _ in range(3)]
         loaded, drawn = (float(value) for value in np.median(times, axis=0))
-        yield Mark(
+        yield Measurement(
             name=f"{name}, {tier}: from the file to the first picture, CPU-s",
             value=drawn,
-            least="≤ 0.8",
-            moonshot="≤ 0.3",
-            beside=f"reading and session {loaded:.2f} s; a process of its own, median of 3",
+            required="≤ 0.8",
+            stretch_goal="≤ 0.3",
+            context=f"reading and session {loaded:.2f} s; a process of its own, median of 3",
         )
 
 
-def _first(package: Path, tier: str) -> list[float]:
-    command = [sys.executable, "-c", FIRST, str(package), tier]
+def _time_first_image(package: Path, tier: str) -> list[float]:
+    command = [sys.executable, "-c", FIRST_IMAGE_SCRIPT, str(package), tier]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return [float(number) for number in done.stdout.split()]

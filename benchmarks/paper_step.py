@@ -3,12 +3,12 @@
 What follows the paper (Jiang et al. 2023) and its released configuration:
 128 stratified samples a ray between the walls of the posed person's box; of them those survive
 that lie in occupied cells of a 64³ grid in root-normalised space, the union over the sequence
-(§3.3, training); each survivor is carried to canonical space by Broyden's method from nine bones,
+(§3.3, training); each survivor is carried to canonical space by BroydenLookup's method from nine bones,
 ten iterations each (Fast-SNARF, §3.2); of its roots the one of highest density counts; the losses
 of §3.4. One picture a step.
 
 What does not: field, losses and pixels are ours, so that the algorithms alone differ; the union
-grid is made by posing our canonical occupancy, dilated once, not by probing the field; Broyden
+grid is made by posing our canonical occupancy, dilated once, not by probing the field; BroydenLookup
 starts from the bone's own inverse rotation, which costs nothing.
 """
 
@@ -22,23 +22,23 @@ from torch import Tensor
 
 from avatar.config import TrainConfig
 from avatar.kernels import reference
-from avatar.kernels.backend import Grid
+from avatar.kernels.backend import DensityGrid
 from avatar.kernels.roots import START_BONES
-from avatar.prepare import PreparedFrame
-from avatar.replay import Batch
+from avatar.prepare import TrainingFrame
+from avatar.replay import TrainingBatch
 from avatar.rig import Rig
-from benchmarks.torch_step import TorchField, opacity_of
+from benchmarks.torch_step import AutogradField, centimeter_opacity
 
-SAMPLES = 128
+SAMPLES_PER_RAY = 128
 UNION_CELLS = 64
 ITERATIONS = 10
-AT_REST_M = 1e-3
+CONVERGED_M = 1e-3
 SAME_ROOT_M = 1e-3
 """Roots closer than this are one, as in Fast-SNARF's filter."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PaperScene:
+class PaperStepInputs:
     """One frame, as the paper's step needs it.
 
     Attributes:
@@ -54,44 +54,44 @@ class PaperScene:
     low: Float32[Tensor, "3"]
     high: Float32[Tensor, "3"]
     bones: Float32[Tensor, "bones 3 4"]
-    person: Float32[Tensor, "2 3"]
+    person_box: Float32[Tensor, "2 3"]
     union: Bool[Tensor, "64 64 64"]
     union_box: Float32[Tensor, "2 3"]
 
     @classmethod
     def of(
-        cls, rig: Rig, frame: PreparedFrame, frames: Sequence[PreparedFrame], grid: Grid
-    ) -> "PaperScene":
+        cls, rig: Rig, frame: TrainingFrame, frames: Sequence[TrainingFrame], grid: DensityGrid
+    ) -> "PaperStepInputs":
         """The scene of one frame out of a sequence."""
         device = grid.low.device
         transforms = rig.body_from_canonical(frame.pose.joint_rotations)
         weights = torch.from_numpy(rig.weights).to(device)
         blended = weights @ torch.from_numpy(transforms[:, :3].reshape(24, 12)).to(weights)
         inverses = np.linalg.inv(transforms[list(START_BONES)])[:, :3]
-        union, union_box = union_grid(rig, frames, grid)
+        union, union_box = union_occupancy(rig, frames, grid)
         return cls(
             volume=blended.permute(3, 2, 1, 0)[None].contiguous(),
             low=torch.from_numpy(rig.box_low).to(device),
             high=torch.from_numpy(rig.box_high).to(device),
             bones=torch.from_numpy(inverses).to(weights),
-            person=torch.from_numpy(box_of(frame)).to(device),
+            person=torch.from_numpy(person_box(frame)).to(device),
             union=union,
             union_box=union_box,
         )
 
 
-def box_of(frame: PreparedFrame) -> Float32[np.ndarray, "2 3"]:
+def person_box(frame: TrainingFrame) -> Float32[np.ndarray, "2 3"]:
     """Corners of the box about a posed person, body frame, metres."""
-    cells = frame.cells
-    high = cells.low + np.array(cells.index.shape, np.float32) * np.float32(cells.cell_m)
+    cells = frame.correspondences
+    high = cells.low + np.array(cells.packed_cells.shape, np.float32) * np.float32(cells.cell_m)
     return np.stack([cells.low, high]).astype(np.float32)
 
 
-def union_grid(
-    rig: Rig, frames: Sequence[PreparedFrame], grid: Grid
+def union_occupancy(
+    rig: Rig, frames: Sequence[TrainingFrame], grid: DensityGrid
 ) -> tuple[Bool[Tensor, "64 64 64"], Float32[Tensor, "2 3"]]:
     """The cells of root-normalised space that hold something in any frame, and their box."""
-    boxes = np.stack([box_of(frame) for frame in frames])
+    boxes = np.stack([person_box(frame) for frame in frames])
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     cells = grid.occupied.cpu().nonzero().numpy()
     points = (cells + 0.5) / grid.cells_per_m.cpu().numpy() + grid.low.cpu().numpy()
@@ -108,17 +108,17 @@ def union_grid(
     return (dilated > 0).to(device), torch.from_numpy(np.stack([low, high])).to(device)
 
 
-def stratified(
-    scene: PaperScene, batch: Batch
+def stratified_samples(
+    scene: PaperStepInputs, batch: TrainingBatch
 ) -> tuple[Float32[Tensor, "survivors 3"], Tensor, Float32[Tensor, "rays"]]:
-    """Samples that survive the union grid, how many each ray keeps, and each ray's step."""
+    """RaySamples that survive the union grid, how many each ray keeps, and each ray's step."""
     origins, directions = batch.rays.origins, batch.rays.directions
     towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
-    walls = (scene.person[:, None] - origins) / towards
+    walls = (scene.person_box[:, None] - origins) / towards
     enter = walls.amin(dim=0).amax(dim=1).clamp(min=0.0)
-    step = (walls.amax(dim=0).amin(dim=1) - enter).clamp(min=0.0) / SAMPLES
-    place = torch.arange(SAMPLES, device=step.device) + torch.rand(
-        len(step), SAMPLES, device=step.device
+    step = (walls.amax(dim=0).amin(dim=1) - enter).clamp(min=0.0) / SAMPLES_PER_RAY
+    place = torch.arange(SAMPLES_PER_RAY, device=step.device) + torch.rand(
+        len(step), SAMPLES_PER_RAY, device=step.device
     )
     points = (
         origins[:, None] + (enter[:, None] + place * step[:, None])[..., None] * directions[:, None]
@@ -131,7 +131,7 @@ def stratified(
     return points[kept], kept.sum(dim=1), step
 
 
-def _posed(scene: PaperScene, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
+def _skin_points(scene: PaperStepInputs, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
     place = (points - scene.low) / (scene.high - scene.low) * 2.0 - 1.0
     read = torch.nn.functional.grid_sample(
         scene.volume, place[None, :, None, None], padding_mode="border", align_corners=True
@@ -141,19 +141,19 @@ def _posed(scene: PaperScene, points: Float32[Tensor, "points 3"]) -> Float32[Te
 
 
 @torch.no_grad()
-def broyden(
-    scene: PaperScene, targets: Float32[Tensor, "points 3"]
+def find_roots_in_torch(
+    scene: PaperStepInputs, targets: Float32[Tensor, "points 3"]
 ) -> tuple[Float32[Tensor, "bones points 3"], Bool[Tensor, "bones points"]]:
     """A root from each bone for every sample, and which came to rest at a place of their own."""
     count, bones = len(targets), len(scene.bones)
     inverse = scene.bones[:, None, :, :3].expand(bones, count, 3, 3).flatten(0, 1)
     goal = targets.repeat(bones, 1)
     x = (inverse @ goal[..., None])[..., 0] + scene.bones[:, :, 3].repeat_interleave(count, 0)
-    error = _posed(scene, x) - goal
+    error = _skin_points(scene, x) - goal
     for _ in range(ITERATIONS):
         step = -(inverse @ error[..., None])[..., 0]
         x = x + step
-        new = _posed(scene, x) - goal
+        new = _skin_points(scene, x) - goal
         change = (inverse @ (new - error)[..., None])[..., 0]
         scale = (step * change).sum(dim=-1, keepdim=True)
         scale = torch.where(scale.abs() < 1e-12, 1e-12, scale)
@@ -161,7 +161,7 @@ def broyden(
         inverse = inverse + ((step - change) / scale)[..., None] * row
         error = new
     roots = x.unflatten(0, (bones, count))
-    valid = (error.norm(dim=-1) < AT_REST_M).unflatten(0, (bones, count))
+    valid = (error.norm(dim=-1) < CONVERGED_M).unflatten(0, (bones, count))
     for bone in range(1, bones):
         near = (roots[:bone] - roots[bone]).norm(dim=-1) < SAME_ROOT_M
         valid[bone] &= ~(near & valid[:bone]).any(dim=0)
@@ -169,17 +169,17 @@ def broyden(
 
 
 def paper_step(
-    scene: PaperScene,
-    field: TorchField,
-    batch: Batch,
+    scene: PaperStepInputs,
+    field: AutogradField,
+    batch: TrainingBatch,
     empty: Float32[Tensor, "empty 3"],
     background: Float32[Tensor, "rays 3"],
     config: TrainConfig,
 ) -> tuple[int, int]:
     """Gradients of the loss; how many samples survived, and how many roots were asked."""
-    points, count, step = stratified(scene, batch)
-    roots, valid = broyden(scene, points)
-    raw = field.raw_at(torch.cat([roots[valid], empty]))
+    points, count, step = stratified_samples(scene, batch)
+    roots, valid = find_roots_in_torch(scene, points)
+    raw = field.raw_outputs_at(torch.cat([roots[valid], empty]))
     asked = int(valid.sum())
     candidates = raw.new_full((*valid.shape, 4), -30.0)
     candidates[valid] = raw[:asked]
@@ -191,8 +191,8 @@ def paper_step(
     first = torch.cumsum(count, 0) - count
     rendered = reference.composite(chosen, first, count.int(), mean_step)
     loss = reference.loss_per_ray(
-        rendered, batch.target, background, config.alpha_weight, config.hard_weight
+        rendered, batch.target, background, config.alpha_weight, config.hard_surface_weight
     ).mean()
-    total = loss + config.empty_weight * opacity_of(raw[asked:]).mean()
+    total = loss + config.empty_space_weight * centimeter_opacity(raw[asked:]).mean()
     torch.autograd.grad(total, field.parameters)
     return len(points), asked

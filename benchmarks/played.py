@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Mark
+from benchmarks.marks import Measurement
 from preprocess.pose_file import read_motion
 
-LOOKING_S = 0.01
+POLL_INTERVAL_S = 0.01
 FPS = 30.0
 
 
-class Played(NamedTuple):
+class RealtimeRun(NamedTuple):
     """A run, looked at from outside.
 
     Attributes:
@@ -28,7 +28,7 @@ class Played(NamedTuple):
     package_after_s: float
 
 
-def played(capture: Path, run: Path, *more: str) -> Played:
+def run_realtime(capture: Path, run: Path, *more: str) -> RealtimeRun:
     """Runs ia-ingest --realtime and watches its folder."""
     command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4"), "--realtime"]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite", *more]
@@ -37,48 +37,48 @@ def played(capture: Path, run: Path, *more: str) -> Played:
         while process.poll() is None:
             if there_after != there_after and (run / "avatar.iavatar").exists():
                 there_after = time.perf_counter() - began
-            time.sleep(LOOKING_S)
-    return Played(json.loads((run / "report.json").read_text()), there_after)
+            time.sleep(POLL_INTERVAL_S)
+    return RealtimeRun(json.loads((run / "report.json").read_text()), there_after)
 
 
-def played_marks(capture: Path, run: Path) -> Iterator[Mark]:
+def measure_realtime(capture: Path, run: Path) -> Iterator[Measurement]:
     """The first run warms the caches of compiled code and files; the second is measured."""
-    played(capture, run.with_name("warm"), "--frames", "0:60", "--size", "64")
-    seen = played(capture, run)
+    run_realtime(capture, run.with_name("warm"), "--frames", "0:60", "--size", "64")
+    seen = run_realtime(capture, run)
     report, stream = seen.report, seen.report["stream"]
     last_s = (len(read_motion(capture / "poses.npz")) - 1) / FPS
     outside = seen.package_after_s - report["training"]["startup_seconds"] - last_s
     package = report["package"] or {"seconds": float("nan")}
-    yield Mark(
+    yield Measurement(
         name="package ready after the last frame, s",
         value=stream["ready_after_last_frame_seconds"],
-        least="≤ 3",
-        moonshot="≤ 1",
-        beside=f"from outside the process {outside:.2f} (its start-up included in full: imports "
+        required="≤ 3",
+        stretch_goal="≤ 1",
+        context=f"from outside the process {outside:.2f} (its start-up included in full: imports "
         f"before its clock count here); baking, checks, writing {package['seconds']:.2f} s",
     )
     held = report["held_out"]
-    yield Mark(
+    yield Measurement(
         name="held-out PSNR at the last frame, dB",
         value=held["psnr"],
-        beside=f"in the mask {held['psnr_mask']:.2f}; {report['training']['steps']:,} steps, "
+        context=f"in the mask {held['psnr_mask']:.2f}; {report['training']['steps']:,} steps, "
         f"{report['training']['rays_per_second'] / 1000:.0f} k rays/s; "
         f"{report['frames']['used']} frames learnt from, {len(report['frames']['dropped'])} left "
         f"out; {report['frames']['alike']} alike, {report['frames']['not_replayed']} not kept",
     )
-    yield Mark(
+    yield Measurement(
         name="preparing a frame, p95, ms",
         value=stream["ingest_ms"]["p95"],
-        least="≤ 100",
-        moonshot="≤ 35",
-        beside=f"p50 {stream['ingest_ms']['p50']:.0f}; decode, mask, pose, cells, beside the "
+        required="≤ 100",
+        stretch_goal="≤ 35",
+        context=f"p50 {stream['ingest_ms']['p50']:.0f}; decode, mask, pose, cells, beside the "
         f"trainer; behind the video p50 {stream['lateness_ms']['p50']:.0f}, "
         f"p95 {stream['lateness_ms']['p95']:.0f} ms",
     )
-    yield Mark(
+    yield Measurement(
         name="frames dropped",
         value=float(stream["inbox_dropped"]),
-        least="0",
-        beside=f"until the trainer has a frame: p50 {stream['latency_ms']['p50']:.0f}, "
+        required="0",
+        context=f"until the trainer has a frame: p50 {stream['latency_ms']['p50']:.0f}, "
         f"p95 {stream['latency_ms']['p95']:.0f} ms",
     )

@@ -22,16 +22,16 @@ from pathlib import Path
 import torch
 import tyro
 
-from apps.terminal.exit_codes import exit_code
+from apps.terminal.exit_codes import run_command
 from avatar import checkpoint
 from avatar.trainer import Trainer
-from benchmarks.baked import baked, package_marks
+from benchmarks.baked import time_bake, package_marks
 from benchmarks.hardware import ROOT, Hardware
-from benchmarks.likeness import Shot, likeness_marks, shots_of, shots_of_person
-from benchmarks.marks import Mark, table
-from benchmarks.pace import load_marks, pace_marks
-from benchmarks.stage import filmed
-from benchmarks.stopwatch import use_threads
+from benchmarks.likeness import ComparedView, fidelity_marks, views_of_sample, views_of_person
+from benchmarks.marks import Measurement, markdown_rows
+from benchmarks.pace import load_time_marks, frame_time_marks
+from benchmarks.stage import film_sample
+from benchmarks.stopwatch import limit_threads
 
 SIZE_PX = 540
 FRAMES = 120
@@ -39,7 +39,7 @@ SECONDS = 60.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Played:
+class PlayerBenchmark:
     """Measures the player and prints one table."""
 
     quick: bool = False
@@ -56,64 +56,64 @@ class Played:
 
 def main() -> int:
     """The benchmark; returns its exit code."""
-    job = tyro.cli(Played, prog="python -m benchmarks.player", description=__doc__)
-    return exit_code("benchmarks.player", lambda: measure(job))
+    job = tyro.cli(PlayerBenchmark, prog="python -m benchmarks.player", description=__doc__)
+    return run_command("benchmarks.player", lambda: measure(job))
 
 
-def measure(job: Played) -> int:
+def measure(job: PlayerBenchmark) -> int:
     """Measures and prints."""
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
         marks = list(measured(job, job.keep or Path(temporary)))
-    print("\n".join([*hardware.lines(), "", *table(marks)]))
+    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
     return 0
 
 
-def measured(job: Played, folder: Path) -> Iterator[Mark]:
+def measured(job: PlayerBenchmark, folder: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
     subjects = (1,) if job.quick else (1, 2)
     groups = [subject_marks(folder, subject, quick=job.quick) for subject in subjects]
     if job.person is not None and job.dance is not None:
         groups.append(person_marks(folder, job.person, job.dance))
     for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
         yield mark
 
 
-def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Mark]:
+def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Measurement]:
     """One actor."""
     suffix = "" if subject == 1 else f"_{subject}"
-    capture = filmed(folder / f"sample{SIZE_PX}{suffix}", SIZE_PX, subject=subject)
-    trainer = learnt(capture, folder / f"run{SIZE_PX}{suffix}", frames=FRAMES)
-    use_threads(1)
-    shots = shots_of(capture, trainer.avatar, frames=FRAMES, every=2 if quick else 1)
+    capture = film_sample(folder / f"sample{SIZE_PX}{suffix}", SIZE_PX, subject=subject)
+    trainer = train_or_load(capture, folder / f"run{SIZE_PX}{suffix}", frames=FRAMES)
+    limit_threads(1)
+    shots = views_of_sample(capture, trainer.avatar, frames=FRAMES, stride=2 if quick else 1)
     package = folder / f"player{SIZE_PX}{suffix}.iavatar"
     yield from all_marks(f"subject {subject}", trainer, package, shots)
 
 
-def person_marks(folder: Path, capture: Path, dance: Path) -> Iterator[Mark]:
+def person_marks(folder: Path, capture: Path, dance: Path) -> Iterator[Measurement]:
     """A real person."""
-    trainer = learnt(capture, folder / "run_person", size=SIZE_PX)
-    use_threads(1)
-    shots = shots_of_person(capture, trainer.avatar, dance, size=SIZE_PX)
+    trainer = train_or_load(capture, folder / "run_person", size=SIZE_PX)
+    limit_threads(1)
+    shots = views_of_person(capture, trainer.avatar, dance, size=SIZE_PX)
     yield from all_marks("real person", trainer, folder / "player_person.iavatar", shots)
 
 
 def all_marks(
-    name: str, trainer: Trainer, package: Path, shots: Mapping[str, Sequence[Shot]]
-) -> Iterator[Mark]:
+    name: str, trainer: Trainer, package: Path, shots: Mapping[str, Sequence[ComparedView]]
+) -> Iterator[Measurement]:
     """What is measured of anybody."""
-    bake = baked(trainer, package, shots["held out"][:4])
+    bake = time_bake(trainer, package, shots["held out"][:4])
     yield from package_marks(name, package, bake)
-    yield from load_marks(name, package)
-    yield from pace_marks(name, package, [shot for some in shots.values() for shot in some])
-    yield from likeness_marks(name, package, shots)
+    yield from load_time_marks(name, package)
+    yield from frame_time_marks(name, package, [shot for some in shots.values() for shot in some])
+    yield from fidelity_marks(name, package, shots)
 
 
-def learnt(
+def train_or_load(
     capture: Path, run: Path, *, frames: int | None = None, size: int | None = None
 ) -> Trainer:
     """The trainer that ia-ingest left in a folder, which it is asked to fill if there is none."""

@@ -13,31 +13,31 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
-from preprocess.shape import betas_for
+from preprocess.shape import betas_for_motion
 
-Spoil = Callable[[Path], None]
+Corruption = Callable[[Path], None]
 """Makes one mistake in a capture folder."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class CorruptedCapture:
     """A capture folder to be spoilt, and what the doctor should say of it."""
 
-    film: str
-    spoils: tuple[tuple[str, Spoil], ...]
+    capture: str
+    corruptions: tuple[tuple[str, Corruption], ...]
 
     @property
     def causes(self) -> frozenset[str]:
-        return frozenset(cause for cause, _ in self.spoils)
+        return frozenset(cause for cause, _ in self.corruptions)
 
-    def make(self, films: Path, folder: Path) -> Path:
+    def write(self, captures: Path, folder: Path) -> Path:
         """A spoilt copy; pictures and masks are linked where they stay as they are."""
-        shutil.copytree(films / self.film, folder, copy_function=_link)
-        for _, spoil in self.spoils:
+        shutil.copytree(captures / self.capture, folder, copy_function=_link)
+        for _, spoil in self.corruptions:
             spoil(folder)
         return folder
 
@@ -46,14 +46,14 @@ def _link(source: str, target: str) -> None:
     Path(target).hardlink_to(source)
 
 
-def _poses(folder: Path, change: Callable[[Motion], Motion]) -> None:
+def _change_poses(folder: Path, change: Callable[[Motion], Motion]) -> None:
     path = folder / "poses.npz"
     motion = change(read_motion(path))
     path.unlink()
     write_motion(path, motion)
 
 
-def _cameras(folder: Path, **changed: Any) -> None:
+def _change_cameras(folder: Path, **changed: Any) -> None:
     path = folder / "cameras.npz"
     with np.load(path) as archive:
         arrays: dict[str, Any] = {key: archive[key] for key in archive.files}
@@ -67,11 +67,11 @@ def _extrinsic(folder: Path) -> np.ndarray:
 
 
 def _pelvis(motion: Motion) -> np.ndarray:
-    body = load_body()
-    return body.with_shape(betas_for(body, motion)).joints[0]
+    body = load_body_model()
+    return body.with_shape(betas_for_motion(body, motion)).joints[0]
 
 
-def _moved(motion: Motion, rotation: np.ndarray, shift: np.ndarray) -> Motion:
+def _change_world(motion: Motion, rotation: np.ndarray, shift: np.ndarray) -> Motion:
     """The motion in another world, x' = R x + b."""
     pelvis = _pelvis(motion)
     roots = Rotation.from_matrix(rotation) * Rotation.from_rotvec(motion.root_rotations)
@@ -79,45 +79,45 @@ def _moved(motion: Motion, rotation: np.ndarray, shift: np.ndarray) -> Motion:
     return replace(motion, root_rotations=roots.as_rotvec(), root_translations=places)
 
 
-def in_camera_space(folder: Path) -> None:
+def convert_to_camera_space(folder: Path) -> None:
     """No mistake yet: the same capture, told in the camera's own frame, as trackers do."""
     extrinsic = _extrinsic(folder)
-    _poses(folder, lambda m: _moved(m, extrinsic[:3, :3], extrinsic[:3, 3]))
-    _cameras(folder, extrinsic=np.eye(4))
+    _change_poses(folder, lambda m: _change_world(m, extrinsic[:3, :3], extrinsic[:3, 3]))
+    _change_cameras(folder, extrinsic=np.eye(4))
 
 
-def late(frames: int) -> Spoil:
+def delay_poses(frames: int) -> Corruption:
     def spoil(folder: Path) -> None:
         def change(motion: Motion) -> Motion:
             numbers = np.arange(len(motion)) + frames
             return replace(motion, frames=numbers, times_s=None)
 
-        _poses(folder, change)
+        _change_poses(folder, change)
 
     return spoil
 
 
-def cut(frames: int) -> Spoil:
+def drop_first_poses(frames: int) -> Corruption:
     """The first rows are missing, and nothing tells the frames' numbers."""
 
     def spoil(folder: Path) -> None:
-        _poses(folder, lambda m: m.taken(np.arange(frames, len(m))))
+        _change_poses(folder, lambda m: m.select_rows(np.arange(frames, len(m))))
 
     return spoil
 
 
-def resampled(rate: float) -> Spoil:
+def resample_poses(rate: float) -> Corruption:
     """Rows of a copy of the video that had so many times its frame rate; none has a number."""
 
     def spoil(folder: Path) -> None:
-        _poses(
-            folder, lambda m: m.taken(np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int))
+        _change_poses(
+            folder, lambda m: m.select_rows(np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int))
         )
 
     return spoil
 
 
-def slow_clock(factor: float) -> Spoil:
+def scale_timestamps(factor: float) -> Corruption:
     """Times reckoned with a wrong frame rate."""
 
     def spoil(folder: Path) -> None:
@@ -125,160 +125,160 @@ def slow_clock(factor: float) -> Spoil:
             assert motion.times_s is not None
             return replace(motion, frames=None, times_s=motion.times_s * factor)
 
-        _poses(folder, change)
+        _change_poses(folder, change)
 
     return spoil
 
 
-def opengl_poses(folder: Path) -> None:
+def use_opengl_poses(folder: Path) -> None:
     """Poses in the space of an OpenGL camera, and no word of it."""
-    in_camera_space(folder)
-    _poses(folder, lambda m: _moved(m, OPENGL, np.zeros(3)))
+    convert_to_camera_space(folder)
+    _change_poses(folder, lambda m: _change_world(m, OPENGL, np.zeros(3)))
 
 
-def opengl_cameras(folder: Path) -> None:
+def use_opengl_cameras(folder: Path) -> None:
     """nerfstudio's matrix as it stands there: world-from-camera, y up, z back."""
     pose = np.linalg.inv(_extrinsic(folder))
     pose[:3, :3] = pose[:3, :3] @ OPENGL
-    _cameras(folder, extrinsic=pose)
+    _change_cameras(folder, extrinsic=pose)
 
 
-def opengl_roots(folder: Path) -> None:
+def use_opengl_roots(folder: Path) -> None:
     """Root rotations of an OpenGL camera beside places of an OpenCV one."""
-    in_camera_space(folder)
+    convert_to_camera_space(folder)
     turned = Rotation.from_matrix(OPENGL)
 
     def change(m: Motion) -> Motion:
         roots = turned * Rotation.from_rotvec(m.root_rotations)
         return replace(m, root_rotations=roots.as_rotvec())
 
-    _poses(folder, change)
+    _change_poses(folder, change)
 
 
-def y_up_places(folder: Path) -> None:
+def flip_translation_y(folder: Path) -> None:
     """The places' y with the wrong sign, the rotations as they should be."""
-    in_camera_space(folder)
-    _poses(
+    convert_to_camera_space(folder)
+    _change_poses(
         folder,
         lambda m: replace(m, root_translations=m.root_translations * np.array([1.0, -1.0, 1.0])),
     )
 
 
-def turned_pictures(degrees: float) -> Spoil:
+def rotate_tracker_input(degrees: float) -> Corruption:
     """The tracker saw the pictures turned."""
 
     def spoil(folder: Path) -> None:
-        in_camera_space(folder)
+        convert_to_camera_space(folder)
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-        _poses(folder, lambda m: _moved(m, turn, np.zeros(3)))
+        _change_poses(folder, lambda m: _change_world(m, turn, np.zeros(3)))
 
     return spoil
 
 
-def z_up(folder: Path) -> None:
+def use_z_up_poses(folder: Path) -> None:
     """Poses in a world with z up (AMASS), cameras in one with y up."""
     turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    _poses(folder, lambda m: _moved(m, turn, np.zeros(3)))
+    _change_poses(folder, lambda m: _change_world(m, turn, np.zeros(3)))
 
 
-def camera_space_twice(folder: Path) -> None:
+def apply_extrinsics_twice(folder: Path) -> None:
     """Poses in the camera's frame beside a camera that stands somewhere."""
     extrinsic = _extrinsic(folder)
-    _poses(folder, lambda m: _moved(m, extrinsic[:3, :3], extrinsic[:3, 3]))
+    _change_poses(folder, lambda m: _change_world(m, extrinsic[:3, :3], extrinsic[:3, 3]))
 
 
-def world_from_camera(folder: Path) -> None:
-    _cameras(folder, extrinsic=np.linalg.inv(_extrinsic(folder)))
+def invert_extrinsics(folder: Path) -> None:
+    _change_cameras(folder, extrinsic=np.linalg.inv(_extrinsic(folder)))
 
 
-def camera_forgotten(folder: Path) -> None:
+def reset_extrinsics(folder: Path) -> None:
     """Poses in the world, and nothing says where the camera stood."""
-    _cameras(folder, extrinsic=np.eye(4))
+    _change_cameras(folder, extrinsic=np.eye(4))
 
 
-def focal(factor: float) -> Spoil:
+def scale_focal(factor: float) -> Corruption:
     def spoil(folder: Path) -> None:
         with np.load(folder / "cameras.npz") as archive:
             intrinsic = archive["intrinsic"].copy()
         intrinsic[[0, 1], [0, 1]] *= factor
-        _cameras(folder, intrinsic=intrinsic)
+        _change_cameras(folder, intrinsic=intrinsic)
 
     return spoil
 
 
-def exchanged(folder: Path) -> None:
+def swap_left_right(folder: Path) -> None:
     """Left joints' rotations under the right ones' numbers."""
-    _poses(folder, lambda m: replace(m, joint_rotations=m.joint_rotations[:, OTHER_SIDE]))
+    _change_poses(folder, lambda m: replace(m, joint_rotations=m.joint_rotations[:, SWAPPED_JOINTS]))
 
 
-def mirrored_limbs(folder: Path) -> None:
-    _poses(folder, _mirrored)
+def mirror_limbs(folder: Path) -> None:
+    _change_poses(folder, _mirror_motion)
 
 
-def mirrored_pictures(folder: Path) -> None:
+def mirror_tracker_input(folder: Path) -> None:
     """The tracker saw a selfie camera's preview."""
-    in_camera_space(folder)
+    convert_to_camera_space(folder)
 
     def change(motion: Motion) -> Motion:
         rotations, signs = motion.root_rotations, np.array([1.0, -1.0, -1.0])
         places = (_pelvis(motion) + motion.root_translations) * np.array([-1.0, 1.0, 1.0])
         return replace(
-            _mirrored(motion),
+            _mirror_motion(motion),
             root_rotations=rotations * signs,
             root_translations=places - _pelvis(motion),
         )
 
-    _poses(folder, change)
+    _change_poses(folder, change)
 
 
-OTHER_SIDE = (1, 0, 2, 4, 3, 5, 7, 6, 8, 10, 9, 11, 13, 12, 14, 16, 15, 18, 17, 20, 19, 22, 21)
+SWAPPED_JOINTS = (1, 0, 2, 4, 3, 5, 7, 6, 8, 10, 9, 11, 13, 12, 14, 16, 15, 18, 17, 20, 19, 22, 21)
 """Row of the other side's joint, for joints 1 … 23."""
 
 
-def _mirrored(motion: Motion) -> Motion:
-    limbs = motion.joint_rotations[:, OTHER_SIDE] * np.array([1.0, -1.0, -1.0])
+def _mirror_motion(motion: Motion) -> Motion:
+    limbs = motion.joint_rotations[:, SWAPPED_JOINTS] * np.array([1.0, -1.0, -1.0])
     return replace(motion, joint_rotations=limbs)
 
 
-def about_the_origin(folder: Path) -> None:
+def root_about_origin(folder: Path) -> None:
     """EasyMocap's convention: x -> R x + Th."""
-    in_camera_space(folder)
+    convert_to_camera_space(folder)
 
     def change(motion: Motion) -> Motion:
         pelvis = _pelvis(motion)
         turned = Rotation.from_rotvec(motion.root_rotations).apply(pelvis)
         return replace(motion, root_translations=pelvis + motion.root_translations - turned)
 
-    _poses(folder, change)
+    _change_poses(folder, change)
 
 
-def other_size(factor: float) -> Spoil:
+def scale_translations(factor: float) -> Corruption:
     """Places that a tracker reckoned for a body of another size."""
 
     def spoil(folder: Path) -> None:
-        in_camera_space(folder)
+        convert_to_camera_space(folder)
 
         def change(m: Motion) -> Motion:
             pelvis = _pelvis(m)
             return replace(m, root_translations=(pelvis + m.root_translations) * factor - pelvis)
 
-        _poses(folder, change)
+        _change_poses(folder, change)
 
     return spoil
 
 
-def in_units(factor: float) -> Spoil:
+def change_units(factor: float) -> Corruption:
     """Places in millimetres (1000) or centimetres (100)."""
 
     def spoil(folder: Path) -> None:
-        in_camera_space(folder)
-        _poses(folder, lambda m: replace(m, root_translations=m.root_translations * factor))
+        convert_to_camera_space(folder)
+        _change_poses(folder, lambda m: replace(m, root_translations=m.root_translations * factor))
 
     return spoil
 
 
-def z_up_about_the_origin(folder: Path) -> None:
-    """As `z_up`, converted without the pelvis's offset: translations are rotated by themselves."""
+def use_z_up_poses_without_pelvis(folder: Path) -> None:
+    """As `use_z_up_poses`, converted without the pelvis's offset: translations are rotated by themselves."""
     turn = Rotation.from_euler("x", 90, degrees=True)
 
     def change(m: Motion) -> Motion:
@@ -286,23 +286,23 @@ def z_up_about_the_origin(folder: Path) -> None:
         places = turn.apply(m.root_translations)
         return replace(m, root_rotations=roots.as_rotvec(), root_translations=places)
 
-    _poses(folder, change)
+    _change_poses(folder, change)
 
 
-def unnumbered_end(frames: int) -> Spoil:
+def keep_last_poses(frames: int) -> Corruption:
     """The last frames' poses only, with no frame numbers and no times."""
 
     def spoil(folder: Path) -> None:
         def change(m: Motion) -> Motion:
-            last = m.taken(np.arange(len(m) - frames, len(m)))
+            last = m.select_rows(np.arange(len(m) - frames, len(m)))
             return replace(last, frames=None, times_s=None)
 
-        _poses(folder, change)
+        _change_poses(folder, change)
 
     return spoil
 
 
-def second_person(folder: Path) -> None:
+def add_second_person(folder: Path) -> None:
     """Somebody else stands at the left side of every mask."""
     for path in sorted((folder / "masks").iterdir()):
         mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -313,7 +313,7 @@ def second_person(folder: Path) -> None:
         cv2.imwrite(str(path), mask)
 
 
-def changed_film(folder: Path, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> None:
+def rewrite_video(folder: Path, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> None:
     """Writes the film's pictures anew, losslessly; masks and poses stay."""
     path = folder / "video.mp4"
     reader = cv2.VideoCapture(str(path))
@@ -330,18 +330,18 @@ def changed_film(folder: Path, change: Callable[[list[np.ndarray]], list[np.ndar
     writer.release()
 
 
-def rotated_film(quarter_turns: int) -> Spoil:
+def rotate_video(quarter_turns: int) -> Corruption:
     """The film alone rotated counter-clockwise; its pictures must be square."""
-    return lambda folder: changed_film(
+    return lambda folder: rewrite_video(
         folder, lambda film: [np.rot90(p, quarter_turns) for p in film]
     )
 
 
-def mirrored_film(folder: Path) -> None:
-    changed_film(folder, lambda pictures: [picture[:, ::-1] for picture in pictures])
+def mirror_video(folder: Path) -> None:
+    rewrite_video(folder, lambda pictures: [picture[:, ::-1] for picture in pictures])
 
 
-def cropped_film(left: float, top: float, size: float) -> Spoil:
+def crop_video(left: float, top: float, size: float) -> Corruption:
     """A part of the film alone, scaled up to the old size; a size above 1 adds black borders."""
 
     def crop(picture: np.ndarray) -> np.ndarray:
@@ -349,24 +349,24 @@ def cropped_film(left: float, top: float, size: float) -> Spoil:
         affine = np.array([[1.0, 0.0, -left * width], [0.0, 1.0, -top * height]]) / size
         return np.asarray(cv2.warpAffine(picture, affine, (width, height)))
 
-    return lambda folder: changed_film(folder, lambda pictures: [crop(p) for p in pictures])
+    return lambda folder: rewrite_video(folder, lambda pictures: [crop(p) for p in pictures])
 
 
-def trimmed_film(frames: int) -> Spoil:
+def trim_video(frames: int) -> Corruption:
     """The film's beginning is cut off; masks and poses are still those of all frames."""
-    return lambda folder: changed_film(folder, lambda pictures: pictures[frames:])
+    return lambda folder: rewrite_video(folder, lambda pictures: pictures[frames:])
 
 
-def delayed_film(frames: int) -> Spoil:
+def delay_video(frames: int) -> Corruption:
     """The film's first picture stands still at first, and the end is cut off."""
-    return lambda folder: changed_film(folder, lambda film: [film[0]] * frames + film[:-frames])
+    return lambda folder: rewrite_video(folder, lambda film: [film[0]] * frames + film[:-frames])
 
 
-def reversed_film(folder: Path) -> None:
-    changed_film(folder, lambda pictures: pictures[::-1])
+def reverse_video(folder: Path) -> None:
+    rewrite_video(folder, lambda pictures: pictures[::-1])
 
 
-def inverted_masks(folder: Path) -> None:
+def invert_masks(folder: Path) -> None:
     for path in sorted((folder / "masks").iterdir()):
         mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert mask is not None

@@ -7,19 +7,19 @@ from typing import Any, NamedTuple
 
 import torch
 
-from apps.recording.opening import open_recording
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
-from apps.studio.writer import ShootConfig, shoot
+from apps.recording.opening import open_capture
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
+from apps.studio.writer import ShootConfig, film_capture
 from avatar.config import TrainConfig
-from avatar.hold import HeldOut, prepared
-from avatar.prepare import PreparedFrame
+from avatar.hold import HeldOutFrame, prepare_stream
+from avatar.prepare import TrainingFrame
 from avatar.rig import Rig
-from avatar.step import cosine
+from avatar.step import cosine_decay
 from avatar.train import Trainer
 
 
-class Class(NamedTuple):
+class LoadedTrainer(NamedTuple):
     """A trainer and all its frames.
 
     Attributes:
@@ -30,45 +30,45 @@ class Class(NamedTuple):
     """
 
     trainer: Trainer
-    frames: list[PreparedFrame]
-    held: list[HeldOut]
+    frames: list[TrainingFrame]
+    held_out: list[HeldOutFrame]
     ready_seconds: float
 
 
-def filmed(out: Path, size: int, **more: Any) -> Path:
+def film_sample(out: Path, size: int, **more: Any) -> Path:
     """Films the sample, unless it lies there already; its folder."""
     if not out.exists():
-        shoot(out, ShootConfig(size=size, **more))
+        film_capture(out, ShootConfig(size=size, **more))
     return out
 
 
-def opened(capture: Path, *, frames: slice | None = None, size: int | None = None) -> Recording:
+def open_sample(capture: Path, *, frames: slice | None = None, size: int | None = None) -> Capture:
     """A filmed sample or another capture, as it is or with a longer side of `size` pixels."""
-    return open_recording(RecordingPaths(video=capture, frames=frames), size_px=size)
+    return open_capture(CaptureInputs(video=capture, frames=frames), size_px=size)
 
 
-def recipe(recording: Recording, seconds: float, **changes: Any) -> TrainConfig:
+def training_config(recording: Capture, seconds: float, **changes: Any) -> TrainConfig:
     """What the dial chooses for a recording, with some of it changed."""
-    config = TrainConfig.within(seconds, footprint_m=recording.footprint_m())
+    config = TrainConfig.for_budget(seconds, footprint_m=recording.pixel_footprint_m())
     return dataclasses.replace(config, **changes)
 
 
-def assembled(recording: Recording, rig: Rig, config: TrainConfig, device: torch.device) -> Class:
+def load_trainer(recording: Capture, rig: Rig, config: TrainConfig, device: torch.device) -> LoadedTrainer:
     """A trainer that has taken in every frame before its first step."""
     trainer, frames, held = Trainer(rig, config, device), [], []
     began = time.process_time()
     total = recording.source.frame_count
-    for item in prepared(recording.observations(), rig, every=config.hold_every, total=total):
-        if isinstance(item, HeldOut):
+    for item in prepare_stream(recording.observations(), rig, stride=config.held_out_stride, total=total):
+        if isinstance(item, HeldOutFrame):
             held.append(item)
-        elif isinstance(item, PreparedFrame):
+        elif isinstance(item, TrainingFrame):
             frames.append(item)
-            trainer.add(item)
-    return Class(trainer, frames, held, time.process_time() - began)
+            trainer.add_frame(item)
+    return LoadedTrainer(trainer, frames, held, time.process_time() - began)
 
 
 def train_for_core_seconds(trainer: Trainer, seconds: float) -> None:
     """Trains for so much CPU time, with the rate falling over all of it."""
     began = time.process_time()
     while (share := (time.process_time() - began) / seconds) < 1.0:
-        trainer.step(rate=cosine(share), hard_share=min(1.0, 4.0 * share))
+        trainer.step(rate=cosine_decay(share), hard_surface_share=min(1.0, 4.0 * share))

@@ -10,23 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Mark
+from benchmarks.marks import Measurement
 
 STARTS = 3
 MEMORY_SECONDS = 30.0
 
 
-def start_marks(capture: Path) -> Iterator[Mark]:
+def measure_startup(capture: Path) -> Iterator[Measurement]:
     """From the start of a process to its first step; compiled code lies on the disk already."""
     first_step(capture)
     starts = [first_step(capture) for _ in range(STARTS)]
     whole, after_reading = (statistics.median(times) for times in zip(*starts, strict=True))
-    yield Mark(
+    yield Measurement(
         name="start-up to the first step, compiled code cached, s",
         value=whole,
-        least="≤ 6",
-        moonshot="≤ 1.5",
-        beside=f"wall, median of {STARTS} processes: interpreter, imports, body, kernels; of that "
+        required="≤ 6",
+        stretch_goal="≤ 1.5",
+        context=f"wall, median of {STARTS} processes: interpreter, imports, body, kernels; of that "
         f"{after_reading:.2f} s from the opening of the video to the end of the first step",
     )
 
@@ -39,21 +39,21 @@ def first_step(capture: Path) -> tuple[float, float]:
     return float(whole), float(after_reading)
 
 
-def memory_marks(capture: Path, run: Path) -> Iterator[Mark]:
+def measure_peak_memory(capture: Path, run: Path) -> Iterator[Measurement]:
     """The peak of a whole ia-ingest."""
-    report = ingested(capture, run)
+    report = run_ingest(capture, run)
     training = report["training"]
-    yield Mark(
+    yield Measurement(
         name="peak memory of ia-ingest, 300 frames of 540 px, GiB",
         value=training["peak_memory_mb"] / 1024.0,
-        least="≤ 4",
-        moonshot="≤ 2",
-        beside=f"resident, package and checks included; {MEMORY_SECONDS:.0f} s of training; "
+        required="≤ 4",
+        stretch_goal="≤ 2",
+        context=f"resident, package and checks included; {MEMORY_SECONDS:.0f} s of training; "
         f"its own start-up, without imports: {training['startup_seconds']:.2f} s",
     )
 
 
-def ingested(capture: Path, run: Path) -> dict[str, Any]:
+def run_ingest(capture: Path, run: Path) -> dict[str, Any]:
     """Runs ia-ingest; its report."""
     command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4")]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite"]

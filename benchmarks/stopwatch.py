@@ -8,18 +8,18 @@ import numba
 import torch
 
 
-def use_threads(count: int) -> None:
+def limit_threads(count: int) -> None:
     """How many threads numba and torch may use from now on."""
     torch.set_num_threads(count)
     numba.set_num_threads(count)
 
 
-def interleaved(
+def time_interleaved(
     alternatives: Mapping[str, Callable[[], object]],
     device: torch.device,
     *,
     rounds: int = 5,
-    seldom: Mapping[str, int] | None = None,
+    fewer_rounds: Mapping[str, int] | None = None,
 ) -> dict[str, float]:
     """Median seconds of each alternative.
 
@@ -32,15 +32,15 @@ def interleaved(
         rounds: How often each is timed.
         seldom: Those that are too slow for that: how often instead, and without warming up.
     """
-    seldom = seldom or {}
-    use_threads(1)
+    fewer_rounds = fewer_rounds or {}
+    limit_threads(1)
     for name, work in alternatives.items():
-        if name not in seldom:
+        if name not in fewer_rounds:
             work()
     spent: dict[str, list[float]] = {name: [] for name in alternatives}
     for turn in range(rounds):
         for name, work in alternatives.items():
-            if turn < seldom.get(name, rounds):
+            if turn < fewer_rounds.get(name, rounds):
                 began = _now(device)
                 work()
                 spent[name].append(_now(device) - began)

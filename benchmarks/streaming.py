@@ -17,22 +17,22 @@ from pathlib import Path
 import tyro
 
 from benchmarks.hardware import Hardware
-from benchmarks.kills import kill_marks
-from benchmarks.looped import growth_marks
-from benchmarks.marks import Mark, table
-from benchmarks.onlooker import onlooker_marks
-from benchmarks.played import played_marks
-from benchmarks.stage import filmed
+from benchmarks.kills import measure_kills
+from benchmarks.looped import measure_memory_growth
+from benchmarks.marks import Measurement, markdown_rows
+from benchmarks.onlooker import measure_streaming_quality
+from benchmarks.played import measure_realtime
+from benchmarks.stage import film_sample
 
 
 @dataclass(frozen=True, kw_only=True)
-class Streaming:
+class StreamingOptions:
     """Measures streaming and prints one table."""
 
     size: int = 270
     """Width and height of the pictures."""
     frames: int = 600
-    """Frames of the video, at 30 a second."""
+    """EvaluationFrames of the video, at 30 a second."""
     kills: int = 20
     """How often a run is killed."""
     quick: bool = False
@@ -45,27 +45,27 @@ class Streaming:
 
 def main() -> None:
     """The benchmark."""
-    job = tyro.cli(Streaming, prog="python -m benchmarks.streaming", description=__doc__)
+    job = tyro.cli(StreamingOptions, prog="python -m benchmarks.streaming", description=__doc__)
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        marks = list(measured(job, job.keep or Path(temporary), Path(temporary)))
-    print("\n".join([*hardware.lines(), "", *table(marks)]))
+        marks = list(measure_all(job, job.keep or Path(temporary), Path(temporary)))
+    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
 
 
-def measured(job: Streaming, folder: Path, scratch: Path) -> Iterator[Mark]:
+def measure_all(job: StreamingOptions, folder: Path, scratch: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
-    capture = filmed(folder / f"turning{job.size}", job.size, frames=job.frames, turns=2.0)
-    groups = [played_marks(capture, scratch / "played"), onlooker_marks(capture)]
+    capture = film_sample(folder / f"turning{job.size}", job.size, frames=job.frames, turns=2.0)
+    groups = [measure_realtime(capture, scratch / "played"), measure_streaming_quality(capture)]
     if not job.quick:
-        groups.append(growth_marks(capture, folder / f"looped{job.size}"))
+        groups.append(measure_memory_growth(capture, folder / f"looped{job.size}"))
     if not job.quick and job.kills:
-        small = filmed(folder / "small", 96, frames=60, turns=1.0)
-        groups.append(kill_marks(small, scratch / "killed", kills=job.kills))
+        small = film_sample(folder / "small", 96, frames=60, turns=1.0)
+        groups.append(measure_kills(small, scratch / "killed", kills=job.kills))
     for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
         yield mark
 
 

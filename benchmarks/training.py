@@ -18,25 +18,25 @@ from typing import Literal
 import torch
 import tyro
 
-from apps.terminal.device import device_for
-from apps.terminal.exit_codes import exit_code
+from apps.terminal.device import resolve_device
+from apps.terminal.exit_codes import run_command
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.hardware import Hardware
-from benchmarks.marks import Mark, table
-from benchmarks.quality import core_second_marks, refinement_marks, wall_marks
+from benchmarks.marks import Measurement, markdown_rows
+from benchmarks.quality import measure_by_core_seconds, measure_pose_refinement, measure_by_wall_time
 from benchmarks.skipping import skipping_marks
-from benchmarks.stage import assembled, filmed, opened, recipe, train_for_core_seconds
-from benchmarks.startup import memory_marks, start_marks
+from benchmarks.stage import load_trainer, film_sample, open_sample, training_config, train_for_core_seconds
+from benchmarks.startup import measure_peak_memory, measure_startup
 from benchmarks.steps import encode_marks, step_marks
-from benchmarks.stopwatch import use_threads
+from benchmarks.stopwatch import limit_threads
 from benchmarks.warps import warp_marks
 from preprocess.pose_file import read_motion
 
 SIZE_PX = 256
 TEN_MINUTES = 600.0
 """What patience adds to a minute, at 540 px."""
-LEARNT_SECONDS = 15.0
+WARMUP_TRAINING_SECONDS = 15.0
 """How long the avatar has been learnt on which single operations are measured, CPU seconds."""
 
 
@@ -57,45 +57,45 @@ class Training:
 def main() -> int:
     """The benchmark; returns its exit code."""
     job = tyro.cli(Training, prog="python -m benchmarks.training", description=__doc__)
-    return exit_code("benchmarks.training", lambda: measure(job))
+    return run_command("benchmarks.training", lambda: run_benchmark(job))
 
 
-def measure(job: Training) -> int:
+def run_benchmark(job: Training) -> int:
     """Measures and prints."""
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        marks = list(measured(job, job.keep or Path(temporary)))
-    print("\n".join([*hardware.lines(), f"device {job.device}", "", *table(marks)]))
+        marks = list(all_marks(job, job.keep or Path(temporary)))
+    print("\n".join([*hardware.lines(), f"device {job.device}", "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
     return 0
 
 
-def measured(job: Training, folder: Path) -> Iterator[Mark]:
+def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
-    device = device_for(job.device)
-    small = filmed(folder / f"sample{SIZE_PX}", SIZE_PX)
+    device = resolve_device(job.device)
+    small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
     groups = [operation_marks(small, device)]
     if not job.quick:
         groups += [
-            core_second_marks(folder, device),
-            wall_marks(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device),
-            refinement_marks(folder, device),
+            measure_by_core_seconds(folder, device),
+            measure_by_wall_time(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device),
+            measure_pose_refinement(folder, device),
             large_marks(folder, device),
         ]
     for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.beside})", file=sys.stderr, flush=True)
+        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
         yield mark
 
 
-def operation_marks(capture: Path, device: torch.device) -> Iterator[Mark]:
+def operation_marks(capture: Path, device: torch.device) -> Iterator[Measurement]:
     """Single operations, on an avatar that has been learnt for a while."""
-    recording = opened(capture)
-    rig = Rig.of(recording.shaped)
-    seen = assembled(recording, rig, recipe(recording, 60.0, refine_poses=False), device)
-    use_threads(1)
-    train_for_core_seconds(seen.trainer, LEARNT_SECONDS)
+    recording = open_sample(capture)
+    rig = Rig.from_shaped_body(recording.shaped)
+    seen = load_trainer(recording, rig, training_config(recording, 60.0, refine_poses=False), device)
+    limit_threads(1)
+    train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
     yield from step_marks(seen, device)
     yield from encode_marks(seen, device)
     if device.type == "cpu":  # the other side of the ratio runs there only
@@ -105,15 +105,15 @@ def operation_marks(capture: Path, device: torch.device) -> Iterator[Mark]:
     yield from skipping_marks(seen, device)
 
 
-def large_marks(folder: Path, device: torch.device) -> Iterator[Mark]:
+def large_marks(folder: Path, device: torch.device) -> Iterator[Measurement]:
     """What a long video of large pictures takes; its first 120 frames turn as the others do."""
-    large = filmed(folder / "sample540", 540, frames=300, turns=5.0)
+    large = film_sample(folder / "sample540", 540, frames=300, turns=5.0)
     asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
-    yield from wall_marks(large, asked, device)
-    yield from start_marks(large)
-    yield from memory_marks(large, folder / "run540")
+    yield from measure_by_wall_time(large, asked, device)
+    yield from measure_startup(large)
+    yield from measure_peak_memory(large, folder / "run540")
     printed = dict.fromkeys(asked, ("", ""))
-    yield from wall_marks(large, printed, device, seconds=TEN_MINUTES)
+    yield from measure_by_wall_time(large, printed, device, seconds=TEN_MINUTES)
 
 
 if __name__ == "__main__":

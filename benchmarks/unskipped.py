@@ -1,4 +1,4 @@
-"""Samples as they are without skipping: all between the walls of the person's box, or the paper's.
+"""RaySamples as they are without skipping: all between the walls of the person's box, or the paper's.
 
 InstantAvatar's code sets near and far to the distance of the body less and plus a metre and puts
 its samples there, on every ray of the picture; without skipping each of them is warped and asked.
@@ -18,18 +18,18 @@ from jaxtyping import Float32, Int32
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from avatar.cells import WarpCells
-from avatar.kernels.backend import Backend, CellTables, Grid, Marching, Rays, Samples
-from avatar.prepare import PreparedFrame
+from avatar.cells import CorrespondenceGrid
+from avatar.kernels.backend import Backend, CorrespondenceTables, DensityGrid, MarchSettings, RayBatch, RaySamples
+from avatar.prepare import TrainingFrame
 from avatar.render import EMPTY_LOG_DENSITY
-from avatar.replay import Replay
+from avatar.replay import ReplayBuffer
 
-MOST_SAMPLES = 512
+MAX_DENSE_SAMPLES = 512
 REACH_M = 1.0
 """How far before and behind the body's distance the paper's code looks, metres."""
 
 
-class Unskipped(NamedTuple):
+class DenseSampler(NamedTuple):
     """Where all samples of some frames lie.
 
     Attributes:
@@ -39,68 +39,68 @@ class Unskipped(NamedTuple):
         center: From here the paper's metre is counted; None for the walls of the cells' box.
     """
 
-    cells: CellTables
-    stand_in: int
-    own: CellTables
+    cells: CorrespondenceTables
+    first_substitute_row: int
+    own: CorrespondenceTables
     center: Float32[Tensor, "3"] | None
 
-    def samples(self, backend: Backend, rays: Rays, grid: Grid, step_m: float) -> Samples:
+    def samples(self, backend: Backend, rays: RayBatch, grid: DensityGrid, step_m: float) -> RaySamples:
         """Every sample along rays, none left out and no end before the last."""
         everywhere = grid._replace(occupied=torch.ones_like(grid.occupied))
         if self.center is None:
-            how = Marching(step_m, math.inf, MOST_SAMPLES)
+            how = MarchSettings(step_m, math.inf, MAX_DENSE_SAMPLES)
             return backend.march(rays, self.cells, everywhere, how)
-        own, wide = entry(rays, self.own), entry(rays, self.cells)
+        own, wide = ray_entry(rays, self.own), ray_entry(rays, self.cells)
         near = (rays.origins - self.center).norm(dim=1) - REACH_M
         same_lattice = ((own - wide) / step_m + rays.jitter) % 1.0
         passed = torch.floor((near - wide) / step_m).clamp(min=0.0)
-        how = Marching(step_m, math.inf, math.ceil(2.0 * REACH_M / step_m))
+        how = MarchSettings(step_m, math.inf, math.ceil(2.0 * REACH_M / step_m))
         later = rays._replace(jitter=same_lattice + passed)
         return backend.march(later, self.cells, everywhere, how)
 
-    def emptied(
+    def clear_substitutes(
         self, raw: Float32[Tensor, "samples 4"], rows: Int32[Tensor, "samples"]
     ) -> Float32[Tensor, "samples 4"]:
         """Raw outputs, in place, without density where a sample has no warp of its own."""
-        raw[:, 3].masked_fill_(rows >= self.stand_in, EMPTY_LOG_DENSITY)
+        raw[:, 3].masked_fill_(rows >= self.first_substitute_row, EMPTY_LOG_DENSITY)
         return raw
 
 
-def in_the_box(cells: CellTables, inside: Float32[Tensor, "3"]) -> Unskipped:
-    """Between the walls of each frame's box; without a root a sample is asked at one point."""
+def dense_in_box(cells: CorrespondenceTables, inside: Float32[Tensor, "3"]) -> DenseSampler:
+    """ResectionResult the walls of each frame's box; without a root a sample is asked at one point."""
     slots, row, _ = cells.roots.shape
     stand_in = torch.zeros(slots, 1, 12, device=cells.roots.device)
     stand_in[:, 0, :3] = inside
-    index = torch.where(cells.index <= 0, row * 8 + 1, cells.index)
-    filled = cells._replace(index=index, roots=torch.cat([cells.roots, stand_in], dim=1))
-    return Unskipped(filled, row, cells, None)
+    index = torch.where(cells.packed_cells <= 0, row * 8 + 1, cells.packed_cells)
+    filled = cells._replace(packed_cells=index, roots=torch.cat([cells.roots, stand_in], dim=1))
+    return DenseSampler(filled, row, cells, None)
 
 
-def as_the_paper(
-    frames: Sequence[PreparedFrame], center: Float32[np.ndarray, "3"], device: torch.device
-) -> tuple[Unskipped, Replay]:
+def dense_as_in_paper(
+    frames: Sequence[TrainingFrame], center: Float32[np.ndarray, "3"], device: torch.device
+) -> tuple[DenseSampler, ReplayBuffer]:
     """A metre before to a metre behind the body, and a store of the frames to draw rays from."""
     ends = np.concatenate([_ends(frame, center) for frame in frames])
     low, high = ends.min(axis=0), ends.max(axis=0)
-    most = max(len(frame.cells.roots) for frame in frames)
-    own, wide = Replay(len(frames), device), Replay(len(frames), device)
+    most = max(len(frame.correspondences.roots) for frame in frames)
+    own, wide = ReplayBuffer(len(frames), device), ReplayBuffer(len(frames), device)
     for frame in frames:
         own.add(frame)
-        wide.add(dataclasses.replace(frame, cells=surrounded(frame.cells, low, high, most)))
+        wide.add(dataclasses.replace(frame, correspondences=extend_correspondences(frame.correspondences, low, high, most)))
     middle = torch.from_numpy(center).to(device)
-    return Unskipped(wide.cells, most, own.cells, middle), wide
+    return DenseSampler(wide.correspondences, most, own.correspondences, middle), wide
 
 
-def _ends(frame: PreparedFrame, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "ends 3"]:
+def _ends(frame: TrainingFrame, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "ends 3"]:
     """Where the samples of a frame's rays begin and end, body frame, metres."""
     middle = np.linalg.norm(frame.origin - center)
     ends = [frame.origin + (middle + way) * frame.directions for way in (-REACH_M, REACH_M)]
     return np.concatenate(ends).astype(np.float32)
 
 
-def surrounded(
-    cells: WarpCells, low: Float32[np.ndarray, "3"], high: Float32[np.ndarray, "3"], most: int
-) -> WarpCells:
+def extend_correspondences(
+    cells: CorrespondenceGrid, low: Float32[np.ndarray, "3"], high: Float32[np.ndarray, "3"], most: int
+) -> CorrespondenceGrid:
     """The cells, filled up and continued to a larger box with the nearest roots there are.
 
     Args:
@@ -108,23 +108,23 @@ def surrounded(
         low, high: Corners of what must be covered, metres.
         most: From this row on, roots are copies that stand in.
     """
-    shape = np.array(cells.index.shape)
+    shape = np.array(cells.packed_cells.shape)
     before = np.ceil((cells.low - low) / cells.cell_m).clip(0).astype(int) + 1
     after = np.ceil((high - cells.low) / cells.cell_m - shape).clip(0).astype(int) + 1
-    index = np.pad(cells.index, np.stack([before, after], axis=1))
+    index = np.pad(cells.packed_cells, np.stack([before, after], axis=1))
     nearest = distance_transform_edt(index <= 0, return_distances=False, return_indices=True)
     copies = ((index >> 3) + most)[tuple(np.asarray(nearest))] * 8 + 1
     roots = np.zeros((most + len(cells.roots), 12), dtype=np.float32)
     roots[: len(cells.roots)] = roots[most:] = cells.roots
-    return WarpCells(
+    return CorrespondenceGrid(
         low=(cells.low - before * cells.cell_m).astype(np.float32),
         cell_m=cells.cell_m,
-        index=np.where(index <= 0, copies, index).astype(np.int32),
+        packed_cells=np.where(index <= 0, copies, index).astype(np.int32),
         roots=roots,
     )
 
 
-def entry(rays: Rays, cells: CellTables) -> Float32[Tensor, "rays"]:
+def ray_entry(rays: RayBatch, cells: CorrespondenceTables) -> Float32[Tensor, "rays"]:
     """Where rays enter the box of their frame's cells, metres, as marching has it."""
     slot = rays.slots.long()
     towards = torch.where(rays.directions.abs() > 1e-7, rays.directions, 1e-7)

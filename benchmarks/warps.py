@@ -1,4 +1,4 @@
-"""The warp: cells looked up as marching does it, beside Broyden's method for every sample."""
+"""The warp: cells looked up as marching does it, beside BroydenLookup's method for every sample."""
 
 import math
 from typing import NamedTuple
@@ -7,22 +7,22 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
-from avatar.cells import WarpCells
-from avatar.kernels.backend import CellTables, Grid, Marching, Rays, Samples
-from avatar.render import cell_tables
-from benchmarks.broyden import Broyden
-from benchmarks.marks import Mark
-from benchmarks.stage import Class
-from benchmarks.stopwatch import interleaved
+from avatar.cells import CorrespondenceGrid
+from avatar.kernels.backend import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch, RaySamples
+from avatar.render import correspondence_tables
+from benchmarks.broyden import BroydenLookup
+from benchmarks.marks import Measurement
+from benchmarks.stage import LoadedTrainer
+from benchmarks.stopwatch import time_interleaved
 
 POINTS = 65_536
-FAR_M = 1e3
+ONE_SAMPLE_STEP_M = 1e3
 """A step that leaves the body's box at once: each ray is asked at its origin alone."""
-LOST_M = 0.01
+WRONG_ROOT_M = 0.01
 """A point warped farther off than this was warped with another root."""
 
 
-class Posed(NamedTuple):
+class PosedPoints(NamedTuple):
     """Points of the avatar in one pose.
 
     Attributes:
@@ -34,33 +34,33 @@ class Posed(NamedTuple):
     posed: Float32[np.ndarray, "points 3"]
 
 
-def warp_marks(seen: Class, novel: Float[np.ndarray, "23 3"]) -> list[Mark]:
+def warp_marks(seen: LoadedTrainer, novel: Float[np.ndarray, "23 3"]) -> list[Measurement]:
     """Speed and error of the look-up in a training pose and in one that was never filmed."""
     rig, cpu = seen.trainer.avatar.rig, torch.device("cpu")
     poses = {"training": seen.frames[len(seen.frames) // 3].pose.joint_rotations, "novel": novel}
-    marks: list[Mark] = []
+    marks: list[Measurement] = []
     for name, pose in poses.items():
-        points = drawn(seen, pose)
+        points = draw_points(seen, pose)
         rays = one_sample_rays(points)
-        solved = WarpCells.of(rig, pose)
-        cells = cell_tables(solved, cpu)
-        broyden = Broyden(rig, pose, _grid(seen))
-        times = interleaved(
+        solved = CorrespondenceGrid.solve(rig, pose)
+        cells = correspondence_tables(solved, cpu)
+        broyden = BroydenLookup(rig, pose, _grid(seen))
+        times = time_interleaved(
             {
-                "look-up": lambda rays=rays, cells=cells: marched(seen, rays, cells),
-                "Broyden": lambda points=points, broyden=broyden: broyden(points.posed),
+                "look-up": lambda rays=rays, cells=cells: march_once(seen, rays, cells),
+                "BroydenLookup": lambda points=points, broyden=broyden: broyden(points.posed),
             },
             cpu,
         )
-        marks += _compared(
-            name, times, _errors(found(marched(seen, rays, cells)), points),
-            _errors(broyden(points.posed), points), along_rays(seen, cells),
-            _bent_share(solved, points),
+        marks += _lookup_marks(
+            name, times, _errors(canonical_points(march_once(seen, rays, cells)), points),
+            _errors(broyden(points.posed), points), lookups_per_second(seen, cells),
+            _second_order_share(solved, points),
         )  # fmt: skip
     return marks
 
 
-def drawn(seen: Class, pose: Float[np.ndarray, "23 3"]) -> Posed:
+def draw_points(seen: LoadedTrainer, pose: Float[np.ndarray, "23 3"]) -> PosedPoints:
     """Random points of cells that hold something dense, carried to a pose."""
     rig, grid, chance = seen.trainer.avatar.rig, _grid(seen), np.random.default_rng(0)
     cells = (grid.occupied != 0).nonzero().numpy()
@@ -70,13 +70,13 @@ def drawn(seen: Class, pose: Float[np.ndarray, "23 3"]) -> Posed:
     bones = rig.body_from_canonical(pose)[:, :3].reshape(24, 12)
     blended = (rig.weights_at(canonical) @ bones).reshape(-1, 3, 4)
     posed = (blended[:, :, :3] @ canonical[:, :, None])[..., 0] + blended[:, :, 3]
-    return Posed(canonical, posed.astype(np.float32))
+    return PosedPoints(canonical, posed.astype(np.float32))
 
 
-def one_sample_rays(points: Posed) -> Rays:
+def one_sample_rays(points: PosedPoints) -> RayBatch:
     """One ray a point, to be asked at its origin alone."""
     count = len(points.posed)
-    return Rays(
+    return RayBatch(
         torch.from_numpy(points.posed),
         torch.tensor([[0.6, 0.64, 0.48]]).expand(count, 3).contiguous(),
         torch.zeros(count, dtype=torch.int32),
@@ -84,83 +84,83 @@ def one_sample_rays(points: Posed) -> Rays:
     )
 
 
-def marched(seen: Class, rays: Rays, cells: CellTables) -> Samples:
+def march_once(seen: LoadedTrainer, rays: RayBatch, cells: CorrespondenceTables) -> RaySamples:
     """The trainer's own march, asked for one sample a ray."""
-    return seen.trainer.backend.march(rays, cells, _grid(seen), Marching(FAR_M, math.inf, 1))
+    return seen.trainer.backend.march(rays, cells, _grid(seen), MarchSettings(ONE_SAMPLE_STEP_M, math.inf, 1))
 
 
-def found(samples: Samples) -> Float32[np.ndarray, "points 3"]:
+def canonical_points(samples: RaySamples) -> Float32[np.ndarray, "points 3"]:
     """The canonical point of each one-sample ray; far off where there is none."""
-    out = np.full((len(samples.count), 3), FAR_M, dtype=np.float32)
-    out[samples.count.numpy() > 0] = samples.points.numpy()
+    out = np.full((len(samples.counts), 3), ONE_SAMPLE_STEP_M, dtype=np.float32)
+    out[samples.counts.numpy() > 0] = samples.points.numpy()
     return out
 
 
-def along_rays(seen: Class, cells: CellTables) -> float:
+def lookups_per_second(seen: LoadedTrainer, cells: CorrespondenceTables) -> float:
     """Look-ups a second of core time along whole rays, when every sample that has a root stays."""
     trainer, grid = seen.trainer, _grid(seen)
     generator = torch.Generator().manual_seed(0)
-    batches = [trainer.replay.draw(trainer.config.rays, generator).rays for _ in range(8)]
+    batches = [trainer.replay.sample_rays(trainer.config.rays, generator).rays for _ in range(8)]
     batches = [rays._replace(slots=torch.zeros_like(rays.slots)) for rays in batches]
     everywhere = grid._replace(occupied=torch.ones_like(grid.occupied))
-    how = Marching(trainer.config.step_m, math.inf, 256)
+    how = MarchSettings(trainer.config.sample_step_m, math.inf, 256)
 
     def march() -> int:
         return sum(
             len(trainer.backend.march(rays, cells, everywhere, how).points) for rays in batches
         )
 
-    return march() / interleaved({"march": march}, torch.device("cpu"))["march"]
+    return march() / time_interleaved({"march": march}, torch.device("cpu"))["march"]
 
 
-def _grid(seen: Class) -> Grid:
-    return seen.trainer.avatar.occupancy.grid
+def _grid(seen: LoadedTrainer) -> DensityGrid:
+    return seen.trainer.avatar.occupancy.density_grid
 
 
-def _bent_share(cells: WarpCells, points: Posed) -> float:
+def _second_order_share(cells: CorrespondenceGrid, points: PosedPoints) -> float:
     """How many of the points lie in cells whose warp has a second-order term."""
     place = ((points.posed - cells.low) / cells.cell_m).astype(int)
-    place = np.clip(place, 0, np.array(cells.index.shape) - 1)
-    return float((cells.index[tuple(place.T)] & 4 > 0).mean())
+    place = np.clip(place, 0, np.array(cells.packed_cells.shape) - 1)
+    return float((cells.packed_cells[tuple(place.T)] & 4 > 0).mean())
 
 
-def _errors(where: Float32[np.ndarray, "points 3"], points: Posed) -> Float[np.ndarray, "points"]:
+def _errors(where: Float32[np.ndarray, "points 3"], points: PosedPoints) -> Float[np.ndarray, "points"]:
     return np.linalg.norm(where - points.canonical, axis=1)
 
 
-def _compared(
+def _lookup_marks(
     pose: str,
     times: dict[str, float],
     errors: Float[np.ndarray, "points"],
     broyden: Float[np.ndarray, "points"],
     along: float,
     bent: float,
-) -> list[Mark]:
+) -> list[Measurement]:
     mega = {name: POINTS / time / 1e6 for name, time in times.items()}
 
     def told(error: Float[np.ndarray, "points"]) -> str:
         p50, p99 = 1000.0 * np.quantile(error, (0.5, 0.99))
-        lost = 100.0 * float((error > LOST_M).mean())
+        lost = 100.0 * float((error > WRONG_ROOT_M).mean())
         return f"p50 {p50:.3f} mm, p99 {p99:.2f} mm, {lost:.2f} % off by more than 1 cm"
 
-    true = errors[errors <= LOST_M]
+    true = errors[errors <= WRONG_ROOT_M]
     return [
-        Mark(
+        Measurement(
             name=f"warp-cell look-up vs numba Broyden, {pose} pose, one-sample rays, times",
-            value=times["Broyden"] / times["look-up"], least="30", moonshot="80",
-            beside=f"{mega['look-up']:.1f} million points/s in random order, each a ray of its "
-            f"own; Broyden (9 starts) {mega['Broyden']:.2f}",
+            value=times["BroydenLookup"] / times["look-up"], required="30", stretch_goal="80",
+            context=f"{mega['look-up']:.1f} million points/s in random order, each a ray of its "
+            f"own; Broyden (9 starts) {mega['BroydenLookup']:.2f}",
         ),
-        Mark(
+        Measurement(
             name=f"warp-cell look-up vs numba Broyden, {pose} pose, whole rays, times",
-            value=along / 1e6 / mega["Broyden"], least="30", moonshot="80",
-            beside=f"{along / 1e6:.1f} million points/s along the trainer's rays, when every "
+            value=along / 1e6 / mega["BroydenLookup"], required="30", stretch_goal="80",
+            context=f"{along / 1e6:.1f} million points/s along the trainer's rays, when every "
             "sample that has a root stays; empty cells on the way included",
         ),
-        Mark(
+        Measurement(
             name=f"error of that look-up, {pose} pose, p99 mm",
-            value=1000.0 * float(np.quantile(errors, 0.99)), least="< 2", moonshot="< 1",
-            beside=f"{told(errors)}; p99 of the others {1000 * np.quantile(true, 0.99):.2f} mm; "
+            value=1000.0 * float(np.quantile(errors, 0.99)), required="< 2", stretch_goal="< 1",
+            context=f"{told(errors)}; p99 of the others {1000 * np.quantile(true, 0.99):.2f} mm; "
             f"Broyden: {told(broyden)}; points of occupied cells, {100 * bent:.0f} % of them in "
             "bent cells, where a second-order term corrects",
         ),

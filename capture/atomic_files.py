@@ -9,16 +9,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import final
 
-from capture.errors import BadInput
-from capture.file_list import FileList
+from capture.errors import InputError
+from capture.file_list import OutputFileList
 
 
 @final
-class Draft:
+class AtomicFile:
     """A file under a random name beside its own, which it takes when it is finished.
 
     A link is followed: what it points to is replaced. The passing name keeps the suffix, by which
-    encoders know what to write. An older file stays until then. In a folder with a `FileList` the
+    encoders know what to write. An older file stays until then. In a folder with a `OutputFileList` the
     file is listed.
 
     Attributes:
@@ -34,28 +34,28 @@ class Draft:
                 only where no list says which files are ours.
 
         Raises:
-            BadInput: If `path` is a folder, a device or a pipe, or a file that must stay.
+            InputError: If `path` is a folder, a device or a pipe, or a file that must stay.
             OSError: If it cannot be written.
         """
         self._path, self._replace, self._finished = path, replace, False
-        self._list = FileList(path.parent)
+        self._list = OutputFileList(path.parent)
         if path.is_dir():
-            raise BadInput(f"{path} is a folder; the name of a file was expected.")
+            raise InputError(f"{path} is a folder; the name of a file was expected.")
         if is_stream(path):
-            raise BadInput(f"{path} is a device or a pipe; the name of a file was expected.")
+            raise InputError(f"{path} is a device or a pipe; the name of a file was expected.")
         self._check_replaceable()
         real = Path(os.path.realpath(path))
         real.parent.mkdir(parents=True, exist_ok=True)
-        self._real, self.part = real, real.with_name(_passing(path.stem, "part") + path.suffix)
+        self._real, self.part = real, real.with_name(_temporary_name(path.stem, "part") + path.suffix)
         if self._list.exists() and real.parent == Path(os.path.realpath(path.parent)):
-            self._list.add_unfinished(self.part.name)
+            self._list.add_temporary(self.part.name)
         os.close(os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
 
-    def finish(self) -> None:
+    def commit(self) -> None:
         """Flushes the file to the disk and gives it its name.
 
         Raises:
-            BadInput: If a file that must stay has come there meanwhile.
+            InputError: If a file that must stay has come there meanwhile.
             OSError: If the disk is full.
         """
         with self.part.open("rb") as file:
@@ -72,59 +72,59 @@ class Draft:
             self.part.unlink(missing_ok=True)
 
     def _check_replaceable(self) -> None:
-        if not replaceable(self._path, self._replace):
-            raise BadInput(
+        if not is_replaceable(self._path, self._replace):
+            raise InputError(
                 f"{self._path} is there already, and is not what this program wrote there; it was "
                 "left alone. Move it elsewhere, or name another place."
             )
 
 
-def replaceable(path: Path, replace: bool | None) -> bool:
-    """Whether a file may be written under a name; see `Draft` for what `replace` says."""
-    listing = FileList(path.parent)
+def is_replaceable(path: Path, replace: bool | None) -> bool:
+    """Whether a file may be written under a name; see `AtomicFile` for what `replace` says."""
+    listing = OutputFileList(path.parent)
     if replace or not os.path.lexists(path) or is_stream(path):
         return True
     if replace is None and not listing.exists():
         return True
-    return listing.holds(path.name)
+    return listing.owns(path.name)
 
 
 @contextmanager
-def whole_file(path: Path, *, replace: bool | None = None) -> Iterator[Path]:
+def atomic_file(path: Path, *, replace: bool | None = None) -> Iterator[Path]:
     """Gives a name to write to; the file takes its own name once the block is done.
 
     An older file stays until then, and stays if the block fails.
 
     Args:
         path: The name that the file will have.
-        replace: As of `Draft`.
+        replace: As of `AtomicFile`.
 
     Raises:
-        BadInput: If `path` is a folder, a device or a pipe, or a file that must stay.
+        InputError: If `path` is a folder, a device or a pipe, or a file that must stay.
         OSError: If it cannot be written.
     """
-    draft = Draft(path, replace=replace)
+    draft = AtomicFile(path, replace=replace)
     try:
         yield draft.part
-        draft.finish()
+        draft.commit()
     finally:
         draft.discard()
 
 
-def write_text(path: Path, text: str, *, replace: bool | None = None) -> None:
+def write_text_atomically(path: Path, text: str, *, replace: bool | None = None) -> None:
     """A text file, whole or not at all; a device such as /dev/stdout just gets the text."""
     if is_stream(path):
-        path.write_text(text, encoding="utf-8")
+        path.write_text_atomically(text, encoding="utf-8")
         return
-    with whole_file(path, replace=replace) as part:
-        part.write_text(text, encoding="utf-8")
+    with atomic_file(path, replace=replace) as part:
+        part.write_text_atomically(text, encoding="utf-8")
 
 
 @contextmanager
-def whole_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
+def atomic_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
     """Gives a folder to fill; it takes its own name, and an older one's place, at the end.
 
-    A link is followed, as by `whole_file`. An older folder is replaced only if it is empty, or if
+    A link is followed, as by `atomic_file`. An older folder is replaced only if it is empty, or if
     its list says that all of it is ours.
 
     Args:
@@ -132,14 +132,14 @@ def whole_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
         listed: Whether a list is made of what was written, by which it can be replaced later.
 
     Raises:
-        BadInput: If something there must stay.
+        InputError: If something there must stay.
         OSError: If it cannot be written.
     """
     check_replaceable_folder(path)
     real = Path(os.path.realpath(path))
     real.parent.mkdir(parents=True, exist_ok=True)
-    part = real.with_name(_passing(real.name, "part"))
-    old = real.with_name(_passing(real.name, "old"))
+    part = real.with_name(_temporary_name(real.name, "part"))
+    old = real.with_name(_temporary_name(real.name, "old"))
     part.mkdir()
     try:
         yield part
@@ -156,20 +156,20 @@ def whole_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
             raise
     finally:
         shutil.rmtree(part, ignore_errors=True)
-        _remove_older(old, path)
+        _remove_replaced(old, path)
 
 
 def check_replaceable_folder(path: Path) -> None:
     """Refuses a folder with anything in it that this program did not write there.
 
     Raises:
-        BadInput: Naming what is there.
+        InputError: Naming what is there.
     """
     if os.path.lexists(path) and not path.is_dir():
-        raise BadInput(f"{path} is a file; a folder was expected.")
-    stranger = next(FileList(path).strangers(), None)
+        raise InputError(f"{path} is a file; a folder was expected.")
+    stranger = next(OutputFileList(path).foreign_files(), None)
     if stranger is not None:
-        raise BadInput(
+        raise InputError(
             f"{path} holds {stranger}, which this program did not write there (or which was "
             "changed since), so the folder is not replaced. Name one that is empty or new."
         )
@@ -177,32 +177,32 @@ def check_replaceable_folder(path: Path) -> None:
 
 def _list_all(folder: Path) -> None:
     files = {str(p.relative_to(folder)): p for p in sorted(folder.rglob("*")) if p.is_file()}
-    FileList(folder).make()
-    FileList(folder).add_all(files)
+    OutputFileList(folder).create()
+    OutputFileList(folder).add_all(files)
 
 
-def _remove_older(old: Path, path: Path) -> None:
+def _remove_replaced(old: Path, path: Path) -> None:
     """Removes a folder that gave way, file by file: what came into it meanwhile is not lost."""
     if not old.exists():
         return
-    FileList(old).clear()
+    OutputFileList(old).remove_all()
     try:
         old.rmdir()
     except OSError:
-        raise BadInput(
+        raise InputError(
             f"Files came into {path} while it was replaced; they lie in {old}."
         ) from None
 
 
-def _passing(name: str, kind: str) -> str:
+def _temporary_name(name: str, kind: str) -> str:
     """A name that nobody else has, of a length that every file system takes."""
     return f".{name[:100]}.{secrets.token_hex(8)}.{kind}"
 
 
-STREAM = re.compile(r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd/\d+")
+STREAM_PATH = re.compile(r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd/\d+")
 
 
 def is_stream(path: Path) -> bool:
     """Whether a name is that of a device or a pipe; stdout is one wherever it was sent to."""
-    named = STREAM.fullmatch(str(path.absolute())) is not None
+    named = STREAM_PATH.fullmatch(str(path.absolute())) is not None
     return named or (path.exists() and not (path.is_file() or path.is_dir()))

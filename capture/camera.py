@@ -57,7 +57,7 @@ class Camera:
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         return -rotation.T @ translation
 
-    def resized(self, size_px: tuple[int, int]) -> "Camera":
+    def resize(self, size_px: tuple[int, int]) -> "Camera":
         """The same camera for a picture scaled to another size (the same field of view)."""
         sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         return replace(
@@ -67,13 +67,13 @@ class Camera:
             size_px=size_px,
         )
 
-    def fitted(self, longer_px: int) -> "Camera":
+    def resize_longer_side(self, longer_px: int) -> "Camera":
         """The same camera for a picture whose longer side is so long."""
         scale = longer_px / max(self.size_px)
         width, height = (max(1, round(side * scale)) for side in self.size_px)
-        return self.resized((width, height))
+        return self.resize((width, height))
 
-    def turned(self, quarter_turns: int) -> "Camera":
+    def rotate_quarter_turns(self, quarter_turns: int) -> "Camera":
         """The camera of the same pictures, turned by so many times 90° against the clock.
 
         Its axes turn with the picture; where it stands and what it sees stay. Distortion can only
@@ -97,7 +97,7 @@ class Camera:
             )
         return camera
 
-    def mirrored(self) -> "Camera":
+    def mirror(self) -> "Camera":
         """The camera of the same pictures, left and right exchanged, in a world mirrored like them.
 
         A camera of mirrored pictures stands in a mirror's world, x' = F x with F = diag(-1, 1, 1).
@@ -119,13 +119,13 @@ class Camera:
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         return np.stack([x, y], axis=-1)
 
-    def directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
+    def ray_directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions in the world of the rays through `pixels` (x, y).
 
         All rays start at `center_world`.
         """
         if self.distortion:
-            plane = self._undistorted(pixels)
+            plane = self._undistort(pixels)
         else:
             plane = (pixels - np.array(self.center_px)) / np.array(self.focal_px)
         in_camera = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
@@ -138,10 +138,10 @@ class Camera:
         in_camera = points_world @ rotation.T + translation
         plane = in_camera[..., :2] / in_camera[..., 2:]
         if self.distortion:
-            plane = self._distorted(plane)
+            plane = self._distort(plane)
         return plane * np.array(self.focal_px) + np.array(self.center_px)
 
-    def _undistorted(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def _undistort(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels as points of the plane at depth 1, as a lens without distortion sees them."""
         import cv2  # heavy, and only needed for lenses that bend
 
@@ -149,7 +149,7 @@ class Camera:
         plane = cv2.undistortPoints(flat, self.intrinsic, np.array(self.distortion))
         return np.asarray(plane).reshape(pixels.shape)
 
-    def _distorted(self, plane: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def _distort(self, plane: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Points of the plane at depth 1, moved to where the lens bends them."""
         import cv2  # heavy, and only needed for lenses that bend
 
@@ -159,7 +159,7 @@ class Camera:
         return np.asarray(bent).reshape(plane.shape)
 
 
-def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+def same_aspect_ratio(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """Whether two pictures have one aspect ratio: the larger shrinks to the smaller within 1 px."""
     large, small = sorted((a, b), key=max, reverse=True)
     scale = max(small) / max(large)

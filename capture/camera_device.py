@@ -14,25 +14,25 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.pace import Pace
+from capture.pace import PacingClock
 from capture.quiet import silence_opencv
-from capture.selection import Selection
+from capture.selection import FrameSelection
 
-PREFIX = "camera:"
-MOST_WAITING = 16
+CAMERA_PREFIX = "camera:"
+MAX_QUEUED_FRAMES = 16
 """Pictures that wait at most, so that one whose pose is late does not cost the next ones."""
-PATIENCE = 16
+MAX_READ_FAILURES = 16
 """How many failures in a row are the end: the camera was unplugged, or the stream is over."""
 
 
 def camera_address(path: Path) -> str | None:
     """What follows `camera:` in an argument; None if it names no camera."""
     text = str(path)
-    if not text.startswith(PREFIX):
+    if not text.startswith(CAMERA_PREFIX):
         return None
-    return re.sub(r"^(\w+):/(?!/)", r"\1://", text.removeprefix(PREFIX))  # paths fold "//"
+    return re.sub(r"^(\w+):/(?!/)", r"\1://", text.removeprefix(CAMERA_PREFIX))  # paths fold "//"
 
 
 @final
@@ -53,7 +53,7 @@ class CameraDevice:
     frame_count: int | None = None
     duration_s: float | None = None
 
-    def __init__(self, address: str, selection: Selection, pace: Pace) -> None:
+    def __init__(self, address: str, selection: FrameSelection, pace: PacingClock) -> None:
         """Opens it and waits for its first picture.
 
         Args:
@@ -62,16 +62,16 @@ class CameraDevice:
             pace: By which others wait for what belongs to its pictures; closing ends it.
 
         Raises:
-            BadInput: If there is no such camera.
+            InputError: If there is no such camera.
             OSError: If it is there and cannot be used now (EBUSY), or may not be (EACCES).
         """
-        self.path = Path(PREFIX + address)
+        self.path = Path(CAMERA_PREFIX + address)
         self.selection = selection
         self.warnings: list[str] = []
         self.dropped = 0
         self._pace, self._waited_s = pace, 0.0
         self._is_file = Path(address).is_file()
-        self._capture = _opened(address)
+        self._capture = _open_device(address)
         ok, picture = self._capture.read()
         if not ok:
             self._capture.release()
@@ -95,9 +95,9 @@ class CameraDevice:
             self._reader = threading.Thread(target=self._read, daemon=True)
             self._reader.start()
         while (frame := self._next()) is not None:
-            if self.selection.over(frame.index):
+            if self.selection.is_past_end(frame.index):
                 return
-            if self.selection.wants(frame.index):
+            if self.selection.contains(frame.index):
                 yield frame
 
     def count_frames(self) -> int:
@@ -106,7 +106,7 @@ class CameraDevice:
 
     def close(self) -> None:
         """Lets the camera go."""
-        self._pace.end()
+        self._pace.stop()
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -122,12 +122,12 @@ class CameraDevice:
             while not (self._waiting or self._ended):
                 self._changed.wait(0.1)
             self._waited_s += time.perf_counter() - began
-            return self._waiting.popleft() if self._waiting and not self._pace.ended else None
+            return self._waiting.popleft() if self._waiting and not self._pace.stopped else None
 
     def _read(self) -> None:
         """Takes pictures as fast as they come; runs on its own thread."""
         try:
-            count = 1 + self._read_until_the_end()
+            count = 1 + self._read_all()
             if not (self._ended or self._is_file):
                 self.warnings.append(
                     f"{self.path} gave no more pictures after {count}; was it unplugged? What was "
@@ -138,10 +138,10 @@ class CameraDevice:
                 self._ended = True
                 self._changed.notify_all()
 
-    def _read_until_the_end(self) -> int:
+    def _read_all(self) -> int:
         """The number of the last picture."""
         index, failures = 0, 0
-        while failures < PATIENCE and not self._ended:
+        while failures < MAX_READ_FAILURES and not self._ended:
             if not self._capture.grab():
                 failures += 1
                 continue
@@ -157,7 +157,7 @@ class CameraDevice:
 
     def _put(self, frame: Frame) -> None:
         with self._changed:
-            if len(self._waiting) == MOST_WAITING:
+            if len(self._waiting) == MAX_QUEUED_FRAMES:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(frame)
@@ -168,11 +168,11 @@ class CameraDevice:
         return Frame(index=index, time_s=due_s - self._first_at, rgb=rgb, due_s=due_s)
 
 
-def _opened(address: str) -> cv2.VideoCapture:
+def _open_device(address: str) -> cv2.VideoCapture:
     """The camera, open.
 
     Raises:
-        BadInput: If there is none.
+        InputError: If there is none.
         OSError: If it cannot be opened although it is there.
     """
     silence_opencv()
@@ -186,12 +186,12 @@ def _opened(address: str) -> cv2.VideoCapture:
         raise PermissionError(errno.EACCES, "Permission denied", str(device))
     if device.is_char_device():
         raise OSError(errno.EBUSY, "another program may be using it", str(device))
-    there = ", ".join(sorted(path.name.removeprefix("video") for path in _devices())) or "none"
-    raise BadInput(
+    there = ", ".join(sorted(path.name.removeprefix("video") for path in _list_devices())) or "none"
+    raise InputError(
         f"There is no camera {address!r} that can be opened; cameras of this machine: {there}. "
         "Expected camera:0, camera:/dev/video2, or a stream's address, as in camera:rtsp://…"
     )
 
 
-def _devices() -> list[Path]:
+def _list_devices() -> list[Path]:
     return list(Path("/dev").glob("video[0-9]*"))

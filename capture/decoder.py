@@ -9,20 +9,20 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.decoder_av import AvDecoder
+from capture.decoder_av import PyAvDecoder
 from capture.quiet import silence_opencv
-from capture.shot import PATIENCE, Decoder, Shot, refusal
+from capture.shot import MAX_DECODE_FAILURES, VideoDecoder, DecoderFrame, unreadable_video_error
 
 
-def open_decoder(path: Path) -> Decoder:
+def open_decoder(path: Path) -> VideoDecoder:
     """PyAV's decoder if it is installed, which sees damage and knows HDR; else OpenCV's.
 
     Raises:
-        BadInput: If it is no video that can be opened.
+        InputError: If it is no video that can be opened.
     """
     if importlib.util.find_spec("av") is not None:
-        return AvDecoder(path)
-    return CvDecoder(path)
+        return PyAvDecoder(path)
+    return OpenCvDecoder(path)
 
 
 def has_alpha_plane(tag: int) -> bool:
@@ -35,7 +35,7 @@ def has_alpha_plane(tag: int) -> bool:
 
 
 @final
-class CvDecoder:
+class OpenCvDecoder:
     """OpenCV's FFmpeg. It applies rotation flags, and does not tell which pictures are damaged."""
 
     knows_hdr = False
@@ -44,7 +44,7 @@ class CvDecoder:
         """Opens the file once, to look at it.
 
         Raises:
-            BadInput: If it cannot be opened.
+            InputError: If it cannot be opened.
         """
         self._path = path
         capture = self._open()
@@ -57,7 +57,7 @@ class CvDecoder:
         self.leaves_alpha = has_alpha_plane(kind)
         capture.release()
 
-    def shots(self) -> Iterator[Shot]:
+    def decode(self) -> Iterator[DecoderFrame]:
         """The pictures in order; every call starts anew."""
         capture, failures = self._open(), 0
 
@@ -66,12 +66,12 @@ class CvDecoder:
             return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if ok else None
 
         try:
-            while failures < PATIENCE:
+            while failures < MAX_DECODE_FAILURES:
                 if not capture.grab():
                     failures += 1
                     continue
                 time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-                yield Shot(time_s=time_s, after_gap=failures > 0, corrupt=False, rgb=rgb)
+                yield DecoderFrame(time_s=time_s, after_gap=failures > 0, corrupt=False, rgb=rgb)
                 failures = 0
         finally:
             capture.release()
@@ -80,5 +80,5 @@ class CvDecoder:
         silence_opencv()
         capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         if not capture.isOpened():
-            raise refusal(self._path)
+            raise unreadable_video_error(self._path)
         return capture

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
-PREFIX = ".instant-avatar-"
+RESERVED_PREFIX = ".instant-avatar-"
 """Of all names that are not for users."""
-NAME = f"{PREFIX}files"
+LIST_NAME = f"{RESERVED_PREFIX}files"
 """Of the list, in the folder whose files it lists."""
 HEADER = b'{"program": "instant-avatar-stream", "list": "files it wrote here", "format": 1}'
 
 
 @dataclass(frozen=True)
-class FileList:
+class OutputFileList:
     """The list of one folder, or the place for it.
 
     Each line is appended, and on the disk, before the file that it names appears: a process that
@@ -39,30 +39,30 @@ class FileList:
     @property
     def path(self) -> Path:
         """The list itself."""
-        return self.folder / NAME
+        return self.folder / LIST_NAME
 
     def exists(self) -> bool:
         """Whether there is one, and it is ours."""
         return self._beginning() == HEADER
 
-    def is_foreign(self) -> bool:
+    def path_is_foreign(self) -> bool:
         """Whether something that is no list of ours has its name; one cut short is ours."""
         beginning = self._beginning()
         if beginning is None:
             return os.path.lexists(self.path)
         return not HEADER.startswith(beginning)
 
-    def make(self) -> None:
+    def create(self) -> None:
         """Begins the list, unless there is one.
 
         Raises:
-            BadInput: If a file of somebody else has the list's name.
+            InputError: If a file of somebody else has the list's name.
             OSError: If the disk is full.
         """
         if self.exists():
             return
-        if self.is_foreign():
-            raise BadInput(
+        if self.path_is_foreign():
+            raise InputError(
                 f"{self.path} is not a list that this program wrote. Move it elsewhere, or name "
                 "another folder."
             )
@@ -79,16 +79,16 @@ class FileList:
 
     def add_all(self, files: dict[str, Path]) -> None:
         """Lists several files, by the names they will have."""
-        self._append([{"name": name, "sha256": digest(file)} for name, file in files.items()])
+        self._append([{"name": name, "sha256": file_sha256(file)} for name, file in files.items()])
 
-    def add_unfinished(self, name: str) -> None:
+    def add_temporary(self, name: str) -> None:
         """Lists the random name of a file that is still being written, by this process."""
         self._append([{"unfinished": name, "pid": os.getpid()}])
 
-    def holds(self, name: str) -> bool:
+    def owns(self, name: str) -> bool:
         """Whether a file of this name is there, and is what was listed under it."""
         try:
-            found = digest(self.folder / name)
+            found = file_sha256(self.folder / name)
         except OSError:
             return False
         return found in self._listed().get(name, ())  # read last: a run may be writing both
@@ -99,25 +99,25 @@ class FileList:
         Returns:
             Whether none is there now.
         """
-        if self.holds(name):
+        if self.owns(name):
             (self.folder / name).unlink()
         return not os.path.lexists(self.folder / name)
 
-    def strangers(self) -> Iterator[str]:
+    def foreign_files(self) -> Iterator[str]:
         """Whatever lies in the folder, at any depth, and is not ours."""
         listed = self._listed()
         above = {str(parent) for name in listed for parent in Path(name).parents}
         for folder, folders, files in os.walk(self.folder):
             place = Path(folder).relative_to(self.folder)
             for name in sorted(files):
-                own = place / name == Path(NAME) and self.exists()
-                if not own and not (str(place / name) in listed and self.holds(str(place / name))):
+                own = place / name == Path(LIST_NAME) and self.exists()
+                if not own and not (str(place / name) in listed and self.owns(str(place / name))):
                     yield str(place / name)
             for name in sorted(folders):
                 if str(place / name) not in above or Path(folder, name).is_symlink():
                     yield str(place / name)
 
-    def clear(self) -> None:
+    def remove_all(self) -> None:
         """Removes all files that are ours, folders that are empty then, and the list at the end."""
         listed = self._listed()
         for name in listed:
@@ -126,19 +126,19 @@ class FileList:
         for name in sorted(folders, key=len, reverse=True):
             with suppress(OSError):  # somebody else's file is in it
                 (self.folder / name).rmdir()
-        self.remove_unfinished()
-        self.tidy()
+        self.remove_temporaries()
+        self.remove_if_empty()
 
-    def tidy(self) -> None:
+    def remove_if_empty(self) -> None:
         """Removes the list if nothing else lies in the folder, except a lock of ours."""
-        if self.exists() and all(p.name.startswith(PREFIX) for p in self.folder.iterdir()):
+        if self.exists() and all(p.name.startswith(RESERVED_PREFIX) for p in self.folder.iterdir()):
             self.path.unlink()
 
-    def remove_unfinished(self) -> None:
+    def remove_temporaries(self) -> None:
         """Removes what processes that were killed left half-written."""
         for record in self._records():
             name, pid = record.get("unfinished"), record.get("pid")
-            if isinstance(name, str) and isinstance(pid, int) and not _runs(pid):
+            if isinstance(name, str) and isinstance(pid, int) and not _process_exists(pid):
                 (self.folder / Path(name).name).unlink(missing_ok=True)
 
     def _beginning(self) -> bytes | None:
@@ -177,7 +177,7 @@ class FileList:
         return found
 
 
-def digest(path: Path) -> str:
+def file_sha256(path: Path) -> str:
     """SHA-256 of a file's content; computed once for as long as the file is not written to.
 
     Raises:
@@ -186,16 +186,16 @@ def digest(path: Path) -> str:
     if not path.is_file():  # a pipe would never end
         raise FileNotFoundError(path)
     state = path.stat()
-    return _digest(path, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
+    return _cached_sha256(path, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=1024)
-def _digest(path: Path, *_: int) -> str:
+def _cached_sha256(path: Path, *_: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _runs(pid: int) -> bool:
+def _process_exists(pid: int) -> bool:
     """Whether a process of this machine has that number."""
     try:
         os.kill(pid, 0)

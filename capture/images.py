@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from capture.quiet import silence_opencv
-from capture.selection import Selection
+from capture.selection import FrameSelection
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 
 EXIF_ORIENTATION = 0x0112
-QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
+EXIF_QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
 """By EXIF's orientation: turns by 90° against the clock that make a stored picture upright."""
-UPRIGHT = {
+EXIF_TRANSPOSE = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -31,21 +31,21 @@ UPRIGHT = {
 }
 """The same with those that are mirrored, for pixels."""
 
-TIFF = (b"II*\x00", b"MM\x00*")
+TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
 """How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
-LOOKED_AT = 5
+ALPHA_SAMPLES = 5
 """Pictures, evenly spread, that are asked whether an alpha channel cuts the person out."""
-WITH_ALPHA = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
+ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 """Kinds of pictures that can have an alpha channel."""
-TRANSPARENT = 0.01
+MIN_TRANSPARENT_FRACTION = 0.01
 """Share of the pixels that an alpha channel must clear to be a mask: rounded corners clear less."""
 
-RATE = 30.0
+ASSUMED_FPS = 30.0
 """Pictures a second, where nobody has said when each was taken."""
 
 
-def natural_key(path: Path) -> list[tuple[int, str]]:
+def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Sorts `image_9` before `image_10`."""
     return [
         (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)
@@ -55,7 +55,7 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
 def list_images(folder: Path) -> list[Path]:
     """The pictures in a folder, in natural order."""
     images = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-    return sorted((file for file in images if not file.name.startswith(".")), key=natural_key)
+    return sorted((file for file in images if not file.name.startswith(".")), key=natural_sort_key)
 
 
 def read_image(
@@ -64,54 +64,54 @@ def read_image(
     """One upright picture as RGB, and its alpha channel if it has one.
 
     Raises:
-        BadInput: If it cannot be decoded, or is not complete.
+        InputError: If it cannot be decoded, or is not complete.
     """
     data = path.read_bytes()
     if not _is_complete(data):
-        raise BadInput(f"{path} is cut off; the file is not complete.")
+        raise InputError(f"{path} is cut off; the file is not complete.")
     encoded = np.frombuffer(data, np.uint8)
     picture = _decode(encoded, cv2.IMREAD_UNCHANGED)
     if picture is None:
-        raise BadInput(f"{path} is no picture that can be decoded; it is empty or damaged.")
+        raise InputError(f"{path} is no picture that can be decoded; it is empty or damaged.")
     alpha = None
     if picture.ndim == 3 and picture.shape[2] == 4:
         alpha = picture[..., 3]
         alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
-        alpha = np.ascontiguousarray(_turned(alpha, data))
+        alpha = np.ascontiguousarray(_rotate_alpha(alpha, data))
     picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
     if picture is None:
-        raise BadInput(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
+        raise InputError(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
     rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     if alpha is not None and alpha.shape != rgb.shape[:2]:
-        raise BadInput(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
+        raise InputError(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
     return rgb, alpha
 
 
-def cuts_out(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
+def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
     """Whether an alpha channel says where the person is: an opaque one says nothing."""
-    return alpha is not None and float((alpha < 128).mean()) >= TRANSPARENT
+    return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
 
 
-def any_cuts_out(images: Sequence[Path]) -> bool:
+def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     """Whether the alpha channel of any of a few pictures, spread over all, cuts the person out.
 
     One picture is no evidence: matting tools write the first ones opaque, or where they see nobody.
     """
-    able = [path for path in images if path.suffix.lower() in WITH_ALPHA]
-    places = np.linspace(0, len(able) - 1, min(LOOKED_AT, len(able))).round().astype(int)
+    able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
+    places = np.linspace(0, len(able) - 1, min(ALPHA_SAMPLES, len(able))).round().astype(int)
     for path in (able[place] for place in places):
         try:
             alpha = read_image(path)[1]
-        except (BadInput, OSError):  # damaged or half written; another one says it
+        except (InputError, OSError):  # damaged or half written; another one says it
             continue
-        if cuts_out(alpha):
+        if has_cutout_alpha(alpha):
             return True
     return False
 
 
-def orientation(data: bytes) -> int:
+def exif_orientation(data: bytes) -> int:
     """EXIF's orientation of an encoded picture, 1 to 8; 1 (upright) where there is none."""
-    tagged = data.startswith(TIFF) or any(mark in data for mark in (b"Exif", b"eXIf", b"EXIF"))
+    tagged = data.startswith(TIFF_MAGIC) or any(mark in data for mark in (b"Exif", b"eXIf", b"EXIF"))
     if not tagged:  # looking closer would decode a PNG
         return 1
     try:
@@ -119,15 +119,15 @@ def orientation(data: bytes) -> int:
             found = picture.getexif().get(EXIF_ORIENTATION, 1)
     except Exception:  # damaged tags; of many types, and OpenCV leaves the picture as it is, too
         return 1
-    return found if found in UPRIGHT else 1
+    return found if found in EXIF_TRANSPOSE else 1
 
 
-def _turned(alpha: UInt8[np.ndarray, "_ _"], data: bytes) -> UInt8[np.ndarray, "height width"]:
+def _rotate_alpha(alpha: UInt8[np.ndarray, "_ _"], data: bytes) -> UInt8[np.ndarray, "height width"]:
     """An alpha channel as it was stored, made upright as OpenCV makes the colours."""
-    found = orientation(data)
-    if found == 1 or data.startswith(TIFF):
+    found = exif_orientation(data)
+    if found == 1 or data.startswith(TIFF_MAGIC):
         return alpha
-    return np.asarray(Image.fromarray(alpha).transpose(UPRIGHT[found]))
+    return np.asarray(Image.fromarray(alpha).transpose(EXIF_TRANSPOSE[found]))
 
 
 def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
@@ -156,11 +156,11 @@ class ImageFolder:
     waited_s = 0.0
     dropped = 0
 
-    def __init__(self, path: Path, selection: Selection) -> None:
+    def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Lists the folder and reads the first picture that can be read.
 
         Raises:
-            BadInput: If there is none, or none is wanted.
+            InputError: If there is none, or none is wanted.
         """
         self.path = path
         self.selection = selection
@@ -169,23 +169,23 @@ class ImageFolder:
         self.frames_in_file = len(self._images)
         self.frame_count: int | None = selection.count(self.frames_in_file)
         if not self.frame_count:
-            raise BadInput(
+            raise InputError(
                 f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
                 f"; at least one was expected from number {selection.start} on."
             )
-        self.duration_s: float | None = selection.span(self.frames_in_file) / RATE
+        self.duration_s: float | None = selection.span(self.frames_in_file) / ASSUMED_FPS
         self.size_px, self.quarter_turns = self._look()
-        self.has_alpha = any_cuts_out([p for i, p in enumerate(self._images) if selection.wants(i)])
+        self.has_alpha = any_has_cutout_alpha([p for i, p in enumerate(self._images) if selection.contains(i)])
 
     def frames(self) -> Iterator[Frame]:
         """The wanted pictures in order; every call starts anew."""
         previous = None
         for index, path in enumerate(self._images):
-            if not self.selection.wants(index):
+            if not self.selection.contains(index):
                 continue
             try:
                 rgb, alpha = read_image(path)
-            except (BadInput, OSError) as cause:  # damaged, or the disk was unplugged
+            except (InputError, OSError) as cause:  # damaged, or the disk was unplugged
                 self._warn(f"{cause} It was left out.")
                 continue
             if rgb.shape[1::-1] != self.size_px:
@@ -196,7 +196,7 @@ class ImageFolder:
                 continue
             repeated = previous is not None and np.array_equal(rgb, previous)
             flags = frozenset({"repeated"} if repeated else ())
-            yield Frame(index=index, time_s=index / RATE, rgb=rgb, flags=flags, alpha=alpha)
+            yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, flags=flags, alpha=alpha)
             previous = rgb
 
     def count_frames(self) -> int:
@@ -211,11 +211,11 @@ class ImageFolder:
         for path in self._images:
             try:
                 rgb, _ = read_image(path)
-            except BadInput:
+            except InputError:
                 continue
-            turns = QUARTER_TURNS.get(orientation(path.read_bytes()), 0)
+            turns = EXIF_QUARTER_TURNS.get(exif_orientation(path.read_bytes()), 0)
             return (rgb.shape[1], rgb.shape[0]), turns
-        raise BadInput(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
+        raise InputError(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:

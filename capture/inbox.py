@@ -54,21 +54,21 @@ class Inbox(Generic[Item]):
         return self._ended.is_set() and self._queue.empty() and self._error is None
 
     @property
-    def waiting(self) -> int:
+    def pending(self) -> int:
         """How many items have arrived and nobody has taken."""
         return self._queue.qsize()
 
-    def take(self, *, wait_s: float = 0.0, most: int | None = None) -> list[Item]:
+    def take(self, *, timeout_s: float = 0.0, max_items: int | None = None) -> list[Item]:
         """Takes what has arrived, in order.
 
         Args:
-            wait_s: Seconds to wait for a first item.
+            timeout_s: Seconds to wait for a first item.
             most: Number of items taken at most; None for all.
         """
         taken: list[Item] = []
         try:
-            taken.append(self._queue.get(timeout=wait_s) if wait_s else self._queue.get_nowait())
-            while most is None or len(taken) < most:
+            taken.append(self._queue.get(timeout=timeout_s) if timeout_s else self._queue.get_nowait())
+            while max_items is None or len(taken) < max_items:
                 taken.append(self._queue.get_nowait())
         except queue.Empty:
             pass
@@ -92,7 +92,7 @@ class Inbox(Generic[Item]):
             except queue.Empty:
                 return
 
-    def _let_one_give_way(self) -> None:
+    def _drop_oldest(self) -> None:
         """Makes room for the latest, of a live source; else the producer goes on waiting."""
         if not self.live:
             return
@@ -110,7 +110,7 @@ class Inbox(Generic[Item]):
                         self._queue.put(item, timeout=0.0 if self.live else 0.1)
                         break
                     except queue.Full:
-                        self._let_one_give_way()
+                        self._drop_oldest()
                 if self._stop.is_set():
                     return
         except BaseException as error:

@@ -4,7 +4,7 @@ import resource
 import sys
 from pathlib import Path
 
-STATUS = Path("/proc/self/status")
+PROC_STATUS = Path("/proc/self/status")
 
 
 def peak_memory_mb() -> float:
@@ -14,7 +14,7 @@ def peak_memory_mb() -> float:
     (fs/exec.c sets maxrss of the memory that is left behind); /proc does not.
     """
     try:
-        lines = STATUS.read_text(encoding="ascii").splitlines()
+        lines = PROC_STATUS.read_text(encoding="ascii").splitlines()
         return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
     except (OSError, ValueError, StopIteration):  # another system
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -3,22 +3,22 @@
 from pathlib import Path
 
 from capture.camera_device import CameraDevice
-from capture.errors import BadInput
-from capture.growing import GrowingFolder
+from capture.errors import InputError
+from capture.growing import WatchedImageFolder
 from capture.images import IMAGE_SUFFIXES, ImageFolder, list_images
-from capture.pace import Pace
-from capture.selection import Selection
-from capture.source import Source
+from capture.pace import PacingClock
+from capture.selection import FrameSelection
+from capture.source import FrameSource
 from capture.video import VIDEO_SUFFIXES, VideoFile
 
-HEIC = frozenset({".heic", ".heif"})
-NO_VIDEO = HEIC | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})
+NON_VIDEO_SUFFIXES = HEIC_SUFFIXES | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
 """Endings of files that people name by mistake."""
-BESIDE = ("mask", "preview")
+SIDE_VIDEO_PREFIXES = ("mask", "preview")
 """How the names of videos begin that lie beside the one that is meant."""
 
 
-def open_source(path: Path, *, frames: slice | None = None) -> Source:
+def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
     """Opens a video file, a folder of pictures or a native capture folder.
 
     Args:
@@ -26,36 +26,36 @@ def open_source(path: Path, *, frames: slice | None = None) -> Source:
         frames: Which frames are wanted; they keep their numbers. All if None.
 
     Raises:
-        BadInput: If there is nothing there that can be read.
+        InputError: If there is nothing there that can be read.
     """
-    selection = Selection.of(frames)
+    selection = FrameSelection.of(frames)
     if not path.exists():
-        raise BadInput(f"{path} does not exist; a video or a folder of pictures was expected.")
+        raise InputError(f"{path} does not exist; a video or a folder of pictures was expected.")
     if not path.is_dir():
-        if path.suffix.lower() in IMAGE_SUFFIXES | NO_VIDEO:
-            raise BadInput(
+        if path.suffix.lower() in IMAGE_SUFFIXES | NON_VIDEO_SUFFIXES:
+            raise InputError(
                 f"{path} is no video; expected one ({', '.join(sorted(VIDEO_SUFFIXES))}), or a "
                 "folder of pictures."
             )
         return VideoFile(path, selection)
     if (path / "images").is_dir():
         return ImageFolder(path / "images", selection)
-    videos = _videos(path)
+    videos = _list_videos(path)
     if list_images(path) and not videos:
         return ImageFolder(path, selection)
     if len(videos) != 1:
-        raise _unclear(path, videos)
+        raise _ambiguous_folder_error(path, videos)
     return VideoFile(videos[0], selection)
 
 
-def _videos(folder: Path) -> list[Path]:
+def _list_videos(folder: Path) -> list[Path]:
     """List the videos in a folder; masks and a preview do not count where there is another."""
     files = (file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
     seen = sorted(file for file in files if not file.name.startswith("."))
-    return [file for file in seen if not file.stem.lower().startswith(BESIDE)] or seen
+    return [file for file in seen if not file.stem.lower().startswith(SIDE_VIDEO_PREFIXES)] or seen
 
 
-def _unclear(path: Path, videos: list[Path]) -> BadInput:
+def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
     """What is said of a folder that is neither pictures nor one video."""
     if videos:
         found, advice = ", ".join(file.name for file in videos), "Name the video itself."
@@ -63,16 +63,16 @@ def _unclear(path: Path, videos: list[Path]) -> BadInput:
         endings = {file.suffix.lower() for file in path.iterdir() if file.suffix}
         found = f"files ending in {', '.join(sorted(endings))}" if endings else "neither"
         heic = "HEIC pictures must be converted, to JPEG or PNG."
-        advice = heic if endings & HEIC else "Name the folder that holds them."
-    return BadInput(
+        advice = heic if endings & HEIC_SUFFIXES else "Name the folder that holds them."
+    return InputError(
         f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
         f"{found}. {advice}"
     )
 
 
-def open_live(
-    path: Path, camera: str | None, frames: slice | None, pace: Pace, *, idle_s: float
-) -> Source:
+def open_live_source(
+    path: Path, camera: str | None, frames: slice | None, pace: PacingClock, *, idle_s: float
+) -> FrameSource:
     """Opens a camera, or a folder that another program writes pictures to.
 
     Args:
@@ -83,11 +83,11 @@ def open_live(
         idle_s: No new picture for so long is a folder's end.
 
     Raises:
-        BadInput: If there is no such camera, or no picture comes into the folder.
+        InputError: If there is no such camera, or no picture comes into the folder.
         OSError: If the camera cannot be used now.
     """
-    selection = Selection.of(frames)
+    selection = FrameSelection.of(frames)
     if camera is not None:
         return CameraDevice(camera, selection, pace)
     inside = path / "images"
-    return GrowingFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)
+    return WatchedImageFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)

@@ -10,7 +10,7 @@ Wait = Callable[[float], object]
 
 
 @final
-class Pace:
+class PacingClock:
     """The clock of a source whose frames come at times of their own.
 
     Attributes:
@@ -30,7 +30,7 @@ class Pace:
         self.waited_s = 0.0
 
     @property
-    def ended(self) -> bool:
+    def stopped(self) -> bool:
         """Whether nobody waits any more."""
         return self._ended.is_set()
 
@@ -38,18 +38,18 @@ class Pace:
         """Seconds on the clock."""
         return self._clock()
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Ends every wait, the present one too; from any thread."""
         self._ended.set()
 
-    def until(self, moment: float) -> bool:
+    def wait_until(self, moment: float) -> bool:
         """Waits for a moment on the clock; does not if it has gone by.
 
         Returns:
             Whether to go on: False once somebody has ended it.
         """
         began = self._clock()
-        if moment > began and not self.ended:
+        if moment > began and not self.stopped:
             self._wait(moment - began)
             self.waited_s += self._clock() - began
-        return not self.ended
+        return not self.stopped

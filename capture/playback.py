@@ -5,12 +5,12 @@ from dataclasses import replace
 from typing import final
 
 from capture.frame import Frame
-from capture.pace import Pace
-from capture.source import Source
+from capture.pace import PacingClock
+from capture.source import FrameSource
 
 
 @final
-class Playback:
+class RealtimePlayback:
     """A source whose frames are handed over no earlier than their timestamps say.
 
     The first frame is at 0; what lies between two frames is what the container says, whatever its
@@ -25,7 +25,7 @@ class Playback:
     live = False
     paced = True
 
-    def __init__(self, source: Source, pace: Pace) -> None:
+    def __init__(self, source: FrameSource, pace: PacingClock) -> None:
         """Nothing is read yet.
 
         Args:
@@ -63,7 +63,7 @@ class Playback:
                 due = self._pace.now()
                 began = due - frame.time_s
             due = max(due, began + frame.time_s)
-            if not self._pace.until(due):
+            if not self._pace.wait_until(due):
                 return
             yield replace(frame, due_s=due)
 
@@ -73,5 +73,5 @@ class Playback:
 
     def close(self) -> None:
         """Ends the playback, also in the middle of a wait."""
-        self._pace.end()
+        self._pace.stop()
         self._source.close()

@@ -3,7 +3,7 @@
 import os
 from functools import cache
 
-SILENT = 0
+LOG_LEVEL_SILENT = 0
 """OpenCV's own number."""
 
 
@@ -14,4 +14,4 @@ def silence_opencv() -> None:
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
-    (set_level or cv2.utils.logging.setLogLevel)(SILENT)
+    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)

@@ -5,12 +5,12 @@ from typing import final
 
 import numpy as np
 
-KEPT = 4096
+RESERVOIR_SIZE = 4096
 """Numbers that are kept; up to so many the percentiles are exact."""
 
 
 @final
-class Reservoir:
+class ReservoirSample:
     """A uniform sample of all numbers so far (Vitter 1985, algorithm R).
 
     Attributes:
@@ -18,7 +18,7 @@ class Reservoir:
         largest: The largest of them all; 0 of none.
     """
 
-    def __init__(self, kept: int = KEPT) -> None:
+    def __init__(self, kept: int = RESERVOIR_SIZE) -> None:
         """An empty one that keeps at most so many."""
         self._most = kept
         self._kept: list[float] = []

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Selection:
+class FrameSelection:
     """Every `step`-th frame from `start` up to, not including, `stop` (None: to the end)."""
 
     start: int = 0
@@ -18,24 +18,24 @@ class Selection:
         """From a slice; all frames if it is None.
 
         Raises:
-            BadInput: If it counts from the end, goes backwards or leaves nothing.
+            InputError: If it counts from the end, goes backwards or leaves nothing.
         """
         if frames is None:
             return cls()
         start = 0 if frames.start is None else frames.start
         step = 1 if frames.step is None else frames.step
         if start < 0 or step < 1 or (frames.stop is not None and frames.stop <= start):
-            raise BadInput(
+            raise InputError(
                 f"Frames {start}:{'' if frames.stop is None else frames.stop}:{step} name nothing; "
                 "expected START:STOP:STEP with 0 <= START < STOP and STEP >= 1."
             )
         return cls(start=start, stop=frames.stop, step=step)
 
-    def wants(self, index: int) -> bool:
+    def contains(self, index: int) -> bool:
         """Whether the frame with this number belongs to it."""
-        return index >= self.start and not self.over(index) and not (index - self.start) % self.step
+        return index >= self.start and not self.is_past_end(index) and not (index - self.start) % self.step
 
-    def over(self, index: int) -> bool:
+    def is_past_end(self, index: int) -> bool:
         """Whether no frame from this number on belongs to it."""
         return self.stop is not None and index >= self.stop
 

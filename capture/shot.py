@@ -7,13 +7,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
-PATIENCE = 16
+MAX_DECODE_FAILURES = 16
 """How many failures in a row are the end: one damaged packet is none."""
 
 
-class Shot(NamedTuple):
+class DecoderFrame(NamedTuple):
     """A picture at which the decoder stands.
 
     Attributes:
@@ -30,11 +30,11 @@ class Shot(NamedTuple):
 
 
 @runtime_checkable
-class Decoder(Protocol):
+class VideoDecoder(Protocol):
     """An open video.
 
     Attributes:
-        rate: Frames a second, as the container claims; 0 if it does not.
+        rate: EvaluationFrames a second, as the container claims; 0 if it does not.
         claimed: How many frames there are, as the container claims; 0 or less if it does not.
         quarter_turns: How often its pictures are turned by 90° against the clock to stand upright.
         deep: Whether its pictures have more than 8 bits.
@@ -50,14 +50,14 @@ class Decoder(Protocol):
     knows_hdr: bool
     leaves_alpha: bool
 
-    def shots(self) -> Iterator[Shot]:
+    def decode(self) -> Iterator[DecoderFrame]:
         """The pictures in order; every call starts anew."""
         ...
 
 
-def refusal(path: Path) -> BadInput:
+def unreadable_video_error(path: Path) -> InputError:
     """What is said of a file that no decoder opens."""
-    return BadInput(
+    return InputError(
         f"{path} is no video that can be opened; does it hold pictures, or sound "
         "alone? A recording that was cut off before "
         "it was finished has no index and cannot be read: copy it again from the camera."

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from capture.frame import Frame
-from capture.selection import Selection
+from capture.selection import FrameSelection
 
 
 @runtime_checkable
-class Source(Protocol):
+class FrameSource(Protocol):
     """A recorded or live stream of upright RGB frames of one size.
 
     Attributes:
@@ -34,7 +34,7 @@ class Source(Protocol):
 
     path: Path
     size_px: tuple[int, int]
-    selection: Selection
+    selection: FrameSelection
     frames_in_file: int
     frame_count: int | None
     duration_s: float | None

@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from typing import final
 
 from capture.frame import Frame
-from capture.source import Source
+from capture.source import FrameSource
 
 
 @final
-class Transposed:
+class TransposedSource:
     """A source that is said to be as high as it is wide, and as wide as it is high.
 
     With it masks and cameras of the upright pictures can be opened for a film that was rotated by
@@ -19,7 +19,7 @@ class Transposed:
     paced = False
     waited_s = 0.0
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: FrameSource) -> None:
         """Nothing is read yet.
 
         Args:

@@ -7,17 +7,17 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.decoder import open_decoder
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.hdr import hdr_curve
-from capture.selection import Selection
-from capture.shot import Shot
+from capture.hdr import read_hdr_transfer
+from capture.selection import FrameSelection
+from capture.shot import DecoderFrame
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
 )
 
-COUNTED = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
+CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
 
 
@@ -39,11 +39,11 @@ class VideoFile:
     waited_s = 0.0
     dropped = 0
 
-    def __init__(self, path: Path, selection: Selection) -> None:
+    def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Opens the file and decodes one frame.
 
         Raises:
-            BadInput: If no frame can be decoded, or none is wanted.
+            InputError: If no frame can be decoded, or none is wanted.
         """
         self.path = path
         self.selection = selection
@@ -52,9 +52,9 @@ class VideoFile:
         self.quarter_turns = self._decoder.quarter_turns
         self.leaves_alpha = self._decoder.leaves_alpha
         self._rate = self._decoder.rate
-        picture = next((shot.rgb() for shot in self._decoder.shots()), None)
+        picture = next((shot.rgb() for shot in self._decoder.decode()), None)
         if picture is None:
-            raise BadInput(f"No frame of {path} could be decoded; the video is empty or damaged.")
+            raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
         self.size_px = (int(picture.shape[1]), int(picture.shape[0]))
         claimed = self._decoder.claimed
         self.frames_in_file = claimed if claimed > 0 else self.count_frames()
@@ -62,7 +62,7 @@ class VideoFile:
         span = selection.span(self.frames_in_file)
         self.duration_s: float | None = span / self._rate if self._rate > 0.0 else None
         if not self.frame_count:
-            raise BadInput(
+            raise InputError(
                 f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "
                 f"for, which start at {selection.start}."
             )
@@ -72,28 +72,28 @@ class VideoFile:
         """The wanted frames in order; every call starts anew."""
         previous = None
         for index, shot in self._numbered():
-            if not self.selection.wants(index):
+            if not self.selection.contains(index):
                 continue
             rgb = shot.rgb()
             if rgb is None or rgb.shape[1::-1] != self.size_px:
                 self._warn(f"Frame {index} of {self.path.name} could not be decoded; left out.")
                 continue
-            flags = _flags(rgb, previous, shot)
+            flags = _frame_flags(rgb, previous, shot)
             yield Frame(index=index, time_s=shot.time_s, rgb=rgb, flags=flags)
             previous = rgb
 
     def count_frames(self) -> int:
         """How many frames can be decoded, found by doing so."""
-        return sum(1 for _ in self._decoder.shots())
+        return sum(1 for _ in self._decoder.decode())
 
     def close(self) -> None:
         """Nothing is held open but by `frames()`, which lets it go itself."""
 
-    def _numbered(self) -> Iterator[tuple[int, Shot]]:
+    def _numbered(self) -> Iterator[tuple[int, DecoderFrame]]:
         """Every picture with its number; where some are lost, an even rate tells how many."""
         index, got, even, time_s, damaged = 0, 0, True, 0.0, 0
-        for shot in self._decoder.shots():
-            if self.selection.over(index):
+        for shot in self._decoder.decode():
+            if self.selection.is_past_end(index):
                 return
             time_s = shot.time_s
             place = time_s * self._rate
@@ -103,14 +103,14 @@ class VideoFile:
             damaged += shot.corrupt
             yield index, shot
             index, got = index + 1, got + 1
-        if not self.selection.over(index):
+        if not self.selection.is_past_end(index):
             self._compare_with_claim(got, time_s)
         if damaged:
             self._warn(f"{self.path.name}: {damaged} of {got} frames are damaged; left out.")
 
     def _compare_with_claim(self, got: int, end_s: float) -> None:
         """Warns if the container promised more than came."""
-        counted = self.path.suffix.lower() in COUNTED
+        counted = self.path.suffix.lower() in CONTAINERS_WITH_FRAME_COUNT
         duration_s = self.frames_in_file / max(self._rate, 1e-6)
         if counted and got < self.frames_in_file:
             came = f"only {got} of {self.frames_in_file} frames could be decoded"
@@ -124,8 +124,8 @@ class VideoFile:
         """HDR without PyAV comes slowly, and its highlights are cut off."""
         if not self._decoder.deep or self._decoder.knows_hdr:
             return
-        tells = self.path.suffix.lower() in COUNTED
-        if tells and hdr_curve(self.path) is None:
+        tells = self.path.suffix.lower() in CONTAINERS_WITH_FRAME_COUNT
+        if tells and read_hdr_transfer(self.path) is None:
             return
         kind = "an HDR video" if tells else "a 10-bit video, perhaps HDR"
         self._warn(
@@ -138,10 +138,10 @@ class VideoFile:
             self.warnings.append(message)
 
 
-def _flags(
+def _frame_flags(
     rgb: UInt8[np.ndarray, "height width 3"],
     previous: UInt8[np.ndarray, "height width 3"] | None,
-    shot: Shot,
+    shot: DecoderFrame,
 ) -> frozenset[str]:
     """A picture after a gap was predicted from one that is lost."""
     same = previous is not None and np.array_equal(rgb, previous)

@@ -8,9 +8,9 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.playing.background import background
+from apps.playing.background import background_compositor
 from apps.playing.follow import FollowingCamera
-from capture.atomic_files import whole_file
+from capture.atomic_files import atomic_file
 from capture.opening import open_source
 from export.player import Player
 from preprocess.camera_file import read_cameras
@@ -38,10 +38,10 @@ def main() -> None:
     capture = given.demo / "capture"
     player = Player.load(given.demo / "run" / "avatar.iavatar")
     source, poses = open_source(capture), read_motion(capture / "poses.npz")
-    camera = read_cameras(capture / "cameras.npz", source.size_px)[0].resized((size, size))
+    camera = read_cameras(capture / "cameras.npz", source.size_px)[0].resize((size, size))
     dance = read_motion(capture / "dance.npz")
     following = FollowingCamera.of(player, dance, size)
-    blend = background("#f4f1ea")
+    blend = background_compositor("#f4f1ea")
     rows = []
     for frame in source.frames():
         if frame.index % STEP or len(rows) == FRAMES:
@@ -49,9 +49,9 @@ def main() -> None:
         pose = dance[len(rows) * STEP % len(dance)]
         video = np.asarray(Image.fromarray(frame.rgb).resize((size, size)))
         same = blend(player.render(poses[frame.index], camera))
-        rows.append(np.hstack([video, same, blend(player.render(pose, following.at(pose)))]))
+        rows.append(np.hstack([video, same, blend(player.render(pose, following.camera_for(pose)))]))
     first, *others = [Image.fromarray(row) for row in rows]
-    with whole_file(given.out) as part:
+    with atomic_file(given.out) as part:
         first.save(
             part, save_all=True, append_images=others, duration=1000 // FPS, loop=0, quality=70
         )

@@ -14,17 +14,17 @@ try:
 
     import torch
 
-    from apps.recording.opening import open_recording
-    from apps.recording.wanted import RecordingPaths
-    from apps.studio.writer import ShootConfig, shoot
+    from apps.recording.opening import open_capture
+    from apps.recording.wanted import CaptureInputs
+    from apps.studio.writer import ShootConfig, film_capture
     from avatar.config import TrainConfig
     from avatar.events import Evaluated, Finished, Warned
-    from avatar.hold import prepared
+    from avatar.hold import prepare_stream
     from avatar.rig import Rig
     from avatar.train import train
     from avatar.trainer import Trainer
     from avatar.warm import warm_up
-    from capture.errors import BadInput
+    from capture.errors import InputError
     from capture.inbox import Inbox
     from export.build import export_avatar
 except ModuleNotFoundError as missing:
@@ -35,19 +35,19 @@ STEPS = 500
 
 def main(folder: Path) -> None:
     # A film of somebody who does not exist; yours would be a video with poses and masks.
-    shoot(folder / "capture", ShootConfig(frames=48, size=96), overwrite=True)
+    film_capture(folder / "capture", ShootConfig(frames=48, size=96), overwrite=True)
 
     # Everything that is known about it, checked before a frame is read.
-    recording = open_recording(RecordingPaths(video=folder / "capture"))
+    recording = open_capture(CaptureInputs(video=folder / "capture"))
 
     # The rig never changes; the recipe follows from the number of steps and the size of a pixel.
-    rig = Rig.of(recording.shaped)
-    config = TrainConfig.within(steps=STEPS, footprint_m=recording.footprint_m())
+    rig = Rig.from_shaped_body(recording.shaped)
+    config = TrainConfig.for_budget(steps=STEPS, footprint_m=recording.pixel_footprint_m())
     trainer = Trainer(rig, config, torch.device("cpu"))
     warm_up(trainer)  # compiles kernels
 
     # One thread makes frames ready, this one learns from them as they come.
-    frames = prepared(recording.observations(), rig, every=10, total=recording.source.frame_count)
+    frames = prepare_stream(recording.observations(), rig, stride=10, total=recording.source.frame_count)
     held_out = []
     for event in train(trainer, Inbox(frames), held_out):
         match event:
@@ -68,5 +68,5 @@ def main(folder: Path) -> None:
 if __name__ == "__main__":
     try:
         main(Path(sys.argv[1] if len(sys.argv) > 1 else "demo/python"))
-    except BadInput as error:
+    except InputError as error:
         sys.exit(str(error))

@@ -15,7 +15,7 @@ try:
     from PIL import Image
 
     from capture.camera import Camera
-    from capture.errors import BadInput
+    from capture.errors import InputError
     from export.player import Player
     from preprocess.pose import BodyPose
 except ModuleNotFoundError as missing:
@@ -67,5 +67,5 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     try:
         main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "turntable.webp"))
-    except BadInput as error:  # no package there, or a damaged one
+    except InputError as error:  # no package there, or a damaged one
         sys.exit(str(error))

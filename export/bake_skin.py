@@ -4,16 +4,16 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt16
 
 from avatar.rig import Rig
-from export.hull import Hull
-from export.tables import FULL_WEIGHT, Skin
+from export.hull import ProxySurface
+from export.tables import WEIGHT_SCALE, SkinningGrid
 
-BEFORE_M = 0.012
+OUTER_MARGIN_M = 0.012
 """Rays begin at most about so far outside of the hull."""
-APART_M = 0.012
+PROBE_SPACING_M = 0.012
 """Distance between the points along a normal that are looked at: much less than a cell."""
 
 
-def skin_of(rig: Rig, hull: Hull) -> Skin:
+def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
     """The skin under a hull, as deep as one sees.
 
     Args:
@@ -22,9 +22,9 @@ def skin_of(rig: Rig, hull: Hull) -> Skin:
     """
     shape = np.array(rig.weights.shape[:3])
     step_m = (rig.box_high - rig.box_low) / (shape - 1)
-    depths = np.arange(-BEFORE_M, float(hull.thickness.max()) + APART_M, APART_M)
-    within = depths <= hull.thickness[:, None] + APART_M
-    points = hull.positions[:, None] - hull.normals[:, None] * depths[:, None].astype(np.float32)
+    depths = np.arange(-OUTER_MARGIN_M, float(surface.thickness.max()) + PROBE_SPACING_M, PROBE_SPACING_M)
+    within = depths <= surface.thickness[:, None] + PROBE_SPACING_M
+    points = surface.positions[:, None] - surface.normals[:, None] * depths[:, None].astype(np.float32)
     cells = np.floor((points[within] - rig.box_low) / step_m).astype(np.int64)
     touched = np.zeros(shape - 1, dtype=bool)
     touched[tuple(np.clip(cells, 0, shape - 2).T)] = True
@@ -37,9 +37,9 @@ def skin_of(rig: Rig, hull: Hull) -> Skin:
     index[stored] = np.arange(1, stored.sum() + 1)
     part = rig.weights[first[0] : last[0], first[1] : last[1], first[2] : last[2]]
     codes = np.zeros((24, stored.sum() + 1), dtype=np.uint16)
-    codes[0, 0] = FULL_WEIGHT
-    codes[:, 1:] = weight_codes(part[stored]).T
-    return Skin(
+    codes[0, 0] = WEIGHT_SCALE
+    codes[:, 1:] = encode_weights(part[stored]).T
+    return SkinningGrid(
         low=(rig.box_low + first * step_m).astype(np.float32),
         step_m=step_m.astype(np.float32),
         index=index,
@@ -47,9 +47,9 @@ def skin_of(rig: Rig, hull: Hull) -> Skin:
     )
 
 
-def weight_codes(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarray, "nodes 24"]:
-    """Weights × `FULL_WEIGHT`, rounded so that each row sums to it (the largest makes up)."""
-    codes: Int64[np.ndarray, "nodes 24"] = np.round(weights * FULL_WEIGHT).astype(np.int64)
+def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarray, "nodes 24"]:
+    """Weights × `WEIGHT_SCALE`, rounded so that each row sums to it (the largest makes up)."""
+    codes: Int64[np.ndarray, "nodes 24"] = np.round(weights * WEIGHT_SCALE).astype(np.int64)
     rows = np.arange(len(codes))
-    codes[rows, codes.argmax(axis=1)] += FULL_WEIGHT - codes.sum(axis=1)
+    codes[rows, codes.argmax(axis=1)] += WEIGHT_SCALE - codes.sum(axis=1)
     return codes.astype(np.uint16)

@@ -18,36 +18,36 @@ from avatar.model import Avatar
 from avatar.render import render
 from avatar.rig import Rig
 from capture.camera import Camera
-from capture.errors import BadInput
-from export.bake import BakeConfig, read, tables_of
+from capture.errors import InputError
+from export.bake import BakeConfig, sample_field, bake_tables
 from export.checks import (
-    CHECKED_PX,
+    CHECK_PX,
     check_graph,
-    check_pictures,
-    fitted,
-    shown_on_white,
-    warnings_for,
+    mean_psnr_to_renderer,
+    fit_camera,
+    picture_on_white,
+    quality_warnings,
 )
-from export.codec import Layout
+from export.codec import TableLayout
 from export.graph import build_graph
-from export.lattice import FieldAt
-from export.manifest import GOLDEN_PX, GoldenFrame, Manifest, TierNote
-from export.package import AvatarPackage, PackageDraft
+from export.lattice import FieldFunction
+from export.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
+from export.package import AvatarPackage, PackageWriter
 from export.player import Player
-from export.rules import DrawingRules
-from export.seen import Picture, Renderer, View
-from export.tables import Tables
-from export.tiers import TIERS
-from export.tuning import Progress, Tuned, far_off, tuned
+from export.rules import RenderSettings
+from export.seen import RgbaPicture, RenderFunction, PosedView
+from export.tables import PlayerTables
+from export.tiers import QUALITY_TIERS
+from export.tuning import ExportProgress, FineTuningResult, is_below_target, fine_tune
 from preprocess.pose import BodyPose
 
-PROVEN = {"hq": 2, "lite": 1}
+GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
 the arithmetic of this machine's onnxruntime, and further poses would prove it again."""
-MOST_GOLDEN = 4
-BAKED_SHARE, TUNED_SHARE = 0.25, 0.55
+MAX_GOLDEN_FRAMES = 4
+BAKING_PROGRESS, FINE_TUNING_PROGRESS = 0.25, 0.55
 """Of an export's time, baking comes first and fine-tuning follows; the rest are the checks."""
-UNTUNED = (
+INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
 )
@@ -62,7 +62,7 @@ class ExportReport:
         bytes: Its size.
         seconds: Wall time of baking, checking and writing.
         psnr_to_renderer: Of each tier, dB, mean over the views.
-        largest_difference: Between graph and twin, in 1/255.
+        largest_difference: ResectionResult graph and twin, in 1/255.
         tuning: PSNR to the volume renderer's before and after fine-tuning, dB, of pictures that
             it has not seen; None if it was left out.
         warnings: What the user should know.
@@ -72,7 +72,7 @@ class ExportReport:
     bytes: int
     seconds: float
     psnr_to_renderer: Mapping[str, float]
-    tuning: tuple[float, float] | None
+    fine_tuning_psnr: tuple[float, float] | None
     largest_difference: float
     warnings: tuple[str, ...]
 
@@ -81,13 +81,13 @@ def export_avatar(
     avatar: Avatar,
     path: Path,
     *,
-    views: Sequence[View],
+    views: Sequence[PosedView],
     metrics: Mapping[str, Any],
-    renderer: Callable[[Avatar, BodyPose, Camera], Picture] = render,
+    renderer: Callable[[Avatar, BodyPose, Camera], RgbaPicture] = render,
     config: BakeConfig | None = None,
-    hasty: bool = False,
-    fine_tuned: bool = True,
-    progress: Progress = lambda _: None,
+    quick: bool = False,
+    fine_tune_bricks: bool = True,
+    progress: ExportProgress = lambda _: None,
 ) -> ExportReport:
     """Writes an avatar's package, or nothing.
 
@@ -117,11 +117,11 @@ def export_avatar(
     def field_at(
         points: Float32[torch.Tensor, "points 3"],
     ) -> tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]]:
-        rgb, density = avatar.field_at(points.to(device))
+        rgb, density = avatar.color_and_density_at(points.to(device))
         return rgb.cpu(), density.cpu()
 
-    config = config or BakeConfig.for_cells(finest_m)
-    config = config if fine_tuned else replace(config, tuned=0)
+    config = config or BakeConfig.for_cell_size(finest_m)
+    config = config if fine_tune_bricks else replace(config, fine_tuning_pictures=0)
     return export_field(
         field_at,
         avatar.rig,
@@ -130,56 +130,56 @@ def export_avatar(
         views=views,
         metrics=metrics,
         renderer=lambda pose, camera: renderer(avatar, pose, camera),
-        config=config.hasty() if hasty else config,
+        config=config.quick() if quick else config,
         progress=progress,
     )
 
 
 def export_field(
-    field_at: FieldAt,
+    field_at: FieldFunction,
     rig: Rig,
     occupied: UInt8[np.ndarray, "cx cy cz"],
     path: Path,
     *,
-    views: Sequence[View],
+    views: Sequence[PosedView],
     metrics: Mapping[str, Any],
-    renderer: Renderer,
+    renderer: RenderFunction,
     config: BakeConfig | None = None,
-    progress: Progress = lambda _: None,
+    progress: ExportProgress = lambda _: None,
 ) -> ExportReport:
     """As `export_avatar`, of any canonical field."""
     if not views:
-        raise BadInput("An avatar cannot be checked without a pose and a camera; give one view.")
+        raise InputError("An avatar cannot be checked without a pose and a camera; give one view.")
     started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
     # the field, and the renderer with it, is asked on this thread alone
-    lattice = read(field_at, rig, occupied=occupied, config=config)
-    with PackageDraft(path) as draft, ThreadPoolExecutor(2) as beside:
-        baked = beside.submit(tables_of, lattice, rig, config)
-        exact = [shown_on_white(renderer(pose, fitted(c, CHECKED_PX))) for pose, c in views]
+    lattice = sample_field(field_at, rig, occupied=occupied, config=config)
+    with PackageWriter(path) as draft, ThreadPoolExecutor(2) as beside:
+        baked = beside.submit(bake_tables, lattice, rig, config)
+        exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
-        def finer() -> Tables:
-            better = config.finer()
-            return tables_of(read(field_at, rig, occupied=occupied, config=better), rig, better)
+        def finer() -> PlayerTables:
+            better = config.with_finer_voxels()
+            return bake_tables(sample_field(field_at, rig, occupied=occupied, config=better), rig, better)
 
-        better = _tuned(
+        better = _fine_tune(
             baked.result(), finer, rig, renderer, views, config, beside,
-            lambda share: progress(BAKED_SHARE + TUNED_SHARE * share),
+            lambda share: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * share),
         )  # fmt: skip
         tables = better.tables
         compressed = beside.submit(draft.add_tables, tables)
-        rules = {tier: better.rules if tier == "hq" else TIERS[tier] for tier in config.tiers}
-        package = _package(tables, rules, rig, views, metrics)
+        rules = {tier: better.settings if tier == "hq" else QUALITY_TIERS[tier] for tier in config.tiers}
+        package = _unchecked_package(tables, rules, rig, views, metrics)
         others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
         hq = Player(package)
-        notes, warnings = {}, [UNTUNED] if config.tuned and better.psnr is None else []
+        notes, warnings = {}, [INTERRUPTED_WARNING] if config.fine_tuning_pictures and better.psnr is None else []
         for tier in config.tiers:
             player = hq if tier == "hq" else others[tier].result()
             looks = slice(None) if tier == "hq" else slice(1)
-            proofs = package.manifest.golden[: PROVEN[tier]]
+            proofs = package.manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
             worst = check_graph(player, package, tier, proofs)
-            score = check_pictures(player, views[looks], exact[looks])
-            warnings += warnings_for(score) if tier == "hq" else []
+            score = mean_psnr_to_renderer(player, views[looks], exact[looks])
+            warnings += quality_warnings(score) if tier == "hq" else []
             note = package.manifest.tiers[tier]
             notes[tier] = replace(note, psnr_to_renderer=score, largest_difference=worst)
         golden = tuple(hq.render(frame.pose, frame.camera) for frame in package.manifest.golden)
@@ -189,7 +189,7 @@ def export_field(
                 package.manifest, tiers=notes, metrics={**metrics, "warnings": warnings}
             ),
             golden=golden,
-            preview=_png(hq.render(*views[0])),
+            preview=_encode_png(hq.render(*views[0])),
         )
         compressed.result()
         size = draft.finish(package)
@@ -199,54 +199,54 @@ def export_field(
         seconds=time.perf_counter() - started,
         psnr_to_renderer={tier: note.psnr_to_renderer for tier, note in notes.items()},
         largest_difference=max(note.largest_difference for note in notes.values()),
-        tuning=better.psnr,
+        fine_tuning_psnr=better.psnr,
         warnings=tuple(warnings),
     )
 
 
-def _tuned(
-    tables: Tables,
-    finer: Callable[[], Tables],
+def _fine_tune(
+    tables: PlayerTables,
+    finer: Callable[[], PlayerTables],
     rig: Rig,
-    renderer: Renderer,
-    views: Sequence[View],
+    renderer: RenderFunction,
+    views: Sequence[PosedView],
     config: BakeConfig,
     beside: Executor,
-    progress: Progress,
-) -> Tuned:
+    progress: ExportProgress,
+) -> FineTuningResult:
     """Fine-tunes, if that is wanted, finer bricks where the player is too far from the renderer.
 
     Ctrl-C leaves the bricks as they are, and goes on.
     """
-    if config.tuned:
+    if config.fine_tuning_pictures:
         with suppress(KeyboardInterrupt):
-            rules = TIERS["hq"]
-            far = far_off(tables, rig, rules, renderer, views=views, beside=beside)
+            rules = QUALITY_TIERS["hq"]
+            far = is_below_target(tables, rig, rules, renderer, views=views, executor=beside)
             tables = finer() if far else tables
-            return tuned(
+            return fine_tune(
                 tables, rig, rules, renderer,
-                views=views, pictures=config.tuned, beside=beside, deepens=far, progress=progress,
+                views=views, max_pictures=config.fine_tuning_pictures, executor=beside, may_add_layers=far, progress=progress,
             )  # fmt: skip
-    return Tuned(tables=tables, rules=TIERS["hq"], psnr=None)
+    return FineTuningResult(tables=tables, settings=QUALITY_TIERS["hq"], psnr=None)
 
 
-def _package(
-    tables: Tables,
-    rules: Mapping[str, DrawingRules],
+def _unchecked_package(
+    tables: PlayerTables,
+    rules: Mapping[str, RenderSettings],
     rig: Rig,
-    views: Sequence[View],
+    views: Sequence[PosedView],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
     """The package as it stands before the checks: no scores, no pictures."""
     notes = {
-        tier: TierNote(
-            layout=Layout.of(tables), rules=rule, psnr_to_renderer=0.0, largest_difference=0.0
+        tier: TierInfo(
+            layout=TableLayout.of(tables), settings=rule, psnr_to_renderer=0.0, largest_difference=0.0
         )
         for tier, rule in rules.items()
     }
     golden = [
-        GoldenFrame(pose=pose, camera=fitted(camera, GOLDEN_PX))
-        for pose, camera in views[:MOST_GOLDEN]
+        GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
+        for pose, camera in views[:MAX_GOLDEN_FRAMES]
     ]
     return AvatarPackage(
         manifest=Manifest(
@@ -267,7 +267,7 @@ def _package(
     )
 
 
-def _png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
+def _encode_png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(rgba).save(buffer, format="PNG")
     return buffer.getvalue()

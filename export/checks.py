@@ -5,85 +5,85 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.hold import on_white
+from avatar.hold import composite_on_white
 from avatar.metrics import psnr
 from capture.camera import Camera
 from export.errors import ExportRefused
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage
-from export.player import ALIKE, Likeness, Player, premultiplied
-from export.seen import Picture, View
-from export.twin import Shot, draw
+from export.player import MIN_CLOSE_FRACTION, PictureDifference, Player, premultiply
+from export.seen import RgbaPicture, PosedView
+from export.twin import PlayerInputs, draw_reference
 
 POOR_PSNR, GOOD_PSNR = 30.0, 38.0
 """Player against volume renderer, dB: what is below the second, or the first, is warned of."""
-SIMPLIFIED = (
+SIMPLIFIED_WARNING = (
     "The package simplifies fine detail or soft edges: what it draws is {score:.1f} dB from the "
     "avatar as it was learnt ({good:.0f} dB and more look the same)."
 )
-POOR = (
+POOR_WARNING = (
     "The package shows the avatar poorly: what it draws is only {score:.1f} dB from the avatar as "
     "it was learnt ({good:.0f} dB and more look the same). The avatar is still fog rather than a "
     "surface; learn longer (ia-ingest with --resume and more --seconds)."
 )
-CHECKED_PX = 256
+CHECK_PX = 256
 """Longer side of the pictures that are compared with the volume renderer."""
 
 
-def fitted(camera: Camera, longest_px: int) -> Camera:
+def fit_camera(camera: Camera, longest_px: int) -> Camera:
     """The camera for a picture whose longer side is at most so long."""
-    return camera.fitted(min(longest_px, max(camera.size_px)))
+    return camera.resize_longer_side(min(longest_px, max(camera.size_px)))
 
 
-def shown_on_white(picture: Picture) -> Float32[np.ndarray, "height width 3"]:
+def picture_on_white(picture: RgbaPicture) -> Float32[np.ndarray, "height width 3"]:
     """A picture on white, in [0, 1]."""
-    return np.clip(on_white(picture), 0.0, 1.0)
+    return np.clip(composite_on_white(picture), 0.0, 1.0)
 
 
 def check_graph(
     player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
 ) -> float:
     """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
-    tables, rules = package.tables[tier], package.manifest.tiers[tier].rules
+    tables, rules = package.tables[tier], package.manifest.tiers[tier].settings
     worst = 0.0
     for number, frame in enumerate(frames):
         camera = frame.camera
-        shot = Shot(
+        shot = PlayerInputs(
             bones=player.bones(frame.pose, camera),
             focal=np.array(camera.focal_px, dtype=np.float32),
             center=np.array(camera.center_px, dtype=np.float32),
             size_px=camera.size_px,
             samples=rules.samples,
         )
-        drawn = premultiplied(player.render(frame.pose, camera))
-        likeness = Likeness.of(drawn, draw(tables, rules, shot))
-        worst = max(worst, likeness.largest)
-        if not likeness.alike:
+        drawn = premultiply(player.render(frame.pose, camera))
+        likeness = PictureDifference.of(drawn, draw_reference(tables, rules, shot))
+        worst = max(worst, likeness.largest_difference)
+        if not likeness.matches:
             raise ExportRefused(
                 f"In view {number} the player's graph ({tier}) is within 2/255 of its meaning on "
-                f"only {likeness.close:.2%} of the pixels ({ALIKE:.1%} are wanted). Nothing was "
+                f"only {likeness.close_fraction:.2%} of the pixels ({MIN_CLOSE_FRACTION:.1%} are wanted). Nothing was "
                 "written; the checkpoint is kept. This is a fault of the program: please report "
                 "it with the version of onnxruntime."
             )
     return worst
 
 
-def check_pictures(
+def mean_psnr_to_renderer(
     player: Player,
-    views: Sequence[View],
+    views: Sequence[PosedView],
     exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
 ) -> float:
     """Compares the player with the exact renderer's pictures on white; the mean PSNR, dB."""
     scores = []
     for (pose, camera), truth in zip(views, exact, strict=True):
-        drawn = shown_on_white(premultiplied(player.render(pose, fitted(camera, CHECKED_PX))))
+        drawn = picture_on_white(premultiply(player.render(pose, fit_camera(camera, CHECK_PX))))
         scores.append(min(psnr(drawn, truth), 99.0))
     return float(np.mean(scores))
 
 
-def warnings_for(score: float) -> list[str]:
+def quality_warnings(score: float) -> list[str]:
     """What a user should know of a package whose player has this PSNR to the renderer, dB."""
     if score >= GOOD_PSNR:
         return []
-    text = POOR if score < POOR_PSNR else SIMPLIFIED
+    text = POOR_WARNING if score < POOR_PSNR else SIMPLIFIED_WARNING
     return [text.format(score=score, good=GOOD_PSNR)]

@@ -8,31 +8,31 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
-from export.rules import DrawingRules
-from export.skin import stored_nodes
-from export.tables import Tables
+from export.rules import RenderSettings
+from export.skin import stored_skinning_nodes
+from export.tables import PlayerTables
 
-ABOUT_M = 0.05
+NODE_RADIUS_M = 0.05
 """A surfel has a node of the skin no farther away."""
-BAND = 64
+BAND_ROWS = 64
 """Rows that are enlarged at a time."""
 
 
 @final
-class CloseUps:
+class ResolutionLimit:
     """How much of a picture's fineness an avatar's surfels can cover.
 
-    A surfel covers at most `DrawingRules.largest_footprint_px`; nearer by, one would look between
+    A surfel covers at most `RenderSettings.largest_footprint_px`; nearer by, one would look between
     them. There a voxel is dozens of pixels wide: a coarser picture, enlarged, shows as much.
     """
 
-    def __init__(self, tables: Tables, rules: DrawingRules) -> None:
+    def __init__(self, tables: PlayerTables, rules: RenderSettings) -> None:
         """Of what is drawn, and how; nothing is computed before it is needed."""
-        self._skin, self._pelvis, self._reach_m = tables.skin, tables.pelvis, tables.reach_m
-        self._nearest_m, self._largest_px = rules.nearest_m, rules.largest_footprint_px
+        self._skin, self._pelvis, self._reach_m = tables.skinning, tables.pelvis, tables.reach_m
+        self._nearest_m, self._largest_px = rules.near_plane_m, rules.max_footprint_px
         self._footprint_m = tables.surfels.spacing_m * rules.footprint_spacings
 
-    def coarser(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
+    def downscale_factor(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
         """How many times coarser a picture has to be drawn; 1 if surfels cover it as it is.
 
         Args:
@@ -44,53 +44,53 @@ class CloseUps:
         depth = float(bones[0, 2, :3] @ self._pelvis + bones[0, 2, 3])
         if footprint <= most * (depth - self._reach_m):
             return 1.0
-        return max(1.0, footprint / most / self._nearest(bones, camera))
+        return max(1.0, footprint / most / self._nearest_depth_m(bones, camera))
 
-    def _nearest(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
+    def _nearest_depth_m(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
         """Least depth of what may be seen, metres; the nodes of the skin stand for it."""
-        matrices = (self._nodes.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
-        there = np.einsum("nij,nj->ni", matrices[:, :, :3], self._positions) + matrices[:, :, 3]
-        there = there[there[:, 2] > self._nearest_m - ABOUT_M]
+        matrices = (self._node_weights.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
+        there = np.einsum("nij,nj->ni", matrices[:, :, :3], self._node_positions) + matrices[:, :, 3]
+        there = there[there[:, 2] > self._nearest_m - NODE_RADIUS_M]
         depth = np.maximum(there[:, 2], np.float32(self._nearest_m))
         focal, size = np.array(camera.focal_px), np.array(camera.size_px)
         place = there[:, :2] / depth[:, None] * focal + camera.center_px
-        beside = self._largest_px / 2.0 + focal * ABOUT_M / depth[:, None]
+        beside = self._largest_px / 2.0 + focal * NODE_RADIUS_M / depth[:, None]
         seen = ((place > -beside) & (place < size + beside)).all(axis=1)
         return float(depth[seen].min()) if seen.any() else np.inf
 
     @cached_property
-    def _nodes(self) -> Float32[np.ndarray, "24 rows"]:
-        return stored_nodes(self._skin).weights[:, 1:-1]
+    def _node_weights(self) -> Float32[np.ndarray, "24 rows"]:
+        return stored_skinning_nodes(self._skin).weights[:, 1:-1]
 
     @cached_property
-    def _positions(self) -> Float32[np.ndarray, "rows 3"]:
-        return stored_nodes(self._skin).positions[1:-1]
+    def _node_positions(self) -> Float32[np.ndarray, "rows 3"]:
+        return stored_skinning_nodes(self._skin).positions[1:-1]
 
 
-def coarse(camera: Camera, times: float) -> Camera:
+def downscale_camera(camera: Camera, factor: float) -> Camera:
     """The camera of a picture whose pixels are so many times as wide, with the same corner."""
     (fx, fy), (x, y), (width, height) = camera.focal_px, camera.center_px, camera.size_px
     return replace(
         camera,
-        focal_px=(fx / times, fy / times),
-        center_px=(x / times, y / times),
-        size_px=(int(np.ceil(width / times)), int(np.ceil(height / times))),
+        focal_px=(fx / factor, fy / factor),
+        center_px=(x / factor, y / factor),
+        size_px=(int(np.ceil(width / factor)), int(np.ceil(height / factor))),
     )
 
 
-def enlarged(
-    picture: UInt8[np.ndarray, "rows columns 4"], size_px: tuple[int, int], times: float
+def upscale_picture(
+    picture: UInt8[np.ndarray, "rows columns 4"], size_px: tuple[int, int], factor: float
 ) -> UInt8[np.ndarray, "height width 4"]:
     """The inverse of `coarse` for a picture with straight alpha: bilinear, premultiplied."""
     width, height = size_px
     source = picture.astype(np.float32)
     source[..., :3] *= source[..., 3:] / np.float32(255.0)
-    left, right, across = _between(width, source.shape[1], times)
-    upper, lower, along = _between(height, source.shape[0], times)
+    left, right, across = _bilinear_taps(width, source.shape[1], factor)
+    upper, lower, along = _bilinear_taps(height, source.shape[0], factor)
     wide = source[:, left] * (1.0 - across[:, None]) + source[:, right] * across[:, None]
     whole = np.empty((height, width, 4), dtype=np.uint8)
-    for start in range(0, height, BAND):
-        rows = slice(start, start + BAND)
+    for start in range(0, height, BAND_ROWS):
+        rows = slice(start, start + BAND_ROWS)
         share = along[rows, None, None]
         band = wide[upper[rows]] * (1.0 - share) + wide[lower[rows]] * share
         band[..., :3] *= np.float32(255.0) / np.maximum(band[..., 3:], np.float32(1e-3))
@@ -99,7 +99,7 @@ def enlarged(
     return whole
 
 
-def _between(
+def _bilinear_taps(
     length: int, coarse_length: int, times: float
 ) -> tuple[np.ndarray, np.ndarray, Float32[np.ndarray, "length"]]:
     """For each pixel along a side the two coarse ones that it lies between, and how far."""

@@ -2,27 +2,27 @@
 
 from collections.abc import Sequence
 
-from export.nodes import Value
+from export.nodes import GraphValue
 
-Vector = list[Value]
+VectorValue = list[GraphValue]
 """Three values: x, y, z of many vectors."""
-Matrix = list[list[Value]]
+MatrixValue = list[list[GraphValue]]
 """Rows of values: the entries of many matrices."""
 
 
-def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
+def dot(a: Sequence[GraphValue], b: Sequence[GraphValue]) -> GraphValue:
     """Dot product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Vector, b: Vector) -> Vector:
+def cross(a: VectorValue, b: VectorValue) -> VectorValue:
     """Cross product."""
     return [a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3] for k in range(3)]
 
 
-def adjugate(matrix: Matrix) -> Matrix:
+def adjugate(matrix: MatrixValue) -> MatrixValue:
     """The inverse of 3×3 matrices times their determinant."""
-    rows: Matrix = []
+    rows: MatrixValue = []
     for i in range(3):
         row = []
         for j in range(3):
@@ -32,6 +32,6 @@ def adjugate(matrix: Matrix) -> Matrix:
     return rows
 
 
-def taken(vector: Sequence[Value], places: Value) -> Vector:
+def gather_vector(vector: Sequence[GraphValue], places: GraphValue) -> VectorValue:
     """`[component[places] for component in vector]`."""
-    return [component.take(places) for component in vector]
+    return [component.gather(places) for component in vector]

@@ -9,7 +9,7 @@ F32, I32 = np.float32, np.int32
 
 
 @compile_kernel(nogil=True, error_model="numpy")
-def optical_depth_ends(density, low, voxel_m, positions, normals, step, deepest, opaque, share):
+def visible_depth_steps(density, low, voxel_m, positions, normals, step, max_steps, opaque, fraction):
     """Number of steps along each inward normal until all that can be seen has been seen.
 
     Args:
@@ -22,11 +22,11 @@ def optical_depth_ends(density, low, voxel_m, positions, normals, step, deepest,
         share: So much of all there is along the normal is enough, too.
     """
     ends = np.empty(len(positions), dtype=np.int32)
-    along = np.empty(deepest, dtype=np.float32)
+    along = np.empty(max_steps, dtype=np.float32)
     last_i, last_j, last_k = density.shape[0] - 1, density.shape[1] - 1, density.shape[2] - 1
     for p in range(len(positions)):
         total = F32(0)
-        for n in range(deepest):
+        for n in range(max_steps):
             depth = (F32(n) + F32(0.5)) * step
             i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
             j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
@@ -34,18 +34,18 @@ def optical_depth_ends(density, low, voxel_m, positions, normals, step, deepest,
             i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
             total += density[i, j, k] * step
             along[n] = total
-        enough = min(F32(opaque), F32(share) * total)
+        enough = min(F32(opaque), F32(fraction) * total)
         seen = 0
-        while seen < deepest and along[seen] < enough:
+        while seen < max_steps and along[seen] < enough:
             seen += 1
         ends[p] = seen
     return ends
 
 
 @compile_kernel(nogil=True, error_model="numpy")
-def mark_reached(reached, low, voxel_m, positions, normals, thickness, margin_m):
+def mark_visible_nodes(visible, low, voxel_m, positions, normals, thickness, margin_m):
     """Marks the nodes from a margin outside of each position as deep as its thickness."""
-    last_i, last_j, last_k = reached.shape[0] - 1, reached.shape[1] - 1, reached.shape[2] - 1
+    last_i, last_j, last_k = visible.shape[0] - 1, visible.shape[1] - 1, visible.shape[2] - 1
     for p in range(len(positions)):
         depth = -margin_m
         while depth <= thickness[p]:
@@ -53,7 +53,7 @@ def mark_reached(reached, low, voxel_m, positions, normals, thickness, margin_m)
             j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
             k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
             i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
-            reached[i, j, k] = True
+            visible[i, j, k] = True
             depth += voxel_m
 
 
@@ -76,20 +76,20 @@ def _mean_colors(visible, rgb, nodes):
         rgb[i, j, k, 2] = np.uint8(np.rint(blue / count))
 
 
-def spread_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
+def dilate_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
     """Gives each empty node beside visible ones their mean colour, in place.
 
-    Between a visible and an empty node colour is interpolated too: black would darken the rim.
+    ResectionResult a visible and an empty node colour is interpolated too: black would darken the rim.
     The border is left alone, and counts as empty.
     """
     inner = np.zeros_like(visible)
     inner[1:-1, 1:-1, 1:-1] = visible[1:-1, 1:-1, 1:-1]
-    beside = grown(inner) & ~inner
+    beside = dilate(inner) & ~inner
     beside[[0, -1]] = beside[:, [0, -1]] = beside[:, :, [0, -1]] = False
     _mean_colors(inner, rgb, np.flatnonzero(beside))
 
 
-def grown(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+def dilate(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """The nodes and all 26 neighbours of each."""
     for axis in range(3):
         out = solid.copy()
@@ -105,8 +105,8 @@ def warm_up() -> None:
     """Compiles these loops, or loads them from disk, before anybody waits for a package."""
     nodes, point = np.zeros((3, 3, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
     low, size = point[0], np.float32(1.0)
-    optical_depth_ends(nodes, low, size, point, point, size, 1, 7.0, 0.999)
-    mark_reached(nodes > 0, low, size, point, point, low[:1], size)
+    visible_depth_steps(nodes, low, size, point, point, size, 1, 7.0, 0.999)
+    mark_visible_nodes(nodes > 0, low, size, point, point, low[:1], size)
     solid = np.zeros((3, 3, 3), dtype=bool)
     solid[1, 1, 1] = True
-    spread_colors(solid, np.zeros((3, 3, 3, 3), dtype=np.uint8))
+    dilate_colors(solid, np.zeros((3, 3, 3, 3), dtype=np.uint8))

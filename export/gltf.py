@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt16
 from scipy.spatial.transform import Rotation
 
-from export.manifest import JOINTS, Manifest
+from export.manifest import JOINT_NAMES, Manifest
 from export.mesh import SkinnedMesh
 from preprocess.kinematics import body_from_rest
 from preprocess.pose import Motion
 
-KINDS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
 """glTF's numbers of the element types."""
-SHAPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Animation:
+class SkeletonAnimation:
     """A motion as the skeleton's nodes take it.
 
     Attributes:
@@ -37,7 +37,7 @@ class Animation:
     @classmethod
     def of(
         cls, motion: Motion, rows: tuple[int, ...], fps: float, pelvis: Float[np.ndarray, "3"]
-    ) -> "Animation":
+    ) -> "SkeletonAnimation":
         """The valid poses of a motion, turned and shifted so that the first one stands in place.
 
         glTF's axes are the body's own (y up, the front towards z); a tracker's world may lie
@@ -60,21 +60,21 @@ class Animation:
         return cls(
             times_s=(np.arange(len(chosen)) / fps).astype(np.float32),
             translations=(pelvis + upright.apply(shifts - shifts[0])).astype(np.float32),
-            rotations=_without_jumps(rotations).astype(np.float32),
+            rotations=_continuous_quaternions(rotations).astype(np.float32),
         )
 
 
-def _without_jumps(quaternions: Float[np.ndarray, "24 poses 4"]) -> Float[np.ndarray, "24 poses 4"]:
+def _continuous_quaternions(quaternions: Float[np.ndarray, "24 poses 4"]) -> Float[np.ndarray, "24 poses 4"]:
     """q and -q are the same rotation; the nearer one to its predecessor is taken."""
     steps = np.sum(quaternions[:, 1:] * quaternions[:, :-1], axis=-1)
     signs = np.cumprod(np.where(steps < 0.0, -1.0, 1.0), axis=1)
     return np.concatenate([quaternions[:, :1], quaternions[:, 1:] * signs[..., None]], axis=1)
 
 
-def glb(mesh: SkinnedMesh, manifest: Manifest, animation: Animation, *, name: str) -> bytes:
+def encode_glb(mesh: SkinnedMesh, manifest: Manifest, animation: SkeletonAnimation, *, name: str) -> bytes:
     """The file's bytes.
 
-    Colours hold the light of the recording, so the material asks for no light of its own
+    AppearanceModel hold the light of the recording, so the material asks for no light of its own
     (KHR_materials_unlit); importers that do not know that see a matt one. The canonical pose is
     the bind pose, and the skeleton rests in it.
 
@@ -84,7 +84,7 @@ def glb(mesh: SkinnedMesh, manifest: Manifest, animation: Animation, *, name: st
         animation: What it does.
         name: Of the avatar.
     """
-    draft = _Draft()
+    draft = _GltfBuffer()
     skin, nodes = _skeleton(draft, mesh, manifest)
     content = {
         "asset": {
@@ -106,9 +106,9 @@ def glb(mesh: SkinnedMesh, manifest: Manifest, animation: Animation, *, name: st
         ],
         "skins": [skin],
         "animations": [_animation(draft, animation)],
-        **draft.described(),
+        **draft.describe(),
     }
-    return _packed(content, bytes(draft.binary))
+    return _pack_glb(content, bytes(draft.binary))
 
 
 FIRST_JOINT = 2
@@ -131,7 +131,7 @@ def _skeleton(
     for joint, parent in enumerate(parents):
         offset = rest[joint] - (rest[parent] if parent >= 0 else 0.0)
         children = [FIRST_JOINT + int(child) for child in np.flatnonzero(parents == joint)]
-        node = {"name": JOINTS[joint], "translation": offset.tolist()}
+        node = {"name": JOINT_NAMES[joint], "translation": offset.tolist()}
         nodes.append({**node, "rotation": bends[joint].tolist(), "children": children})
         if not children:
             del nodes[-1]["children"]
@@ -153,7 +153,7 @@ def _primitive(draft: "_Draft", mesh: SkinnedMesh) -> dict[str, Any]:
         "attributes": {
             "POSITION": vertices(mesh.positions, bounds=True),
             "NORMAL": vertices(mesh.normals),
-            "COLOR_0": vertices(_linear(mesh.colors), normalized=True),
+            "COLOR_0": vertices(_srgb_to_linear(mesh.colors), normalized=True),
             "JOINTS_0": vertices(mesh.joints),
             "WEIGHTS_0": vertices(mesh.weights, normalized=True),
         },
@@ -162,7 +162,7 @@ def _primitive(draft: "_Draft", mesh: SkinnedMesh) -> dict[str, Any]:
     }
 
 
-def _linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
+def _srgb_to_linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
     """sRGB to linear light, which glTF's vertex colours are, and opaque; 16 bits keep the darks."""
     srgb = colors.astype(np.float64) / 255.0
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
@@ -170,7 +170,7 @@ def _linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "ver
     return np.round(opaque * 65535.0).astype(np.uint16)
 
 
-def _animation(draft: "_Draft", animation: Animation) -> dict[str, Any]:
+def _animation(draft: "_Draft", animation: SkeletonAnimation) -> dict[str, Any]:
     times = draft.add(animation.times_s, bounds=True)
     moves = [("translation", 0, animation.translations)]
     moves += [("rotation", joint, turns) for joint, turns in enumerate(animation.rotations)]
@@ -188,7 +188,7 @@ def _animation(draft: "_Draft", animation: Animation) -> dict[str, Any]:
 
 
 @final
-class _Draft:
+class _GltfBuffer:
     """The binary part while it grows, and what describes it."""
 
     def __init__(self) -> None:
@@ -211,9 +211,9 @@ class _Draft:
         self.binary += content + bytes(-len(content) % 4)
         accessor: dict[str, Any] = {
             "bufferView": len(self._views) - 1,
-            "componentType": KINDS[array.dtype.name],
+            "componentType": COMPONENT_TYPES[array.dtype.name],
             "count": len(array),
-            "type": SHAPES[array.shape[1:]],
+            "type": ACCESSOR_TYPES[array.shape[1:]],
         }
         if normalized:
             accessor["normalized"] = True
@@ -224,7 +224,7 @@ class _Draft:
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """What the JSON part says about the binary one."""
         return {
             "buffers": [{"byteLength": len(self.binary)}],
@@ -233,7 +233,7 @@ class _Draft:
         }
 
 
-def _packed(content: dict[str, Any], binary: bytes) -> bytes:
+def _pack_glb(content: dict[str, Any], binary: bytes) -> bytes:
     """glTF's container: a header and two chunks, each padded to four bytes."""
     text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)

@@ -5,28 +5,28 @@ from dataclasses import replace
 import numpy as np
 import onnx
 
-from export.columns import taken
-from export.initialisers import initialisers
-from export.nodes import Graph, Value
+from export.columns import gather_vector
+from export.initialisers import graph_initializers
+from export.nodes import GraphBuilder, GraphValue
 from export.posing import pose_nodes
 from export.raster import (
-    FAR,
-    Splats,
-    Window,
-    hidden_by,
-    keys_behind,
-    limits_at,
+    EMPTY_KEY,
+    SurfelSplats,
+    SplatWindow,
+    hidden_splats,
+    keys_behind_limits,
+    depth_limits,
     nearest_keys,
-    splat,
+    project_surfels,
 )
-from export.rules import DrawingRules
-from export.scene import Scene, View
-from export.shading import Hull, Layer, rays, shade
+from export.rules import RenderSettings
+from export.scene import GraphContext, CameraValues
+from export.shading import PosedProxySurface, DepthLayer, pixel_rays, trace_depth_layer
 from export.surfels import pose_surfels
-from export.tables import Tables
+from export.tables import PlayerTables
 
 
-def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
+def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
     """The graph that draws `tables`.
 
     Inputs: `bones` (24, 12), camera-from-canonical 3×4 matrices in metres; `camera` (4), focal
@@ -34,42 +34,42 @@ def build_graph(tables: Tables, rules: DrawingRules) -> onnx.ModelProto:
     (height × width), int32: red, green, blue and straight alpha, one byte each, red the lowest.
     Its tables stay outside (`initialisers`).
     """
-    graph = Graph()
-    scene = Scene(
+    graph = GraphBuilder()
+    scene = GraphContext(
         graph=graph,
         tables=tables,
-        columns={
-            name: graph.table(name, array) for name, array in initialisers(tables, rules).items()
+        table_values={
+            name: graph.table(name, array) for name, array in graph_initializers(tables, settings).items()
         },
-        rules=rules,
-        view=_view(graph),
+        settings=settings,
+        camera=_camera_inputs(graph),
         samples=graph.input("samples", np.int64, []),
     )
-    graph.output(_picture(scene), "rgba", ["pixels"])
+    graph.output(_draw_picture(scene), "rgba", ["pixels"])
     return graph.model()
 
 
-def _picture(scene: Scene) -> Value:
+def _draw_picture(scene: GraphContext) -> GraphValue:
     graph = scene.graph
     posed = pose_nodes(scene)
-    hull = Hull(surfels=pose_surfels(scene, posed), posed=posed)
-    splats = splat(scene, hull.surfels)
+    hull = PosedProxySurface(surfels=pose_surfels(scene, posed), posed=posed)
+    splats = project_surfels(scene, hull.surfels)
     window = splats.window
     keys = nearest_keys(scene, splats)
-    covered = keys < FAR
-    pixel = graph.range((window.width * window.height).cast(np.int32)).compressed(covered)
-    ray = rays(scene.view, window, pixel)
-    first = shade(scene, hull, keys.take(pixel), ray, None)
-    channels = [*first.color, first.light]
-    if scene.rules.layers > 1:
-        channels = _with_further(scene, hull, splats, pixel, first)
-    return _drawn(scene, window, pixel, channels)
+    covered = keys < EMPTY_KEY
+    pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
+    ray = pixel_rays(scene.camera, window, pixel)
+    first = trace_depth_layer(scene, hull, keys.gather(pixel), ray, None)
+    channels = [*first.color, first.transmittance]
+    if scene.settings.layers > 1:
+        channels = _add_further_layers(scene, hull, splats, pixel, first)
+    return _pack_rgba(scene, window, pixel, channels)
 
 
-def _view(graph: Graph) -> View:
+def _camera_inputs(graph: GraphBuilder) -> CameraValues:
     bones = graph.input("bones", np.float32, [24, 12])
     camera = graph.input("camera", np.float32, [4])
-    return View(
+    return CameraValues(
         bones=bones,
         focal=(camera.row(0), camera.row(1)),
         center=(camera.row(2), camera.row(3)),
@@ -78,60 +78,60 @@ def _view(graph: Graph) -> View:
     )
 
 
-def _with_further(
-    scene: Scene, hull: Hull, splats: Splats, pixel: Value, first: Layer
-) -> list[Value]:
-    """Colour and light after all layers, one entry a ray of the first."""
+def _add_further_layers(
+    scene: GraphContext, hull: PosedProxySurface, splats: SurfelSplats, pixel: GraphValue, first: DepthLayer
+) -> list[GraphValue]:
+    """SrgbColor and light after all layers, one entry a ray of the first."""
     graph, window, hidden = scene.graph, splats.window, None
-    color, light, before = first.color, first.light, first
+    color, light, before = first.color, first.transmittance, first
     number = graph.range(graph.size(pixel).cast(np.int32))
-    for _ in range(1, scene.rules.layers):
-        wanted = before.light > scene.rules.transmitted
-        kept = graph.range(graph.size(number).cast(np.int32)).compressed(wanted)
-        cell = _cells(window, pixel.take(number.take(kept)))
-        depth = (before.enter * before.ray[2]).take(kept) + scene.rules.gap_m
-        limits = limits_at(scene, window, cell, depth)
-        hidden = hidden or hidden_by(scene, hull.posed, hull.surfels, splats, limits)
-        keys = keys_behind(scene, hull.surfels, hidden, limits, cell, before.surfel.take(kept))
-        there = keys < FAR
-        keys, kept = keys.compressed(there), kept.compressed(there)
-        number = number.take(kept)
-        seen_from = Layer(
-            ray=taken(before.ray, kept),
-            surfel=before.surfel.take(kept),
-            canonical=taken(before.canonical, kept),
-            camera=taken(before.camera, kept),
+    for _ in range(1, scene.settings.layers):
+        wanted = before.transmittance > scene.settings.layer_min_transmittance
+        kept = graph.range(graph.size(number).cast(np.int32)).compress(wanted)
+        cell = _window_cells(window, pixel.gather(number.gather(kept)))
+        depth = (before.enter * before.ray[2]).gather(kept) + scene.settings.layer_gap_m
+        limits = depth_limits(scene, window, cell, depth)
+        hidden = hidden or hidden_splats(scene, hull.posed, hull.surfels, splats, limits)
+        keys = keys_behind_limits(scene, hull.surfels, hidden, limits, cell, before.surfel.gather(kept))
+        there = keys < EMPTY_KEY
+        keys, kept = keys.compress(there), kept.compress(there)
+        number = number.gather(kept)
+        seen_from = DepthLayer(
+            ray=gather_vector(before.ray, kept),
+            surfel=before.surfel.gather(kept),
+            canonical_position=gather_vector(before.canonical_position, kept),
+            camera_position=gather_vector(before.camera_position, kept),
             color=before.color,
-            light=before.light.take(kept),
+            transmittance=before.transmittance.gather(kept),
             enter=before.enter,
-            end=before.end.take(kept),
+            end=before.end.gather(kept),
         )
-        layer = shade(scene, hull, keys, seen_from.ray, seen_from)
+        layer = trace_depth_layer(scene, hull, keys, seen_from.ray, seen_from)
         color = [
-            c.scattered(number, behind * seen_from.light, reduction="add")
+            c.scatter(number, behind * seen_from.transmittance, reduction="add")
             for c, behind in zip(color, layer.color, strict=True)
         ]
-        before = replace(layer, light=seen_from.light * layer.light)
-        light = light.scattered(number, before.light)
+        before = replace(layer, transmittance=seen_from.transmittance * layer.transmittance)
+        light = light.scatter(number, before.transmittance)
     return [*color, light]
 
 
-def _cells(window: Window, pixel: Value) -> Value:
-    """Cells of the buffer in which pixels of the window lie."""
+def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
+    """SolvedCorrespondences of the buffer in which pixels of the window lie."""
     width, stride = window.width.cast(np.int32), window.stride.cast(np.int32)
     row = pixel // width
     border = window.border.cast(np.int32)
     return (row + border) * stride + (pixel - row * width + border)
 
 
-def _drawn(scene: Scene, window: Window, pixel: Value, channels: list[Value]) -> Value:
+def _pack_rgba(scene: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]) -> GraphValue:
     """The whole picture, eight bits a channel, straight alpha: colour is divided by alpha."""
-    graph, view = scene.graph, scene.view
+    graph, view = scene.graph, scene.camera
     *color, light = channels
     alpha = 1.0 - light
     inverse = 255.0 / alpha.maximum(1e-6)
     bytes_ = [
-        (value + 0.5).clipped(0.0, 255.0).cast(np.int32)
+        (value + 0.5).clip(0.0, 255.0).cast(np.int32)
         for value in [*(channel * inverse for channel in color), alpha * 255.0]
     ]
     red, green, blue, alpha = bytes_
@@ -141,5 +141,5 @@ def _drawn(scene: Scene, window: Window, pixel: Value, channels: list[Value]) ->
     row = pixel // width
     column = pixel - row * width + window.left.cast(np.int32)
     place = (row + window.top.cast(np.int32)) * view.width.cast(np.int32) + column
-    empty = graph.filled(graph.shape(view.pixels), np.int32(0))
-    return empty.scattered(place, packed)
+    empty = graph.full(graph.shape(view.num_pixels), np.int32(0))
+    return empty.scatter(place, packed)

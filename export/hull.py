@@ -6,27 +6,27 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 from scipy import ndimage
 
-from export.compiled import optical_depth_ends
-from export.isosurface import resampled
-from export.lattice import Lattice
+from export.compiled import visible_depth_steps
+from export.isosurface import resample_grid
+from export.lattice import FieldGrid
 
-CONTRAST = 16.0
+DENSITY_CONTRAST = 16.0
 """Densities beyond this factor from the level count as the factor: emptiness has no log."""
 SMOOTHING_M = 0.004
 """Deviation of the blur before the level is taken: a trained field is never quite smooth."""
-SMALLEST_PART = 0.0002
+MIN_PART_FRACTION = 0.0002
 """Parts of less volume than this share of the largest are floaters. At ten times as much a foot
 that a few photographs left in pieces was gone."""
-OPAQUE = 7.0
+OPAQUE_OPTICAL_DEPTH = 7.0
 """Optical depth behind which nothing is seen (0.1 %)."""
-MARGIN_M = 0.004
+THICKNESS_MARGIN_M = 0.004
 """Added to the thickness, for what lies deeper beside the normal than along it."""
-DEEPEST_M = 0.1
+MAX_THICKNESS_M = 0.1
 """Nothing is looked for deeper than this under the hull."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Hull:
+class ProxySurface:
     """A person's hull in canonical space.
 
     Attributes:
@@ -42,7 +42,7 @@ class Hull:
     thickness: Float32[np.ndarray, "surfels"]
 
 
-def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
+def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) -> ProxySurface:
     """The outer level set of the blurred log-density, without floaters and hollows.
 
     Args:
@@ -51,50 +51,50 @@ def find_hull(lattice: Lattice, *, level: float, spacing_m: float) -> Hull:
             cuts into what is seen.
         spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
     """
-    logs = resampled(_log_density(lattice, level), spacing_m / lattice.voxel_m)
+    logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
-    inside = _largest_parts(logs > 0.0)
+    inside = _remove_floaters_and_cavities(logs > 0.0)
     nothing = np.float32(1e-3)
     logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
     slope = ndimage.gaussian_filter(logs, 1.0, truncate=3.0)
-    nodes, normals = _crossings(logs, slope)
-    positions = (lattice.low + nodes * spacing_m).astype(np.float32)
-    return Hull(
+    nodes, normals = _zero_crossings(logs, slope)
+    positions = (grid.low + nodes * spacing_m).astype(np.float32)
+    return ProxySurface(
         spacing_m=spacing_m,
         positions=positions,
         normals=normals,
-        thickness=_thickness(lattice, positions, normals),
+        thickness=_visible_thickness(grid, positions, normals),
     )
 
 
-def _log_density(lattice: Lattice, level: float) -> Float32[np.ndarray, "x y z"]:
+def _log_density(lattice: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
     """Logarithm of the density over the level, within `CONTRAST`; most nodes are empty."""
-    logs = np.full(lattice.density.shape, -np.log(CONTRAST), dtype=np.float32)
-    places = np.flatnonzero(lattice.density > np.float32(level / CONTRAST))
+    logs = np.full(lattice.density.shape, -np.log(DENSITY_CONTRAST), dtype=np.float32)
+    places = np.flatnonzero(lattice.density > np.float32(level / DENSITY_CONTRAST))
     dense = lattice.density.ravel()[places] / np.float32(level)
-    logs.ravel()[places] = np.log(np.clip(dense, 1.0 / CONTRAST, CONTRAST))
+    logs.ravel()[places] = np.log(np.clip(dense, 1.0 / DENSITY_CONTRAST, DENSITY_CONTRAST))
     return logs
 
 
-def _largest_parts(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+def _remove_floaters_and_cavities(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Solid without floaters, and with what it encloses."""
-    parts = _labelled(solid)
+    parts = _label_components(solid)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = sizes >= SMALLEST_PART * sizes.max()
-    outside = _labelled(~kept[parts])
+    kept = sizes >= MIN_PART_FRACTION * sizes.max()
+    outside = _label_components(~kept[parts])
     return outside != outside[0, 0, 0]
 
 
-def _labelled(mask: Bool[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
+def _label_components(mask: Bool[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
     """The number of each connected part; 0 outside of the mask."""
     parts = np.zeros(mask.shape, dtype=np.int32)
     ndimage.label(mask, output=parts)
     return parts
 
 
-def _crossings(
-    logs: Float32[np.ndarray, "x y z"], slope: Float32[np.ndarray, "x y z"]
+def _zero_crossings(
+    logs: Float32[np.ndarray, "x y z"], smoothed: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
     """Where lattice edges cross zero (marching cubes' vertices), in nodes, and the unit normals.
 
@@ -108,13 +108,13 @@ def _crossings(
         start = np.argwhere((logs[here] > 0) != (logs[there] > 0)) + 1
         low, high = logs[tuple(start.T)], logs[tuple((start + along).T)]
         share = (low / (low - high))[:, None]
-        normal = _gradient(slope, start) * (1 - share) + _gradient(slope, start + along) * share
+        normal = _central_differences(smoothed, start) * (1 - share) + _central_differences(smoothed, start + along) * share
         nodes.append(start + along * share)
         normals.append(-normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))
     return np.concatenate(nodes).astype(np.float32), np.concatenate(normals).astype(np.float32)
 
 
-def _gradient(
+def _central_differences(
     values: Float32[np.ndarray, "x y z"], nodes: Int[np.ndarray, "nodes 3"]
 ) -> Float32[np.ndarray, "nodes 3"]:
     """Central differences at nodes that are not on the border, per two nodes."""
@@ -126,19 +126,19 @@ def _gradient(
     return np.stack(parts, axis=1)
 
 
-def _thickness(
-    lattice: Lattice,
+def _visible_thickness(
+    lattice: FieldGrid,
     positions: Float32[np.ndarray, "surfels 3"],
     normals: Float32[np.ndarray, "surfels 3"],
 ) -> Float32[np.ndarray, "surfels"]:
     """Depth along the normal at which all that can be seen has been seen.
 
-    That is where the optical depth reaches `OPAQUE`, or 99.9 % of all there is within
+    That is where the optical depth reaches `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of all there is within
     `DEEPEST_M`; and `MARGIN_M`.
     """
     step = np.float32(0.5 * lattice.voxel_m)
-    ends = optical_depth_ends(
+    ends = visible_depth_steps(
         lattice.density, lattice.low, np.float32(lattice.voxel_m), positions, normals, step,
-        int(DEEPEST_M / step), OPAQUE, 0.999,
+        int(MAX_THICKNESS_M / step), OPAQUE_OPTICAL_DEPTH, 0.999,
     )  # fmt: skip
-    return ((ends + 1) * step + MARGIN_M).astype(np.float32)
+    return ((ends + 1) * step + THICKNESS_MARGIN_M).astype(np.float32)

@@ -3,21 +3,21 @@
 import numpy as np
 from jaxtyping import Shaped
 
-from export.rules import DrawingRules
-from export.skin import nodes_of
-from export.tables import NODES, Tables
+from export.rules import RenderSettings
+from export.skin import skinning_nodes
+from export.tables import BRICK_NODES, PlayerTables
 
 
-def initialisers(tables: Tables, rules: DrawingRules) -> dict[str, Shaped[np.ndarray, "..."]]:
+def graph_initializers(tables: PlayerTables, rules: RenderSettings) -> dict[str, Shaped[np.ndarray, "..."]]:
     """Every table of the graph that draws by these rules, by its name."""
     surfels, bricks = tables.surfels, tables.bricks
-    nodes = nodes_of(tables.skin, rules.nodes_per_step)
+    nodes = skinning_nodes(tables.skinning, rules.skinning_subdivision)
     voxels = bricks.voxels.reshape(-1, 4)
     red, green, blue = (voxels[:, channel].astype(np.int32) for channel in range(3))
     columns = {
         "voxel_color": red | green << 8 | blue << 16,
         "voxel_density": np.ascontiguousarray(voxels[:, 3]),
-        "brick_offset": bricks.index.ravel() * np.int32(NODES**3),
+        "brick_offset": bricks.index.ravel() * np.int32(BRICK_NODES**3),
         "node": nodes.index.ravel(),
         "node_weights": nodes.weights,
         "thickness": surfels.thickness,

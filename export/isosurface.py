@@ -7,7 +7,7 @@ CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 AXES = np.eye(3, dtype=np.int64)
 
 
-def isosurface(
+def extract_isosurface(
     values: Float32[np.ndarray, "x y z"],
 ) -> tuple[Float32[np.ndarray, "vertices 3"], Int32[np.ndarray, "faces 3"]]:
     """Vertices in nodes of the lattice, and triangles that face from positive to negative.
@@ -28,7 +28,7 @@ def isosurface(
     return vertices, _triangles(vertices, np.concatenate(quads))
 
 
-def resampled(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
+def resample_grid(values: Float32[np.ndarray, "x y z"], step: float) -> Float32[np.ndarray, "x2 y2 z2"]:
     """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
     for axis in range(3):
         places = np.arange(0.0, values.shape[axis] - 1, step)

@@ -8,21 +8,21 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 
 from avatar.rig import Rig
-from export.compiled import spread_colors
-from export.tables import BRICK, LOG_DENSITY
+from export.compiled import dilate_colors
+from export.tables import BRICK_SIZE, LOG_DENSITY_RANGE
 
-FieldAt = Callable[
+FieldFunction = Callable[
     [Float32[torch.Tensor, "points 3"]],
     tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
 ]
 """Canonical points to colour in [0, 1] and density in 1/m."""
-CHUNK = 1 << 18
+CHUNK_POINTS = 1 << 18
 """Points that the field is asked for at a time."""
-FAINTEST = float(np.exp(LOG_DENSITY[0]))
+MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Lattice:
+class FieldGrid:
     """Density and colour on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
 
     Attributes:
@@ -38,22 +38,22 @@ class Lattice:
     rgb: UInt8[np.ndarray, "x y z 3"]
 
 
-def read_field(
-    field_at: FieldAt, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
-) -> Lattice:
+def sample_field_grid(
+    field_at: FieldFunction, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
+) -> FieldGrid:
     """Asks the field at every node inside an occupied cell; the others are empty.
 
     Args:
         field_at: The field.
         rig: Whose box the cells divide.
-        occupied: Cells of the box that are not empty, as in `rig.distance`.
+        occupied: SolvedCorrespondences of the box that are not empty, as in `rig.distance`.
         voxel_m: Distance between nodes.
     """
-    first, last = _bounds(occupied)
+    first, last = _occupied_bounds(occupied)
     cell = (rig.box_high - rig.box_low) / occupied.shape
     low = (rig.box_low + (first - 1) * cell).astype(np.float32)
     extent = (last - first + 3) * cell
-    counts = np.ceil(extent / (voxel_m * BRICK)).astype(int) * BRICK + 1
+    counts = np.ceil(extent / (voxel_m * BRICK_SIZE)).astype(int) * BRICK_SIZE + 1
     density = np.zeros(counts, dtype=np.float32)
     rgb = np.zeros((*counts, 3), dtype=np.uint8)
     for nodes in _occupied_nodes(occupied, (low - rig.box_low) / cell, voxel_m / cell, counts):
@@ -64,11 +64,11 @@ def read_field(
         place = (i * counts[1] + j) * counts[2] + k
         density.ravel()[place] = densities.numpy()
         rgb.reshape(-1, 3)[place] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
-    spread_colors(density > FAINTEST, rgb)
-    return Lattice(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
+    dilate_colors(density > MIN_DENSITY, rgb)
+    return FieldGrid(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
 
 
-def _bounds(
+def _occupied_bounds(
     occupied: UInt8[np.ndarray, "cx cy cz"],
 ) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
     axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
@@ -81,7 +81,7 @@ def _occupied_nodes(
     step: Float[np.ndarray, "3"],
     counts: Int[np.ndarray, "3"],
 ) -> Iterator[Int[np.ndarray, "nodes 3"]]:
-    """Lattice nodes inside occupied cells, some 10⁵ at a time."""
+    """FieldGrid nodes inside occupied cells, some 10⁵ at a time."""
     padded = np.pad(occupied, 1)
     cells = [
         np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)
@@ -91,7 +91,7 @@ def _occupied_nodes(
     for i, cell in enumerate(cells[0]):
         j, k = np.nonzero(padded[cell][np.ix_(cells[1], cells[2])])
         waiting.append(np.stack([np.full_like(j, i), j, k], axis=1))
-        if sum(len(nodes) for nodes in waiting) > CHUNK or i == counts[0] - 1:
+        if sum(len(nodes) for nodes in waiting) > CHUNK_POINTS or i == counts[0] - 1:
             nodes = np.concatenate(waiting)
-            yield from (nodes[start : start + CHUNK] for start in range(0, len(nodes), CHUNK))
+            yield from (nodes[start : start + CHUNK_POINTS] for start in range(0, len(nodes), CHUNK_POINTS))
             waiting = []

@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from export.codec import Layout
-from export.rules import DrawingRules
+from capture.errors import InputError
+from export.codec import TableLayout
+from export.rules import RenderSettings
 from preprocess.pose import BodyPose
 
-FORMAT = 3
-LATER = {"sheet_gap_m", "squash_limit", "fold_volume", "fold_setback_m"}
+FORMAT_VERSION = 3
+OPTIONAL_SETTINGS = {"other_sheet_gap_m", "max_compression", "fold_volume_ratio", "fold_depth_offset_m"}
 """What the first packages of this format do not have: then it is as it always was."""
-GOLDEN_PX = 128
+MAX_GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""
-JOINTS = (
+JOINT_NAMES = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee"),
     *("spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot"),
     *("neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
@@ -32,7 +32,7 @@ CONVENTIONS = {
     "pose": "world = R(root_rotation) (x - J0) + J0 + root_translation; axis-angle joint rotations",
     "picture": "RGBA, 8 bits, straight alpha",
 }
-LICENCE = (
+LICENCE_NOTE = (
     "A likeness of a person: use it only as that person allows. It is neither the body model's "
     "data nor code; the rights in it are those of the recording it was learnt from."
 )
@@ -40,18 +40,18 @@ Record = TypeVar("Record")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TierNote:
+class TierInfo:
     """One quality of the player.
 
     Attributes:
         layout: Sizes and scales of what it draws; that of "hq" says how the streams are read.
         rules: How it is drawn.
         psnr_to_renderer: Against the volume renderer, dB.
-        largest_difference: Between graph and twin, in 1/255, over the golden frames.
+        largest_difference: ResectionResult graph and twin, in 1/255, over the golden frames.
     """
 
-    layout: Layout
-    rules: DrawingRules
+    layout: TableLayout
+    settings: RenderSettings
     psnr_to_renderer: float
     largest_difference: float
 
@@ -82,24 +82,24 @@ class Manifest:
     rest_joints: Float[np.ndarray, "24 3"]
     parents: Int[np.ndarray, "24"]
     canonical_rotations: Float[np.ndarray, "23 3"]
-    tiers: dict[str, TierNote]
+    tiers: dict[str, TierInfo]
     golden: tuple[GoldenFrame, ...]
     metrics: dict[str, Any]
-    licence: str = LICENCE
+    licence: str = LICENCE_NOTE
     sha256: dict[str, str]
 
     def to_json(self) -> str:
         """The text of manifest.json."""
         content = {
-            "format": FORMAT,
+            "format": FORMAT_VERSION,
             **CONVENTIONS,
-            "joints": JOINTS,
+            "joints": JOINT_NAMES,
             "parents": self.parents.tolist(),
             "rest_joints": self.rest_joints.tolist(),
             "canonical_rotations": self.canonical_rotations.tolist(),
             "tiers": {name: asdict(tier) for name, tier in self.tiers.items()},
-            "golden": [_golden_to_json(frame) for frame in self.golden],
-            "metrics": _finite(self.metrics),
+            "golden": [_golden_frame_to_json(frame) for frame in self.golden],
+            "metrics": _without_nan(self.metrics),
             "licence": self.licence,
             "sha256": self.sha256,
         }
@@ -110,62 +110,62 @@ class Manifest:
         """Reads manifest.json.
 
         Raises:
-            BadInput: If it is none, or of another format, or something in it cannot be.
+            InputError: If it is none, or of another format, or something in it cannot be.
         """
-        content = _parsed(text)
+        content = _parse_json(text)
         try:
             return cls(
-                rest_joints=_numbers(content["rest_joints"], (24, 3)),
-                parents=_tree(content["parents"]),
-                canonical_rotations=_numbers(content["canonical_rotations"], (23, 3)),
-                tiers=_tiers(content["tiers"]),
-                golden=tuple(_golden(frame) for frame in content["golden"]),
+                rest_joints=_parse_array(content["rest_joints"], (24, 3)),
+                parents=_parse_parents(content["parents"]),
+                canonical_rotations=_parse_array(content["canonical_rotations"], (23, 3)),
+                tiers=_parse_tiers(content["tiers"]),
+                golden=tuple(_parse_golden_frame(frame) for frame in content["golden"]),
                 metrics=dict(content["metrics"]),
                 licence=str(content["licence"]),
                 sha256={str(name): str(sum_) for name, sum_ in content["sha256"].items()},
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            if isinstance(error, BadInput):
+            if isinstance(error, InputError):
                 raise
             what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            raise BadInput(
+            raise InputError(
                 f"The package's manifest is damaged: {what}. Copy or export it again."
             ) from error
 
 
-def _finite(value: Any) -> Any:
+def _without_nan(value: Any) -> Any:
     """JSON knows no NaN and no infinity: they become null."""
     if isinstance(value, dict):
-        return {str(key): _finite(part) for key, part in value.items()}
+        return {str(key): _without_nan(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
+        return [_without_nan(part) for part in value]
     return None if isinstance(value, float) and not isfinite(value) else value
 
 
-def _parsed(text: bytes) -> dict[str, Any]:
+def _parse_json(text: bytes) -> dict[str, Any]:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise BadInput("The package's manifest is no JSON; the file is damaged.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError("The package's manifest is no JSON; the file is damaged.") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT_VERSION:
         found = content.get("format") if isinstance(content, dict) else None
-        newer = isinstance(found, int) and found > FORMAT
-        raise BadInput(
-            f"The package has format {found!r}; this version reads format {FORMAT}. "
+        newer = isinstance(found, int) and found > FORMAT_VERSION
+        raise InputError(
+            f"The package has format {found!r}; this version reads format {FORMAT_VERSION}. "
             + ("Update instant-avatar-stream, " if newer else "Export the avatar again, ")
             + "or use the version that wrote it."
         )
     return content
 
 
-def _numbers(values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def _parse_array(values: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"expected finite numbers of shape {shape}, found {array.shape}")
     return array
 
 
-def _tree(values: Any) -> Int[np.ndarray, "24"]:
+def _parse_parents(values: Any) -> Int[np.ndarray, "24"]:
     parents = np.asarray(values)
     known = parents.shape == (24,) and parents.dtype.kind == "i" and parents[0] == -1
     if not (known and all(0 <= parents[j] < j for j in range(1, 24))):
@@ -173,48 +173,48 @@ def _tree(values: Any) -> Int[np.ndarray, "24"]:
     return parents
 
 
-def _tiers(content: dict[str, Any]) -> dict[str, TierNote]:
-    tiers = {str(name): _tier(note) for name, note in content.items()}
+def _parse_tiers(content: dict[str, Any]) -> dict[str, TierInfo]:
+    tiers = {str(name): _parse_tier(note) for name, note in content.items()}
     if "hq" not in tiers:
         raise ValueError(f'there is no tier "hq", only {", ".join(tiers)}')
     return tiers
 
 
-def _tier(note: dict[str, Any]) -> TierNote:
-    layout = _record(Layout, note["layout"])
+def _parse_tier(note: dict[str, Any]) -> TierInfo:
+    layout = _parse_record(TableLayout, note["layout"])
     layout.check()
-    return TierNote(
+    return TierInfo(
         layout=layout,
-        rules=_record(DrawingRules, note["rules"]),
+        settings=_parse_record(RenderSettings, note["settings"]),
         psnr_to_renderer=float(note["psnr_to_renderer"]),
         largest_difference=float(note["largest_difference"]),
     )
 
 
-def _record(kind: type[Record], values: dict[str, Any]) -> Record:
+def _parse_record(kind: type[Record], values: dict[str, Any]) -> Record:
     """A record of numbers and of tuples of three numbers."""
     content: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
-        if field.name in LATER and field.name not in values:
+        if field.name in OPTIONAL_SETTINGS and field.name not in values:
             continue
         value, whole = values[field.name], "int" in str(field.type)
         if "tuple" in str(field.type):
-            content[field.name] = tuple(_number(v, whole) for v in value)
+            content[field.name] = tuple(_parse_number(v, whole) for v in value)
             if len(value) != 3:
                 raise ValueError(f"{field.name} must be three numbers")
         else:
-            content[field.name] = _number(value, whole)
+            content[field.name] = _parse_number(value, whole)
     return kind(**content)
 
 
-def _number(value: Any, whole: bool) -> float | int:
+def _parse_number(value: Any, whole: bool) -> float | int:
     number = int(value) if whole else float(value)
     if number != value or not np.isfinite(number):
         raise ValueError(f"{value!r} is not a usable number")
     return number
 
 
-def _golden_to_json(frame: GoldenFrame) -> dict[str, Any]:
+def _golden_frame_to_json(frame: GoldenFrame) -> dict[str, Any]:
     pose, camera = frame.pose, frame.camera
     return {
         "root_rotation": pose.root_rotation.tolist(),
@@ -227,21 +227,21 @@ def _golden_to_json(frame: GoldenFrame) -> dict[str, Any]:
     }
 
 
-def _golden(content: dict[str, Any]) -> GoldenFrame:
+def _parse_golden_frame(content: dict[str, Any]) -> GoldenFrame:
     width, height = (int(size) for size in content["size_px"])
-    if not (0 < width <= GOLDEN_PX and 0 < height <= GOLDEN_PX):
-        raise ValueError(f"golden frames are at most {GOLDEN_PX} px, not {width}x{height}")
-    focal, center = _numbers(content["focal_px"], (2,)), _numbers(content["center_px"], (2,))
+    if not (0 < width <= MAX_GOLDEN_PX and 0 < height <= MAX_GOLDEN_PX):
+        raise ValueError(f"golden frames are at most {MAX_GOLDEN_PX} px, not {width}x{height}")
+    focal, center = _parse_array(content["focal_px"], (2,)), _parse_array(content["center_px"], (2,))
     return GoldenFrame(
         pose=BodyPose(
-            root_rotation=_numbers(content["root_rotation"], (3,)),
-            root_translation=_numbers(content["root_translation"], (3,)),
-            joint_rotations=_numbers(content["joint_rotations"], (23, 3)),
+            root_rotation=_parse_array(content["root_rotation"], (3,)),
+            root_translation=_parse_array(content["root_translation"], (3,)),
+            joint_rotations=_parse_array(content["joint_rotations"], (23, 3)),
         ),
         camera=Camera(
             focal_px=(float(focal[0]), float(focal[1])),
             center_px=(float(center[0]), float(center[1])),
             size_px=(width, height),
-            camera_from_world=_numbers(content["camera_from_world"], (4, 4)),
+            camera_from_world=_parse_array(content["camera_from_world"], (4, 4)),
         ),
     )

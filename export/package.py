@@ -12,21 +12,21 @@ from typing import Any, BinaryIO, final
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.atomic_files import Draft
-from capture.errors import BadInput
-from export.codec import Layout, decode, encode
+from capture.atomic_files import AtomicFile
+from capture.errors import InputError
+from export.codec import TableLayout, decode_tables, encode_tables
 from export.manifest import Manifest
-from export.tables import Tables
+from export.tables import PlayerTables
 
-MANIFEST, PREVIEW = "manifest.json", "preview.png"
-MOST_ENTRIES = 64
-LARGEST_TEXT = 4 << 20
+MANIFEST_ENTRY, PREVIEW_ENTRY = "manifest.json", "preview.png"
+MAX_ENTRIES = 64
+MAX_TEXT_BYTES = 4 << 20
 """Bytes of a manifest, a graph or a preview."""
-LARGEST_FILE = 256 << 20
-LARGEST_DIRECTORY = 1 << 17
+MAX_FILE_BYTES = 256 << 20
+MAX_DIRECTORY_BYTES = 1 << 17
 """Bytes of the zip's list of entries, which would be read before they can be counted."""
-KNOWN_TYPES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-EPOCH = (1980, 1, 1, 0, 0, 0)
+ALLOWED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
 """Time stamp of every entry: the same avatar is always the same bytes."""
 
 
@@ -44,7 +44,7 @@ class AvatarPackage:
 
     manifest: Manifest
     graphs: Mapping[str, bytes]
-    tables: Mapping[str, Tables]
+    tables: Mapping[str, PlayerTables]
     golden: tuple[UInt8[np.ndarray, "_ _ 4"], ...]
     preview: bytes
 
@@ -73,13 +73,13 @@ def write_package(package: AvatarPackage, path: Path) -> int:
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
-    with PackageDraft(path) as draft:
+    with PackageWriter(path) as draft:
         draft.add_tables(package.tables["hq"])
         return draft.finish(package)
 
 
 @final
-class PackageDraft:
+class PackageWriter:
     """A package under a temporary name, which it loses unless it is finished.
 
     The tables can go in, and be compressed, while what is drawn of them is still being checked.
@@ -94,20 +94,20 @@ class PackageDraft:
         self._path = path
         self._sums: dict[str, str] = {}
 
-    def __enter__(self) -> "PackageDraft":
+    def __enter__(self) -> "PackageWriter":
         """Opens the temporary file.
 
         Raises:
             OSError: If the folder cannot be written.
         """
-        self._draft = Draft(self._path)
+        self._draft = AtomicFile(self._path)
         self._file = self._draft.part.open("wb")
         self._archive = zipfile.ZipFile(self._file, "w")
         return self
 
-    def add_tables(self, tables: Tables) -> None:
+    def add_tables(self, tables: PlayerTables) -> None:
         """Adds what all tiers draw."""
-        for name, stream in encode(tables).items():
+        for name, stream in encode_tables(tables).items():
             self._add(stream_entry(name), stream)
 
     def finish(self, package: AvatarPackage) -> int:
@@ -121,15 +121,15 @@ class PackageDraft:
         """
         for tier, graph in package.graphs.items():
             self._add(graph_entry(tier), graph)
-        self._add(PREVIEW, package.preview)
+        self._add(PREVIEW_ENTRY, package.preview)
         for number, frame in enumerate(package.golden):
             self._add(golden_entry(number), frame.tobytes())
         manifest = replace(package.manifest, sha256=dict(self._sums))
-        self._add(MANIFEST, manifest.to_json().encode())
+        self._add(MANIFEST_ENTRY, manifest.to_json().encode())
         self._archive.close()
         size = self._file.tell()
         self._file.close()
-        self._draft.finish()
+        self._draft.commit()
         return size
 
     def __exit__(self, *_: object) -> None:
@@ -142,7 +142,7 @@ class PackageDraft:
 
     def _add(self, name: str, content: bytes) -> None:
         self._sums[name] = hashlib.sha256(content).hexdigest()
-        info = zipfile.ZipInfo(name, EPOCH)
+        info = zipfile.ZipInfo(name, ENTRY_TIMESTAMP)
         self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
 
 
@@ -154,27 +154,27 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
         tier: The one that is wanted; all if None.
 
     Raises:
-        BadInput: If the file is missing, truncated, altered, or no package, or has no such tier.
+        InputError: If the file is missing, truncated, altered, or no package, or has no such tier.
     """
     try:
         if path.exists() and not path.is_file():  # a folder; a pipe would never end
-            raise BadInput(_no_file(path))
+            raise InputError(_not_a_file_message(path))
         with path.open("rb") as file:
-            if (size := path.stat().st_size) > LARGEST_FILE:
-                raise BadInput(f"{path} has {size >> 20} MB; no package has. Refused.")
-            bounded = _Bounded(file, LARGEST_DIRECTORY)
+            if (size := path.stat().st_size) > MAX_FILE_BYTES:
+                raise InputError(f"{path} has {size >> 20} MB; no package has. Refused.")
+            bounded = _BoundedFile(file, MAX_DIRECTORY_BYTES)
             with zipfile.ZipFile(bounded) as archive:  # type: ignore[arg-type] - reads and seeks
-                bounded.most = None
-                return _read(_Archive(archive, path), tier)
+                bounded.max_read_bytes = None
+                return _read_archive(_UntrustedArchive(archive, path), tier)
     except FileNotFoundError:
-        raise BadInput(f"There is no package {path}. Make one with ia-ingest.") from None
+        raise InputError(f"There is no package {path}. Make one with ia-ingest.") from None
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as error:
-        raise BadInput(
+        raise InputError(
             f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
         ) from error
 
 
-def _no_file(path: Path) -> str:
+def _not_a_file_message(path: Path) -> str:
     found = sorted(path.glob("*.iavatar")) if path.is_dir() else []
     if found:
         return f"{path} is a folder; the package in it is {found[0]}. Give that."
@@ -183,11 +183,11 @@ def _no_file(path: Path) -> str:
 
 
 @final
-class _Bounded:
+class _BoundedFile:
     """A file of which no more than so many bytes are read at a time."""
 
     def __init__(self, file: BinaryIO, most: int | None) -> None:
-        self._file, self.most = file, most
+        self._file, self.max_read_bytes = file, most
 
     def read(self, size: int = -1) -> bytes:
         """As of a file.
@@ -195,9 +195,9 @@ class _Bounded:
         Raises:
             zipfile.BadZipFile: If more is asked for.
         """
-        if self.most is not None and not 0 <= size <= self.most:
-            content = self._file.read(self.most + 1)
-            if len(content) > self.most:
+        if self.max_read_bytes is not None and not 0 <= size <= self.max_read_bytes:
+            content = self._file.read(self.max_read_bytes + 1)
+            if len(content) > self.max_read_bytes:
                 raise zipfile.BadZipFile("its list of entries is longer than any package's")
             return content
         return self._file.read(size)
@@ -206,66 +206,66 @@ class _Bounded:
         return getattr(self._file, name)
 
 
-class _Archive:
+class _UntrustedArchive:
     """A zip that is not trusted."""
 
     def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
         infos = archive.infolist()
         names = [info.filename for info in infos]
-        if len(names) > MOST_ENTRIES or len(set(names)) < len(names) or MANIFEST not in names:
-            raise BadInput(
-                f"{path} is no avatar package: it must hold {MANIFEST} and at most "
-                f"{MOST_ENTRIES} entries, none of them twice. It holds {len(names)}."
+        if len(names) > MAX_ENTRIES or len(set(names)) < len(names) or MANIFEST_ENTRY not in names:
+            raise InputError(
+                f"{path} is no avatar package: it must hold {MANIFEST_ENTRY} and at most "
+                f"{MAX_ENTRIES} entries, none of them twice. It holds {len(names)}."
             )
         for name in names:
             parts = PurePosixPath(name).parts
             if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
-                raise BadInput(f"{path} holds {name!r}, a path outside of the package. Refused.")
+                raise InputError(f"{path} holds {name!r}, a path outside of the package. Refused.")
         for info in infos:
-            if info.flag_bits & 1 or info.compress_type not in KNOWN_TYPES:
-                raise BadInput(
+            if info.flag_bits & 1 or info.compress_type not in ALLOWED_COMPRESSION:
+                raise InputError(
                     f"{path}: {info.filename} is encrypted or compressed in a way that packages "
                     "are not. Refused."
                 )
         self._archive, self.path = archive, path
         self._sizes = {info.filename: info.file_size for info in infos}
 
-    def read(self, name: str, *, most: int, exactly: int | None = None) -> bytes:
+    def read(self, name: str, *, max_bytes: int, exact_bytes: int | None = None) -> bytes:
         """One entry; its size is known to be right before a byte of it is unpacked."""
         size = self._sizes.get(name)
         if size is None:
-            raise BadInput(f"{self.path} is incomplete: {name} is missing. Export it again.")
-        if size > most or (exactly is not None and size != exactly):
-            wanted = f"{exactly} bytes" if exactly is not None else f"at most {most} bytes"
-            raise BadInput(f"{self.path}: {name} claims {size} bytes, expected {wanted}. Refused.")
+            raise InputError(f"{self.path} is incomplete: {name} is missing. Export it again.")
+        if size > max_bytes or (exact_bytes is not None and size != exact_bytes):
+            wanted = f"{exact_bytes} bytes" if exact_bytes is not None else f"at most {max_bytes} bytes"
+            raise InputError(f"{self.path}: {name} claims {size} bytes, expected {wanted}. Refused.")
         with self._archive.open(name) as file:
             content = file.read(size + 1)
         if len(content) != size:
-            raise BadInput(f"{self.path}: {name} does not hold the {size} bytes that it claims.")
+            raise InputError(f"{self.path}: {name} does not hold the {size} bytes that it claims.")
         return content
 
 
-def _read(archive: _Archive, tier: str | None) -> AvatarPackage:
+def _read_archive(archive: _UntrustedArchive, tier: str | None) -> AvatarPackage:
     try:
-        manifest = Manifest.from_json(archive.read(MANIFEST, most=LARGEST_TEXT))
-    except BadInput as error:
-        raise BadInput(f"{archive.path}: {error}") from error
+        manifest = Manifest.from_json(archive.read(MANIFEST_ENTRY, max_bytes=MAX_TEXT_BYTES))
+    except InputError as error:
+        raise InputError(f"{archive.path}: {error}") from error
     if tier is not None and tier not in manifest.tiers:
         known = ", ".join(sorted(manifest.tiers))
-        raise BadInput(f"{archive.path} has no tier {tier!r}; it has: {known}.")
+        raise InputError(f"{archive.path} has no tier {tier!r}; it has: {known}.")
 
     def checked(name: str, exactly: int | None = None) -> bytes:
         content = archive.read(
-            name, most=LARGEST_TEXT if exactly is None else exactly, exactly=exactly
+            name, max_bytes=MAX_TEXT_BYTES if exactly is None else exactly, exact_bytes=exactly
         )
         if hashlib.sha256(content).hexdigest() != manifest.sha256.get(name):
-            raise BadInput(
+            raise InputError(
                 f"{archive.path} was altered: {name} is not what was written. Export it again."
             )
         return content
 
     layout = manifest.tiers["hq"].layout
-    tables = decode(_streams(checked, layout), layout)
+    tables = decode_tables(_read_streams(checked, layout), layout)
     tiers = {name: n for name, n in manifest.tiers.items() if tier in (None, name)}
     golden = []
     for number, frame in enumerate(manifest.golden):
@@ -277,13 +277,13 @@ def _read(archive: _Archive, tier: str | None) -> AvatarPackage:
         graphs={name: checked(graph_entry(name)) for name in tiers},
         tables=dict.fromkeys(tiers, tables),
         golden=tuple(golden),
-        preview=checked(PREVIEW),
+        preview=checked(PREVIEW_ENTRY),
     )
 
 
-def _streams(checked: Callable[[str, int], bytes], layout: Layout) -> dict[str, bytes]:
+def _read_streams(checked: Callable[[str, int], bytes], layout: TableLayout) -> dict[str, bytes]:
     streams = {}
-    for name, (dtype, shape) in layout.streams().items():
+    for name, (dtype, shape) in layout.stream_types().items():
         size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         streams[name] = checked(stream_entry(name), size)
     return streams

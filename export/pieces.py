@@ -6,14 +6,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from export.rules import DrawingRules
-from export.tables import Bricks
-from export.twin import Look
-from export.twin_march import PosedNodes, Rays, led_back, longest
+from export.rules import RenderSettings
+from export.tables import BrickTable
+from export.twin import TracedPicture
+from export.twin_march import PosedNodes, CanonicalRays, newton_correction, max_sample_spacing
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pieces:
+class RaySegments:
     """Blocks of samples along rays, as `twin_march.march` follows those that never end.
 
     Attributes:
@@ -21,11 +21,11 @@ class Pieces:
         start: Where pieces begin, in voxels of the lattice.
         slope: Voxels from one sample to the next.
         step_m: The same along the ray, metres.
-        count: Samples.
+        count: RaySamples.
         layer: Depth layer, from 0.
     """
 
-    first: Int64[np.ndarray, "rays_and_one"]
+    ray_offsets: Int64[np.ndarray, "rays_and_one"]
     start: Float32[np.ndarray, "pieces 3"]
     slope: Float32[np.ndarray, "pieces 3"]
     step_m: Float32[np.ndarray, "pieces"]
@@ -33,44 +33,44 @@ class Pieces:
     layer: Int32[np.ndarray, "pieces"]
 
     @property
-    def rays(self) -> int:
+    def num_rays(self) -> int:
         """How many there are."""
-        return len(self.first) - 1
+        return len(self.ray_offsets) - 1
 
     @classmethod
-    def of_first(
-        cls, rays: Rays, posed: PosedNodes, bricks: Bricks, rules: DrawingRules
-    ) -> "Pieces":
+    def of_first_layer(
+        cls, rays: CanonicalRays, posed: PosedNodes, bricks: BrickTable, rules: RenderSettings
+    ) -> "RaySegments":
         """The first layer's, of these rays in their order."""
-        blocks = list(_blocks(rays, posed, rules))
+        blocks = list(_march_blocks(rays, posed, rules))
         number = np.concatenate([ray for ray, _, _ in blocks])
         step_m = np.concatenate([step for _, _, step in blocks])
-        start = np.concatenate([rest.start for _, rest, _ in blocks])
-        direction = np.concatenate([rest.direction for _, rest, _ in blocks])
-        return cls._sorted(
-            number, len(rays.begin), bricks, start, direction, step_m, (rules.block, 0)
+        start = np.concatenate([rest.start_canonical for _, rest, _ in blocks])
+        direction = np.concatenate([rest.direction_canonical for _, rest, _ in blocks])
+        return cls._grouped_by_ray(
+            number, len(rays.begin), bricks, start, direction, step_m, (rules.block_samples, 0)
         )
 
     @classmethod
-    def behind(cls, look: Look, number: int, bricks: Bricks, rules: DrawingRules) -> "Pieces":
+    def of_further_layer(cls, look: TracedPicture, number: int, bricks: BrickTable, rules: RenderSettings) -> "RaySegments":
         """Those of a look's further layer: 1 for the first one behind."""
-        (again, rays), count = look.behind[number - 1], rules.second_block
+        (again, rays), count = look.further_layers[number - 1], rules.further_layer_samples
         step_m = (rays.end - rays.begin) / np.float32(count)
-        return cls._sorted(
-            again, len(look.pixel), bricks, rays.start, rays.direction, step_m, (count, number)
+        return cls._grouped_by_ray(
+            again, len(look.pixel), bricks, rays.start_canonical, rays.direction_canonical, step_m, (count, number)
         )
 
     @classmethod
-    def _sorted(
+    def _grouped_by_ray(
         cls,
         number: Int64[np.ndarray, "pieces"],
         rays: int,
-        bricks: Bricks,
+        bricks: BrickTable,
         start: Float32[np.ndarray, "pieces 3"],
         direction: Float32[np.ndarray, "pieces 3"],
         step_m: Float32[np.ndarray, "pieces"],
         count_and_layer: tuple[int, int],
-    ) -> "Pieces":
+    ) -> "RaySegments":
         """Ray by ray; the pieces of each stay in their order."""
         order, voxel_m = np.argsort(number, kind="stable"), np.float32(bricks.voxel_m)
         count, layer = count_and_layer
@@ -83,48 +83,48 @@ class Pieces:
             layer=np.full(len(number), layer, dtype=np.int32),
         )
 
-    def followed_by(self, behind: "Pieces") -> "Pieces":
+    def append_layer(self, behind: "RaySegments") -> "RaySegments":
         """The same rays, with further pieces behind those that they have."""
-        rays = np.arange(self.rays)
-        owners = [np.repeat(rays, np.diff(pieces.first)) for pieces in (self, behind)]
+        rays = np.arange(self.num_rays)
+        owners = [np.repeat(rays, np.diff(pieces.ray_offsets)) for pieces in (self, behind)]
         order = np.argsort(np.concatenate(owners), kind="stable")
         columns = {
             name: np.concatenate([getattr(self, name), getattr(behind, name)])[order]
-            for name in _COLUMNS
+            for name in _SEGMENT_FIELDS
         }
-        return Pieces(first=self.first + behind.first, **columns)
+        return RaySegments(ray_offsets=self.ray_offsets + behind.ray_offsets, **columns)
 
     @classmethod
-    def joined(cls, many: "Sequence[Pieces]") -> "Pieces":
+    def concatenate(cls, many: "Sequence[Pieces]") -> "RaySegments":
         """The rays of many looks, one after the other."""
         offsets = np.cumsum([0, *(len(pieces.step_m) for pieces in many)])
         starts = [pieces.first[:-1] + o for pieces, o in zip(many, offsets[:-1], strict=True)]
         columns = {
-            name: np.concatenate([getattr(pieces, name) for pieces in many]) for name in _COLUMNS
+            name: np.concatenate([getattr(pieces, name) for pieces in many]) for name in _SEGMENT_FIELDS
         }
         return cls(first=np.concatenate([*starts, offsets[-1:]]), **columns)
 
 
-_COLUMNS = [field.name for field in fields(Pieces) if field.name != "first"]
+_SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "first"]
 """What there is one of for each piece."""
 
 
-def _blocks(
-    rays: Rays, posed: PosedNodes, rules: DrawingRules
-) -> Iterator[tuple[Int64[np.ndarray, "pieces"], Rays, Float32[np.ndarray, "pieces"]]]:
+def _march_blocks(
+    rays: CanonicalRays, posed: PosedNodes, rules: RenderSettings
+) -> Iterator[tuple[Int64[np.ndarray, "pieces"], CanonicalRays, Float32[np.ndarray, "pieces"]]]:
     """Numbers of rays, what is left of them, and the steps of their next block."""
     number, rest = np.arange(len(rays.begin)), rays
-    for turn in range(rules.blocks):
+    for turn in range(rules.max_blocks):
         if turn > 0:
-            rest = led_back(rules, posed, rest)
+            rest = newton_correction(rules, posed, rest)
         step_m = np.minimum(
-            (rest.end - rest.begin) / np.float32(rules.block),
-            longest(rules, rules.samples, turn, rest),
+            (rest.end - rest.begin) / np.float32(rules.block_samples),
+            max_sample_spacing(rules, rules.samples, turn, rest),
         )
         yield number, rest, step_m
-        way = step_m * np.float32(rules.block)
+        way = step_m * np.float32(rules.block_samples)
         rest = rest._replace(
-            begin=rest.begin + way, start=rest.start + rest.direction * way[:, None]
+            begin=rest.begin + way, start_canonical=rest.start_canonical + rest.direction_canonical * way[:, None]
         )
         going = rest.begin < rest.end - 1e-5
-        number, rest = number[going], Rays(*(part[going] for part in rest))
+        number, rest = number[going], CanonicalRays(*(part[going] for part in rest))

@@ -11,19 +11,19 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from export.close_up import CloseUps, coarse, enlarged
-from export.drawable import check, sized
-from export.initialisers import initialisers
+from capture.errors import InputError
+from export.close_up import ResolutionLimit, downscale_camera, upscale_picture
+from export.drawable import check_render_inputs, resize_camera
+from export.initialisers import graph_initializers
 from export.manifest import Manifest
 from export.package import AvatarPackage, read_package
-from export.session import provider_named, session_of, shortened
+from export.session import find_provider, create_session, shorten_error
 from preprocess.kinematics import body_from_rest, world_from_body
 from preprocess.pose import BodyPose
 
-CLOSE = 2
+MAX_CLOSE_DIFFERENCE = 2
 """Two pictures are alike where no channel (premultiplied) differs by more, in 1/255 …"""
-ALIKE = 0.999
+MIN_CLOSE_FRACTION = 0.999
 """… on at least this share of the pixels."""
 
 
@@ -48,15 +48,15 @@ class Player:
     ) -> None:
         """A player of a package that has been read (or is about to be written)."""
         self.manifest: Manifest = package.manifest
-        self._rules = package.manifest.tiers[tier].rules
-        self._close_ups = CloseUps(package.tables[tier], self._rules)
+        self._rules = package.manifest.tiers[tier].settings
+        self._close_ups = ResolutionLimit(package.tables[tier], self._rules)
         # onnxruntime only borrows the tables: they must live as long as the session
         self._tables = {
             name: array.tobytes()
-            for name, array in initialisers(package.tables[tier], self._rules).items()
+            for name, array in graph_initializers(package.tables[tier], self._rules).items()
         }
-        self.provider = provider_named(provider)
-        self._session = session_of(package.graphs[tier], self._tables, threads, self.provider)
+        self.provider = find_provider(provider)
+        self._session = create_session(package.graphs[tier], self._tables, threads, self.provider)
         canonical = self._body_from_rest(self.manifest.canonical_rotations)
         self._rest_from_canonical = np.linalg.inv(canonical)
 
@@ -78,14 +78,14 @@ class Player:
             provider: onnxruntime's execution provider, "cpu", "cuda", …
 
         Raises:
-            BadInput: If the file is no sound package, or has no such tier, or there is no such
+            InputError: If the file is no sound package, or has no such tier, or there is no such
                 provider here.
         """
         try:
             package = read_package(Path(path), tier=tier)
             return cls(package, tier=tier, threads=threads, provider=provider)
-        except BadInput as cause:
-            raise cause if str(path) in str(cause) else BadInput(f"{path}: {cause}") from cause
+        except InputError as cause:
+            raise cause if str(path) in str(cause) else InputError(f"{path}: {cause}") from cause
 
     def render(
         self,
@@ -104,19 +104,19 @@ class Player:
             samples: Along 5 cm of a ray; the tier's own choice if None.
 
         Raises:
-            BadInput: If the camera's lens bends, there are no samples or no pixels, or pose or
+            InputError: If the camera's lens bends, there are no samples or no pixels, or pose or
                 camera are of another shape or not finite.
         """
         samples = self._rules.samples if samples is None else samples
-        camera = sized(camera, size)
-        check(pose, camera, samples)
+        camera = resize_camera(camera, size)
+        check_render_inputs(pose, camera, samples)
         bones = self.bones(pose, camera)
-        times = self._close_ups.coarser(bones, camera)
+        times = self._close_ups.downscale_factor(bones, camera)
         if times == 1.0:
-            return self._drawn(bones, camera, samples)
-        return enlarged(self._drawn(bones, coarse(camera, times), samples), camera.size_px, times)
+            return self._run_graph(bones, camera, samples)
+        return upscale_picture(self._run_graph(bones, downscale_camera(camera, times), samples), camera.size_px, times)
 
-    def _drawn(
+    def _run_graph(
         self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
     ) -> UInt8[np.ndarray, "height width 4"]:
         """What the graph draws."""
@@ -132,9 +132,9 @@ class Player:
         try:
             packed = np.asarray(self._session.run(["rgba"], inputs)[0])
         except Exception as error:  # onnxruntime has no common class for what a graph can do
-            raise BadInput(f"The package's graph cannot draw this: {shortened(error)}") from error
+            raise InputError(f"The package's graph cannot draw this: {shorten_error(error)}") from error
         if packed.size != height * width or packed.dtype != np.int32:
-            raise BadInput(
+            raise InputError(
                 f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
                 f"number for each of {width}x{height} px. It is damaged, or none of ours."
             )
@@ -158,7 +158,7 @@ class Player:
             samples: As in `render`.
 
         Raises:
-            BadInput: As `render` does.
+            InputError: As `render` does.
         """
         if workers == 1:
             for pose, camera in shots:
@@ -191,7 +191,7 @@ class Player:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Likeness:
+class PictureDifference:
     """How far two pictures are apart.
 
     Attributes:
@@ -199,24 +199,24 @@ class Likeness:
         close: Share of the pixels that differ by no more than `CLOSE`.
     """
 
-    largest: float
-    close: float
+    largest_difference: float
+    close_fraction: float
 
     @classmethod
     def of(
         cls, a: Float32[np.ndarray, "height width 4"], b: Float32[np.ndarray, "height width 4"]
-    ) -> "Likeness":
+    ) -> "PictureDifference":
         """Of two premultiplied pictures in [0, 1]."""
         difference = np.abs(a - b).max(axis=-1) * 255.0
-        return cls(largest=float(difference.max()), close=float((difference <= CLOSE).mean()))
+        return cls(largest=float(difference.max()), close=float((difference <= MAX_CLOSE_DIFFERENCE).mean()))
 
     @property
-    def alike(self) -> bool:
+    def matches(self) -> bool:
         """Whether they count as the same picture."""
-        return self.close >= ALIKE
+        return self.close_fraction >= MIN_CLOSE_FRACTION
 
 
-def premultiplied(
+def premultiply(
     rgba: UInt8[np.ndarray, "height width 4"],
 ) -> Float32[np.ndarray, "height width 4"]:
     """A straight 8-bit picture as premultiplied floats in [0, 1]."""
@@ -225,7 +225,7 @@ def premultiplied(
     return picture
 
 
-def verify(path: Path | str, *, provider: str = "cpu") -> list[Likeness]:
+def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDifference]:
     """Draws a package's golden frames again, on this machine.
 
     Args:
@@ -236,11 +236,11 @@ def verify(path: Path | str, *, provider: str = "cpu") -> list[Likeness]:
         For each golden frame, how far the new picture is from the stored one.
 
     Raises:
-        BadInput: If the file is no sound package, or there is no such provider.
+        InputError: If the file is no sound package, or there is no such provider.
     """
     package = read_package(Path(path), tier=None)  # every entry is looked at
     player = Player(package, provider=provider)
     return [
-        Likeness.of(premultiplied(player.render(frame.pose, frame.camera)), premultiplied(stored))
+        PictureDifference.of(premultiply(player.render(frame.pose, frame.camera)), premultiply(stored))
         for frame, stored in zip(package.manifest.golden, package.golden, strict=True)
     ]

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-from export.nodes import Graph, Value
-from export.rules import DrawingRules
-from export.tables import Tables
+from export.nodes import GraphBuilder, GraphValue
+from export.rules import RenderSettings
+from export.tables import PlayerTables
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
+class CameraValues:
     """Where a picture is taken from: values of the graph.
 
     Attributes:
@@ -17,20 +17,20 @@ class View:
         height, width: Scalars, int64.
     """
 
-    bones: Value
-    focal: tuple[Value, Value]
-    center: tuple[Value, Value]
-    height: Value
-    width: Value
+    bones: GraphValue
+    focal: tuple[GraphValue, GraphValue]
+    center: tuple[GraphValue, GraphValue]
+    height: GraphValue
+    width: GraphValue
 
     @property
-    def pixels(self) -> Value:
+    def num_pixels(self) -> GraphValue:
         """How many there are, int64 scalar."""
         return self.height * self.width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Scene:
+class GraphContext:
     """A graph being written, and what it draws.
 
     Attributes:
@@ -42,9 +42,9 @@ class Scene:
         samples: Along each ray and layer, int64 scalar.
     """
 
-    graph: Graph
-    tables: Tables
-    columns: dict[str, Value]
-    rules: DrawingRules
-    view: View
-    samples: Value
+    graph: GraphBuilder
+    tables: PlayerTables
+    table_values: dict[str, GraphValue]
+    settings: RenderSettings
+    camera: CameraValues
+    samples: GraphValue

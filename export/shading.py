@@ -4,18 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.columns import Vector, adjugate, dot, taken
-from export.march import Segment, march, sampled, unsquashed
-from export.nodes import Value
-from export.posing import Place, Posed, carried, inverse_of
-from export.raster import Window
-from export.scene import Scene, View
-from export.surfels import Surfels
+from export.columns import VectorValue, adjugate, dot, gather_vector
+from export.march import SegmentValues, march_segments, composite_samples, compression_scale
+from export.nodes import GraphValue
+from export.posing import SkinningCell, PosedNodeValues, skin_points, invert_jacobian
+from export.raster import SplatWindow
+from export.scene import GraphContext, CameraValues
+from export.surfels import PosedSurfels
 from export.tables import SURFEL_BITS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Layer:
+class DepthLayer:
     """One depth layer: values of the graph, one entry a ray.
 
     Attributes:
@@ -27,25 +27,25 @@ class Layer:
         enter, end: Where the ray enters the hull and where it ends, metres along it.
     """
 
-    ray: Vector
-    surfel: Value
-    canonical: Vector
-    camera: Vector
-    color: Vector
-    light: Value
-    enter: Value
-    end: Value
+    ray: VectorValue
+    surfel: GraphValue
+    canonical_position: VectorValue
+    camera_position: VectorValue
+    color: VectorValue
+    transmittance: GraphValue
+    enter: GraphValue
+    end: GraphValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Hull:
+class PosedProxySurface:
     """What rays meet: the surfels, and the skin's nodes in the camera's frame."""
 
-    surfels: Surfels
-    posed: Posed
+    surfels: PosedSurfels
+    posed: PosedNodeValues
 
 
-def rays(view: View, window: Window, pixel: Value) -> Vector:
+def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> VectorValue:
     """Unit directions in the camera's frame through the centres of the window's pixels (int32)."""
     width = window.width.cast(np.int32)
     row = pixel // width
@@ -57,8 +57,8 @@ def rays(view: View, window: Window, pixel: Value) -> Vector:
     return [x * scale, y * scale, scale]
 
 
-def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | None) -> Layer:
-    """Colour and light behind of rays.
+def trace_depth_layer(scene: GraphContext, hull: PosedProxySurface, keys: GraphValue, ray: VectorValue, front_layer: DepthLayer | None) -> DepthLayer:
+    """SrgbColor and light behind of rays.
 
     The map from canonical space to the camera's is taken as linear about the surfel that a ray
     sees: its inverse carries the ray to where it enters the hull.
@@ -70,86 +70,86 @@ def shade(scene: Scene, hull: Hull, keys: Value, ray: Vector, before: Layer | No
         ray: Directions.
         before: What the same rays saw in the first layer, if this is the second.
     """
-    graph, surfel = scene.graph, keys.masked((1 << SURFEL_BITS) - 1)
-    place = hull.surfels.place
-    place = Place(rows=taken(place.rows, surfel), fraction=taken(place.fraction, surfel))
-    camera, derivative = carried(scene, hull.posed, place)
-    inverse = inverse_of(scene, derivative, adjugate(derivative))
-    normal = taken([scene.columns[f"normal_{letter}"] for letter in "xyz"], surfel)
+    graph, surfel = scene.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
+    place = hull.surfels.cell
+    place = SkinningCell(rows=gather_vector(place.rows, surfel), fraction=gather_vector(place.fraction, surfel))
+    camera, derivative = skin_points(scene, hull.posed, place)
+    inverse = invert_jacobian(scene, derivative, adjugate(derivative))
+    normal = gather_vector([scene.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
     # where the skin is folded, the hull is looked at from straight above
     above = [-n for n in normal]
-    seen_along = zip(inverse.applied(ray), above, strict=True)
+    seen_along = zip(inverse.apply(ray), above, strict=True)
     direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
     along = dot(camera, ray)
-    beside = inverse.applied([along * r - c for r, c in zip(ray, camera, strict=True)])
-    thickness = scene.columns["thickness"].take(surfel)
-    enter, begin, end = _extent(scene, normal, thickness, direction, beside, along)
-    canonical = taken([scene.columns[f"position_{letter}"] for letter in "xyz"], surfel)
-    if before is not None:
-        begin = _after(scene, before, canonical, camera, begin, end)
+    beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
+    thickness = scene.table_values["thickness"].gather(surfel)
+    enter, begin, end = _segment_bounds(scene, normal, thickness, direction, beside, along)
+    canonical = gather_vector([scene.table_values[f"position_{letter}"] for letter in "xyz"], surfel)
+    if front_layer is not None:
+        begin = _begin_behind_front_layer(scene, front_layer, canonical, camera, begin, end)
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
-    segment = Segment(ray=ray, begin=begin, end=end, canonical=start, direction=direction)
-    if before is None:
-        color, light = march(scene, hull.posed, segment)
+    segment = SegmentValues(direction_camera=ray, begin=begin, end=end, start_canonical=start, direction_canonical=direction)
+    if front_layer is None:
+        color, light = march_segments(scene, hull.posed, segment)
     else:
-        rules = scene.rules
-        block = sampled(scene, segment, begin * 0.0 + 1.0, rules.second_block, rules.longest_m)
-        color, light = block.color, block.light
-    return Layer(
+        rules = scene.settings
+        block = composite_samples(scene, segment, begin * 0.0 + 1.0, rules.further_layer_samples, rules.max_segment_m)
+        color, light = block.color, block.transmittance
+    return DepthLayer(
         ray=ray,
         surfel=surfel,
-        canonical=canonical,
-        camera=camera,
+        canonical_position=canonical,
+        camera_position=camera,
         color=color,
-        light=light,
+        transmittance=light,
         enter=enter,
         end=end,
     )
 
 
-def _extent(
-    scene: Scene,
-    normal: Vector,
-    thickness: Value,
-    direction: Vector,
-    beside: Vector,
-    along: Value,
-) -> tuple[Value, Value, Value]:
+def _segment_bounds(
+    scene: GraphContext,
+    normal: VectorValue,
+    thickness: GraphValue,
+    direction: VectorValue,
+    beside: VectorValue,
+    along: GraphValue,
+) -> tuple[GraphValue, GraphValue, GraphValue]:
     """Where rays enter the hull's tangent plane, and from where to where they are followed.
 
     `beside` is where each ray comes closest to its surfel, seen from that in canonical space,
     `along` how far that is along the ray.
     """
-    graph, rules = scene.graph, scene.rules
+    graph, rules = scene.graph, scene.settings
     falling = dot(normal, direction)
-    shallow = -0.5 * rules.steepest
+    shallow = -0.5 * rules.min_cosine
     hit = -dot(normal, beside) / falling.minimum(shallow)
-    hit = graph.where(falling < shallow, hit, 0.0).clipped(-rules.slack_m, rules.slack_m)
+    hit = graph.where(falling < shallow, hit, 0.0).clip(-rules.max_entry_shift_m, rules.max_entry_shift_m)
     enter = along + hit
-    cosine = (-falling).maximum(rules.steepest)
-    lead = (rules.lead_m / cosine).minimum(unsquashed(scene, direction) * rules.most_lead_m)
+    cosine = (-falling).maximum(rules.min_cosine)
+    lead = (rules.entry_margin_m / cosine).minimum(compression_scale(scene, direction) * rules.max_entry_margin_m)
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
-    bent = cosine.minimum(rules.squash_limit)  # compression at the surfel seldom lasts
-    times = ((sine * rules.grazing + 1.0) / bent).minimum(rules.lengthened)
-    length = (thickness * times + lead).minimum(rules.longest_m)
+    bent = cosine.minimum(rules.max_compression)  # compression at the surfel seldom lasts
+    times = ((sine * rules.grazing_factor + 1.0) / bent).minimum(rules.max_lengthening)
+    length = (thickness * times + lead).minimum(rules.max_segment_m)
     begin = enter - lead
     return enter, begin, begin + length
 
 
-def _after(
-    scene: Scene, before: Layer, canonical: Vector, camera: Vector, begin: Value, end: Value
-) -> Value:
+def _begin_behind_front_layer(
+    scene: GraphContext, before: DepthLayer, canonical: VectorValue, camera: VectorValue, begin: GraphValue, end: GraphValue
+) -> GraphValue:
     """Where rays begin that must not see a second time what they have passed already."""
-    rules = scene.rules
+    rules = scene.settings
 
-    def apart(here: Vector, first: Vector) -> Value:
+    def apart(here: VectorValue, first: VectorValue) -> GraphValue:
         between = [a - b for a, b in zip(here, first, strict=True)]
         return dot(between, between).sqrt()
 
     one_sheet = (
-        apart(canonical, before.canonical)
-        < apart(camera, before.camera) * rules.same_share + rules.same_m
+        apart(canonical, before.canonical_position)
+        < apart(camera, before.camera_position) * rules.same_sheet_ratio + rules.same_sheet_m
     )
     later = begin.maximum(before.end).minimum(end)
     return scene.graph.where(one_sheet, later, begin)

@@ -6,16 +6,16 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 
-from capture.errors import BadInput
-from export.tables import Skin
+from capture.errors import InputError
+from export.tables import SkinningGrid
 
-NOWHERE_M = 1e6
+UNSTORED_M = 1e6
 """Canonical coordinates of nodes that are not stored, metres. They make the derivative so
 large that it is never inverted: beyond the stored skin a ray keeps its direction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SkinNodes:
+class SkinningNodes:
     """Nodes of a grid whose cells are as long as the skin's, or half as long.
 
     Linear blend skinning, Σ w_j(x) B_j x, carries each node to its posed place. Trilinear between
@@ -29,7 +29,7 @@ class SkinNodes:
             Rows are numbered in C order: the row of the next node along z is the next one. There is
             one row more than nodes, so that there always is a next one.
         positions: Canonical metres; those of the first and the last row, which are no nodes, are
-            `NOWHERE_M`.
+            `UNSTORED_M`.
         weights: Of the joints.
     """
 
@@ -40,40 +40,40 @@ class SkinNodes:
     weights: Float32[np.ndarray, "24 rows"]
 
 
-def nodes_of(skin: Skin, per_step: int) -> SkinNodes:
+def skinning_nodes(skin: SkinningGrid, subdivision: int) -> SkinningNodes:
     """The skin's nodes, its steps cut into so many parts.
 
     Raises:
-        BadInput: If that is neither 1 nor 2.
+        InputError: If that is neither 1 nor 2.
     """
-    if per_step not in (1, 2):
-        raise BadInput(
-            f"The package cuts the skin's steps into {per_step} parts; 1 or 2 can be. "
+    if subdivision not in (1, 2):
+        raise InputError(
+            f"The package cuts the skin's steps into {subdivision} parts; 1 or 2 can be. "
             "The file is damaged or none of ours."
         )
-    return finer_nodes(skin) if per_step == 2 else stored_nodes(skin)
+    return subdivided_skinning_nodes(skin) if subdivision == 2 else stored_skinning_nodes(skin)
 
 
 @lru_cache(maxsize=1)
-def stored_nodes(skin: Skin) -> SkinNodes:
+def stored_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
     """Every node that is stored."""
     place = np.argwhere(skin.index > 0)
     weights = np.zeros((24, len(place) + 2), dtype=np.float32)
     weights[:, :-1] = skin.weights.T
     weights[0, -1] = 1.0
-    return SkinNodes(
+    return SkinningNodes(
         low=skin.low,
         step_m=skin.step_m,
-        index=_with_next(skin.index),
-        positions=_positions(place, skin.low, skin.step_m),
+        index=_rows_with_next_in_z(skin.index),
+        positions=_padded_positions(place, skin.low, skin.step_m),
         weights=weights,
     )
 
 
 @lru_cache(maxsize=1)
-def finer_nodes(skin: Skin) -> SkinNodes:
+def subdivided_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
     """Every node of the halved grid that a cell with eight stored corners holds."""
-    inside = _inside(skin.index > 0)
+    inside = _nodes_of_complete_cells(skin.index > 0)
     place = np.argwhere(inside)
     index = np.zeros(inside.shape, dtype=np.int32)
     index[inside] = np.arange(1, len(place) + 1)
@@ -90,33 +90,33 @@ def finer_nodes(skin: Skin) -> SkinNodes:
         sums = total.sum(axis=1, keepdims=True, dtype=np.float32)
         weights[:, chosen + 1] = (total / np.maximum(sums, np.float32(1.0))).T
     step_m = skin.step_m * np.float32(0.5)
-    return SkinNodes(
+    return SkinningNodes(
         low=skin.low,
         step_m=step_m,
-        index=_with_next(index),
-        positions=_positions(place, skin.low, step_m),
+        index=_rows_with_next_in_z(index),
+        positions=_padded_positions(place, skin.low, step_m),
         weights=weights,
     )
 
 
-def _with_next(index: Int32[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
+def _rows_with_next_in_z(index: Int32[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
     """The rows of those nodes alone whose next one along z is there."""
     kept = np.zeros_like(index)
     kept[..., :-1] = np.where(index[..., 1:] > 0, index[..., :-1], 0)
     return kept
 
 
-def _positions(
+def _padded_positions(
     place: Int[np.ndarray, "nodes 3"],
     low: Float32[np.ndarray, "3"],
     step_m: Float32[np.ndarray, "3"],
 ) -> Float32[np.ndarray, "rows 3"]:
     """Positions of nodes, and of a row before and behind them that are nowhere."""
     positions = (place * step_m + low).astype(np.float32)
-    return np.pad(positions, [(1, 1), (0, 0)], constant_values=NOWHERE_M)
+    return np.pad(positions, [(1, 1), (0, 0)], constant_values=UNSTORED_M)
 
 
-def _inside(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:
+def _nodes_of_complete_cells(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:
     """Nodes of the halved grid that belong to a cell whose corners are all stored."""
     nx, ny, nz = stored.shape
     whole = np.ones((nx - 1, ny - 1, nz - 1), dtype=bool)

@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from export.columns import Vector, cross, dot, taken
-from export.nodes import Value
-from export.posing import Place, Posed, nodes_per_m, place_of
-from export.scene import Scene
+from export.columns import VectorValue, cross, dot, gather_vector
+from export.nodes import GraphValue
+from export.posing import SkinningCell, PosedNodeValues, skinning_nodes_per_m, locate_skinning_cell
+from export.scene import GraphContext
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Surfels:
+class PosedSurfels:
     """The hull: values of the graph, one entry a surfel.
 
     Attributes:
@@ -21,57 +21,57 @@ class Surfels:
         rows: Of the four nodes about each, and
         normal: its normal per step along the edges between these, also the same in all poses.
         camera: Positions in the camera's frame, linear in tetrahedra.
-        folded: Whether the posed tetrahedron has less than `fold_volume` of its canonical volume;
+        folded: Whether the posed tetrahedron has less than `fold_volume_ratio` of its canonical volume;
             inside out counts as negative.
     """
 
-    place: Place
-    rows: list[Value]
-    normal: Vector
-    camera: Vector
-    folded: Value
+    cell: SkinningCell
+    rows: list[GraphValue]
+    normal: VectorValue
+    camera_positions: VectorValue
+    folded: GraphValue
 
 
-def pose_surfels(scene: Scene, posed: Posed) -> Surfels:
+def pose_surfels(scene: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
     """Positions as sums over four nodes each.
 
     All but the nodes' posed places is the same in every pose: onnxruntime computes it once.
     """
-    columns = scene.columns
-    place = place_of(scene, [columns[f"position_{letter}"] for letter in "xyz"])
-    rows, shares, normal, handed = _tetrahedra(scene, place)
-    corners = [taken(posed.camera, row) for row in rows]
+    columns = scene.table_values
+    place = locate_skinning_cell(scene, [columns[f"position_{letter}"] for letter in "xyz"])
+    rows, shares, normal, handed = _surfel_tetrahedra(scene, place)
+    corners = [gather_vector(posed.camera_positions, row) for row in rows]
     camera = []
     for axis in range(3):
         parts = [corner[axis] * share for corner, share in zip(corners, shares, strict=True)]
         camera.append(parts[0] + parts[1] + parts[2] + parts[3])
-    edges = _edges(corners)
+    edges = _tetrahedron_edges(corners)
     volume = dot(edges[0], cross(edges[1], edges[2])) * handed
-    least = scene.rules.fold_volume / float(np.prod(nodes_per_m(scene)))
-    return Surfels(place=place, rows=rows, normal=normal, camera=camera, folded=volume < least)
+    least = scene.settings.fold_volume_ratio / float(np.prod(skinning_nodes_per_m(scene)))
+    return PosedSurfels(cell=place, rows=rows, normal=normal, camera_positions=camera, folded=volume < least)
 
 
-def _edges(corners: Sequence[Vector]) -> list[Vector]:
+def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
     """The three edges from each corner to the next."""
     return [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
 
 
-def faces_camera(scene: Scene, posed: Posed, surfels: Surfels, number: Value) -> Value:
+def faces_camera(scene: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue) -> GraphValue:
     """Which of some surfels face the camera: n · J⁻¹ c, J the derivative in the tetrahedron.
 
     J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
     """
-    rules, rows = scene.rules, taken(surfels.rows, number)
-    edges = _edges([taken(posed.camera, row) for row in rows])
+    rules, rows = scene.settings, gather_vector(surfels.rows, number)
+    edges = _tetrahedron_edges([gather_vector(posed.camera_positions, row) for row in rows])
     across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
     volume = dot(edges[0], across[0])
-    camera = taken(surfels.camera, number)
-    facing = dot(taken(surfels.normal, number), [dot(vector, camera) for vector in across])
+    camera = gather_vector(surfels.camera_positions, number)
+    facing = dot(gather_vector(surfels.normal, number), [dot(vector, camera) for vector in across])
     # the way along the edges turns left or right, so the volume may have either sign
-    return facing * volume < camera[2] * volume * volume * -rules.facing
+    return facing * volume < camera[2] * volume * volume * -rules.min_facing_cosine
 
 
-def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], Vector, Value]:
+def _surfel_tetrahedra(scene: GraphContext, place: SkinningCell) -> tuple[list[GraphValue], list[GraphValue], VectorValue, GraphValue]:
     """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
 
     The last value is 1 where these edges are right-handed in canonical space, and -1 elsewhere.
@@ -94,8 +94,8 @@ def _tetrahedra(scene: Scene, place: Place) -> tuple[list[Value], list[Value], V
     middle = (x + y + z) - largest - smallest
     shares = [1.0 - largest, largest - middle, middle - smallest, smallest]
     nx, ny, nz = (
-        scene.columns[f"normal_{letter}"] * (1.0 / per_m)
-        for letter, per_m in zip("xyz", nodes_per_m(scene), strict=True)
+        scene.table_values[f"normal_{letter}"] * (1.0 / per_m)
+        for letter, per_m in zip("xyz", skinning_nodes_per_m(scene), strict=True)
     )
     one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
     three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))

@@ -5,24 +5,24 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, UInt, UInt8, UInt16
 
-BRICK = 8
+BRICK_SIZE = 8
 """Voxels along a brick's edge; each brick also holds the first layer of its next neighbours."""
-NODES = BRICK + 1
-LOG_DENSITY = (float(np.log(0.5)), float(np.log(3000.0)))
+BRICK_NODES = BRICK_SIZE + 1
+LOG_DENSITY_RANGE = (float(np.log(0.5)), float(np.log(3000.0)))
 """Range of the 8-bit log-density, density in 1/m; code 0 means empty."""
-FULL_WEIGHT = 65535
+WEIGHT_SCALE = 65535
 """Code of the skinning weight 1."""
 THICKNESS_STEP_M = 0.0005
-COLOR_STEP, DENSITY_STEP = 8, 16
+COLOR_CODE_STEP, DENSITY_CODE_STEP = 8, 16
 """Voxels' codes are rounded to multiples of these: nobody sees it, and bytes halve. A step of
 density is 54 %."""
 SURFEL_BITS = 17
 """A z-buffer key is 14 bits of depth over 17 bits of surfel number."""
-DEPTH_STEPS = 1 << (31 - SURFEL_BITS)
+DEPTH_CODES = 1 << (31 - SURFEL_BITS)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Surfels:
+class SurfelTable:
     """Points of the hull, just outside of what can be seen, in canonical space.
 
     Attributes:
@@ -63,10 +63,10 @@ class Surfels:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Bricks:
-    """Colour and log-density on a voxel lattice, stored only near the surface.
+class BrickTable:
+    """SrgbColor and log-density on a voxel lattice, stored only near the surface.
 
-    Lattice node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
+    FieldGrid node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
 
     Attributes:
         low: Corner of the lattice, canonical metres.
@@ -82,7 +82,7 @@ class Bricks:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Skin:
+class SkinningGrid:
     """Skinning weights on the nodes of a grid, stored only where something can be seen.
 
     Node (i, j, k) lies at `low + step_m · (i, j, k)`; between nodes weights are trilinear.
@@ -91,7 +91,7 @@ class Skin:
         low: Corner of the grid, canonical metres.
         step_m: Distance between nodes along x, y, z.
         index: Which column of the codes belongs to each node, numbered in C order; 0 for none.
-        weight_codes: Weights × `FULL_WEIGHT`. Column 0 is the root's alone.
+        weight_codes: Weights × `WEIGHT_SCALE`. Column 0 is the root's alone.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -102,11 +102,11 @@ class Skin:
     @property
     def weights(self) -> Float32[np.ndarray, "columns 24"]:
         """Skinning weights; rows sum to 1 within 0.01 %."""
-        return self.weight_codes.T.astype(np.float32) / np.float32(FULL_WEIGHT)
+        return self.weight_codes.T.astype(np.float32) / np.float32(WEIGHT_SCALE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Tables:
+class PlayerTables:
     """Everything that a tier of the player draws.
 
     Attributes:
@@ -117,21 +117,21 @@ class Tables:
         reach_m: No surfel gets farther from the pelvis than this in any pose.
     """
 
-    surfels: Surfels
-    bricks: Bricks
-    skin: Skin
+    surfels: SurfelTable
+    bricks: BrickTable
+    skinning: SkinningGrid
     pelvis: Float32[np.ndarray, "3"]
     reach_m: float
 
 
-def density_codes(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
+def encode_density(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
     """8-bit log-density; densities below the range become 0, which is empty."""
-    low, high = LOG_DENSITY
+    low, high = LOG_DENSITY_RANGE
     logs = np.log(np.maximum(density, 1e-9))
     return np.clip(np.round((logs - low) / (high - low) * 255.0), 0, 255).astype(np.uint8)
 
 
-def rounded(
+def round_codes(
     codes: UInt[np.ndarray, "*batch"], step: int, largest: int
 ) -> UInt[np.ndarray, "*batch"]:
     """The next multiples of a step that are not above the largest code."""

@@ -1,4 +1,4 @@
-"""Bricks fine-tuned until the player's pixels are what the volume renderer shows.
+"""BrickTable fine-tuned until the player's pixels are what the volume renderer shows.
 
 A voxel that holds the field's value at its place is not the voxel with which a few samples, linear
 between voxels and rounded, look most like the field. Rays of the player are compared with the same
@@ -14,45 +14,45 @@ from scipy.spatial.transform import Rotation
 
 from avatar.rig import Rig
 from capture.camera import Camera
-from export.codec import with_borders
-from export.descent import pushed
-from export.rules import DrawingRules
-from export.seen import Codes, Onlooker, Renderer, Seen, View
-from export.tables import BRICK, COLOR_STEP, DENSITY_STEP, Bricks, Tables, rounded
+from export.codec import add_border_voxels
+from export.descent import back_project
+from export.rules import RenderSettings
+from export.seen import VoxelCodes, TargetBuilder, RenderFunction, RenderTargets, PosedView
+from export.tables import BRICK_SIZE, COLOR_CODE_STEP, DENSITY_CODE_STEP, BrickTable, PlayerTables, round_codes
 
-TUNED_PX, JUDGED_PX = 540, 256
+TRAINING_PX, VALIDATION_PX = 540, 256
 """Longer side of the pictures that bricks are tuned on, and of those that judge."""
-ENLARGED = 2
+MAX_UPSCALE = 2
 """No picture is more than so many times as large as the one that was asked for."""
-LEAST_GAIN_DB = 0.01
+MIN_GAIN_DB = 0.01
 ROUNDS = 4
 """Three quarters of what can be gained come with the first two; more learn the rays by heart."""
 COLOR_DAMPING, DENSITY_DAMPING = 0.5, 1e-3
 """A voxel seen by less than half a ray stays nearly as it is; so does one whose density hardly
 matters: ten rays that move by a hundredth with every code."""
-FARTHEST = 24
-"""Codes of density are never farther from the field's than this: twice or half as dense."""
-BENT, NOVEL_BENT = 0.05, 0.3
+MAX_DENSITY_CODE_CHANGE = 24
+"""VoxelCodes of density are never farther from the field's than this: twice or half as dense."""
+POSE_NOISE_RAD, NOVEL_POSE_NOISE_RAD = 0.05, 0.3
 """Deviation of each joint's turn, radians, in poses to learn from, and in new poses that judge."""
-TILTED = 0.2
+CAMERA_TILT_RAD = 0.2
 """Deviation of the cameras' height, radians about the pelvis."""
-NOVEL = 2
+NOVEL_POSES = 2
 """New poses that judge, besides the views that were given."""
-WANTED_DB = 39.0
+TARGET_DB = 39.0
 """Where the player is farther from the renderer than this in poses as filmed, voxels are finer, and
 more of what lies behind the first depth layer is drawn, if new poses win by it."""
-NEAR = 6
+PROBE_PICTURES = 6
 """Pictures that say how much it shows, of poses near the given ones."""
-DEEPER = {"layers": 3, "sheet_gap_m": -0.015}
+DEEPER_SETTINGS = {"layers": 3, "other_sheet_gap_m": -0.015}
 """6 % of a picture's time. Where limbs touch it wins a decibel and more."""
-LEAST_DEEPER_GAIN_DB = 0.2
+MIN_DEEPER_GAIN_DB = 0.2
 
-Progress = Callable[[float], None]
+ExportProgress = Callable[[float], None]
 """Told how much of the work is done, from 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Tuned:
+class FineTuningResult:
     """What fine-tuning made.
 
     Attributes:
@@ -62,42 +62,42 @@ class Tuned:
             where nothing was tuned.
     """
 
-    tables: Tables
-    rules: DrawingRules
+    tables: PlayerTables
+    settings: RenderSettings
     psnr: tuple[float, float] | None
 
 
-def far_off(
-    tables: Tables,
+def is_below_target(
+    tables: PlayerTables,
     rig: Rig,
-    rules: DrawingRules,
-    renderer: Renderer,
+    settings: RenderSettings,
+    renderer: RenderFunction,
     *,
-    views: Sequence[View],
-    beside: Executor,
+    views: Sequence[PosedView],
+    executor: Executor,
 ) -> bool:
     """Whether the player is farther from the renderer than is wanted, as baked. As for `tuned`."""
-    onlooker = Onlooker(
-        tables=tables, codes=_codes(tables.bricks), rig=rig, renderer=renderer, beside=beside,
-        told=lambda: None,
+    onlooker = TargetBuilder(
+        tables=tables, codes=_own_voxel_codes(tables.bricks), rig=rig, renderer=renderer, executor=executor,
+        on_picture=lambda: None,
     )  # fmt: skip
-    near = list(_near(views, rig, NEAR, BENT, np.random.default_rng(1), JUDGED_PX))
-    return onlooker.psnr(onlooker.looked(near, rules), rules) < WANTED_DB
+    near = list(_perturbed_views(views, rig, PROBE_PICTURES, POSE_NOISE_RAD, np.random.default_rng(1), VALIDATION_PX))
+    return onlooker.psnr(onlooker.build(near, settings), settings) < TARGET_DB
 
 
-def tuned(
-    tables: Tables,
+def fine_tune(
+    tables: PlayerTables,
     rig: Rig,
-    rules: DrawingRules,
-    renderer: Renderer,
+    settings: RenderSettings,
+    renderer: RenderFunction,
     *,
-    views: Sequence[View],
-    pictures: int,
-    beside: Executor,
-    deepens: bool = False,
-    progress: Progress = lambda _: None,
-) -> Tuned:
-    """Bricks with which the player shows more of what the renderer shows.
+    views: Sequence[PosedView],
+    max_pictures: int,
+    executor: Executor,
+    may_add_layers: bool = False,
+    progress: ExportProgress = lambda _: None,
+) -> FineTuningResult:
+    """BrickTable with which the player shows more of what the renderer shows.
 
     Learns from poses near the given ones, seen from all sides. After each round the rounded bricks
     are judged by the given views and by new poses, which no round has seen.
@@ -114,96 +114,96 @@ def tuned(
         progress: Told how much is done.
     """
     generator = np.random.default_rng(0)
-    learnt = list(_near(views, rig, pictures, BENT, generator, TUNED_PX))
-    asked = [(pose, _within(camera, JUDGED_PX)) for pose, camera in views]
-    asked += list(_near(views, rig, NOVEL, NOVEL_BENT, generator, JUDGED_PX))
-    total = len(learnt) + len(asked) + 2 * NOVEL + ROUNDS
-    steps, codes = iter(range(1, total + 1)), _codes(tables.bricks)
-    onlooker = Onlooker(
-        tables=tables, codes=codes, rig=rig, renderer=renderer, beside=beside,
-        told=lambda: progress(next(steps) / total),
+    learnt = list(_perturbed_views(views, rig, max_pictures, POSE_NOISE_RAD, generator, TRAINING_PX))
+    asked = [(pose, _fit_camera(camera, VALIDATION_PX)) for pose, camera in views]
+    asked += list(_perturbed_views(views, rig, NOVEL_POSES, NOVEL_POSE_NOISE_RAD, generator, VALIDATION_PX))
+    total = len(learnt) + len(asked) + 2 * NOVEL_POSES + ROUNDS
+    steps, codes = iter(range(1, total + 1)), _own_voxel_codes(tables.bricks)
+    onlooker = TargetBuilder(
+        tables=tables, codes=codes, rig=rig, renderer=renderer, executor=executor,
+        on_picture=lambda: progress(next(steps) / total),
     )  # fmt: skip
-    rules = _deep_enough(onlooker, rules, asked[-NOVEL:]) if deepens else rules
-    judge, lesson = onlooker.looked(asked, rules), onlooker.looked(learnt, rules)
-    best, first = codes, judge.psnr(tables, rules, codes)
+    settings = _choose_layers(onlooker, settings, asked[-NOVEL_POSES:]) if may_add_layers else settings
+    judge, lesson = onlooker.build(asked, settings), onlooker.build(learnt, settings)
+    best, first = codes, judge.psnr(tables, settings, codes)
     score = first
-    for latent in _rounds(lesson, tables, rules, codes):
-        attempt = _rounded(latent, codes)
-        reached = judge.psnr(tables, rules, attempt)
+    for latent in _sirt_rounds(lesson, tables, settings, codes):
+        attempt = _quantize_codes(latent, codes)
+        reached = judge.psnr(tables, settings, attempt)
         progress(next(steps) / total)
-        if reached < score + LEAST_GAIN_DB:
+        if reached < score + MIN_GAIN_DB:
             break
         best, score = attempt, reached
     if best is codes:
-        return Tuned(tables=tables, rules=rules, psnr=(first, first))
-    bricks = _bricks(tables.bricks, best)
-    return Tuned(tables=replace(tables, bricks=bricks), rules=rules, psnr=(first, score))
+        return FineTuningResult(tables=tables, settings=settings, psnr=(first, first))
+    bricks = _bricks_from_codes(tables.bricks, best)
+    return FineTuningResult(tables=replace(tables, bricks=bricks), settings=settings, psnr=(first, score))
 
 
-def _deep_enough(onlooker: Onlooker, rules: DrawingRules, novel: Sequence[View]) -> DrawingRules:
+def _choose_layers(onlooker: TargetBuilder, rules: RenderSettings, novel: Sequence[PosedView]) -> RenderSettings:
     """The rules, or those that draw more of what lies behind, if new poses win by it."""
-    deeper = replace(rules, **DEEPER)
-    before, after = (onlooker.psnr(onlooker.looked(novel, each), each) for each in (rules, deeper))
-    return deeper if after >= before + LEAST_DEEPER_GAIN_DB else rules
+    deeper = replace(rules, **DEEPER_SETTINGS)
+    before, after = (onlooker.psnr(onlooker.build(novel, each), each) for each in (rules, deeper))
+    return deeper if after >= before + MIN_DEEPER_GAIN_DB else rules
 
 
-def _rounds(lesson: Seen, tables: Tables, rules: DrawingRules, baked: Codes) -> Iterator[Codes]:
-    """Codes after each round, as they are before they are rounded."""
+def _sirt_rounds(targets: RenderTargets, tables: PlayerTables, rules: RenderSettings, baked: VoxelCodes) -> Iterator[VoxelCodes]:
+    """VoxelCodes after each round, as they are before they are rounded."""
     density, color = baked
-    low, high = np.maximum(density - FARTHEST, 0.0), np.minimum(density + FARTHEST, 255.0)
+    low, high = np.maximum(density - MAX_DENSITY_CODE_CHANGE, 0.0), np.minimum(density + MAX_DENSITY_CODE_CHANGE, 255.0)
     for _ in range(ROUNDS):
-        push = pushed(lesson.pieces, rules, tables.bricks.index, density, color, lesson.wanted)
-        color = color - push.color / (push.color_share + np.float32(COLOR_DAMPING))[:, None]
-        density = density - push.density / (push.density_share + np.float32(DENSITY_DAMPING))
+        push = back_project(targets.segments, rules, tables.bricks.index, density, color, targets.target_colors)
+        color = color - push.color / (push.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
+        density = density - push.density / (push.density_normalizer + np.float32(DENSITY_DAMPING))
         color, density = np.clip(color, 0.0, 255.0), np.clip(density, low, high)
-        color[: BRICK**3], density[: BRICK**3] = 0.0, 0.0  # the empty brick
-        yield Codes(density, color)
+        color[: BRICK_SIZE**3], density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
+        yield VoxelCodes(density, color)
 
 
-def _rounded(latent: Codes, baked: Codes) -> Codes:
+def _quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
     """As codes are stored; what was visible stays so."""
-    color = rounded(np.round(latent.color).astype(np.uint8), COLOR_STEP, 255)
-    density = rounded(np.round(latent.density).astype(np.uint8), DENSITY_STEP, 255)
-    density = np.where(baked.density > 0, np.maximum(density, DENSITY_STEP), density)
-    return Codes(density.astype(np.float32), color.astype(np.float32))
+    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_CODE_STEP, 255)
+    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_CODE_STEP, 255)
+    density = np.where(baked.density > 0, np.maximum(density, DENSITY_CODE_STEP), density)
+    return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
 
 
-def _codes(bricks: Bricks) -> Codes:
-    core = bricks.voxels[:, :BRICK, :BRICK, :BRICK].reshape(-1, 4).astype(np.float32)
-    return Codes(np.ascontiguousarray(core[:, 3]), np.ascontiguousarray(core[:, :3]))
+def _own_voxel_codes(bricks: BrickTable) -> VoxelCodes:
+    core = bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE].reshape(-1, 4).astype(np.float32)
+    return VoxelCodes(np.ascontiguousarray(core[:, 3]), np.ascontiguousarray(core[:, :3]))
 
 
-def _bricks(bricks: Bricks, codes: Codes) -> Bricks:
+def _bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:
     core = np.concatenate([codes.color, codes.density[:, None]], axis=1).astype(np.uint8)
-    shape = (len(bricks.voxels), BRICK, BRICK, BRICK, 4)
-    return replace(bricks, voxels=with_borders(bricks.index, core.reshape(shape)))
+    shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
+    return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))
 
 
-def _near(
-    views: Sequence[View],
+def _perturbed_views(
+    views: Sequence[PosedView],
     rig: Rig,
     count: int,
-    bent: float,
+    pose_noise_rad: float,
     generator: np.random.Generator,
     longest_px: int,
-) -> Iterator[View]:
+) -> Iterator[PosedView]:
     """Poses near the views' own, each seen from a side of its own."""
     for turn in range(count):
         pose, camera = views[turn % len(views)]
-        by = Rotation.from_rotvec(generator.normal(size=(23, 3)) * bent)
+        by = Rotation.from_rotvec(generator.normal(size=(23, 3)) * pose_noise_rad)
         joints = (Rotation.from_rotvec(pose.joint_rotations) * by).as_rotvec()
         pose = replace(pose, joint_rotations=joints)
         root = rig.world_from_body(pose)
         pelvis = root[:3, :3] @ rig.rest_joints[0] + root[:3, 3]
         round_ = Rotation.from_rotvec(root[:3, 1] * generator.uniform(-np.pi, np.pi))
         across = camera.camera_from_world[0, :3]
-        orbit = round_ * Rotation.from_rotvec(across * generator.normal() * TILTED)
+        orbit = round_ * Rotation.from_rotvec(across * generator.normal() * CAMERA_TILT_RAD)
         moved = np.eye(4)
         moved[:3, :3] = orbit.as_matrix()
         moved[:3, 3] = pelvis - moved[:3, :3] @ pelvis
         camera = replace(camera, camera_from_world=camera.camera_from_world @ moved)
-        yield pose, _within(camera, longest_px)
+        yield pose, _fit_camera(camera, longest_px)
 
 
-def _within(camera: Camera, longest_px: int) -> Camera:
-    return camera.fitted(min(longest_px, ENLARGED * max(camera.size_px)))
+def _fit_camera(camera: Camera, longest_px: int) -> Camera:
+    return camera.resize_longer_side(min(longest_px, MAX_UPSCALE * max(camera.size_px)))

@@ -6,29 +6,29 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from export.rules import DrawingRules
-from export.skin import SkinNodes
-from export.tables import BRICK, LOG_DENSITY, NODES, Bricks
+from export.rules import RenderSettings
+from export.skin import SkinningNodes
+from export.tables import BRICK_SIZE, LOG_DENSITY_RANGE, BRICK_NODES, BrickTable
 
 
 class PosedNodes(NamedTuple):
     """The skin's nodes, and where they are in the camera's frame."""
 
-    nodes: SkinNodes
+    nodes: SkinningNodes
     camera: Float32[np.ndarray, "rows 3"]
 
 
-class Rays(NamedTuple):
+class CanonicalRays(NamedTuple):
     """Pieces of rays, with canonical starts and directions."""
 
-    ray: Float32[np.ndarray, "rays 3"]
+    direction_camera: Float32[np.ndarray, "rays 3"]
     begin: Float32[np.ndarray, "rays"]
     end: Float32[np.ndarray, "rays"]
-    start: Float32[np.ndarray, "rays 3"]
-    direction: Float32[np.ndarray, "rays 3"]
+    start_canonical: Float32[np.ndarray, "rays 3"]
+    direction_canonical: Float32[np.ndarray, "rays 3"]
 
 
-def carried(
+def skin_trilinear(
     posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
     """Where canonical points are in the camera's frame, and the derivative: trilinear.
@@ -56,7 +56,7 @@ def carried(
     return moved, derivative
 
 
-def carried_in_tetrahedra(
+def skin_tetrahedral(
     posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
     """The same, linear in the tetrahedra of `read` instead of trilinear."""
@@ -67,7 +67,7 @@ def carried_in_tetrahedra(
     moved = np.zeros((len(points), 3), dtype=np.float32)
     derivative = np.zeros((len(points), 3, 3), dtype=np.float32)
     before = None
-    for corner, share in _way(place - base):
+    for corner, share in _tetrahedron_walk(place - base):
         above = corner[:, 2]
         row = nodes.index[tuple((base + corner * np.array([1, 1, 0])).T)] + above
         there = posed.camera[row]
@@ -80,7 +80,7 @@ def carried_in_tetrahedra(
     return moved, derivative
 
 
-def _way(
+def _tetrahedron_walk(
     part: Float[np.ndarray, "points 3"],
 ) -> Iterator[tuple[Int64[np.ndarray, "points 3"], Float[np.ndarray, "points"]]]:
     """The corners of each point's tetrahedron, as steps from its cell's lowest, and their shares.
@@ -99,108 +99,108 @@ def _way(
             corner[np.arange(len(part)), order[:, turn]] += 1
 
 
-class Block(NamedTuple):
+class CompositedBlock(NamedTuple):
     """What a block of samples adds, premultiplied, and the light that is left."""
 
     colors: Float[np.ndarray, "rays 4"]
-    light: Float[np.ndarray, "rays"]
-    way: Float[np.ndarray, "rays"]
+    transmittance: Float[np.ndarray, "rays"]
+    length_m: Float[np.ndarray, "rays"]
 
 
-def sampled(
-    bricks: Bricks,
-    rays: Rays,
+def composite_block(
+    bricks: BrickTable,
+    rays: CanonicalRays,
     light: Float[np.ndarray, "rays"],
     count: int,
-    longest: Float32[np.ndarray, "rays"] | float,
-) -> Block:
+    max_spacing: Float32[np.ndarray, "rays"] | float,
+) -> CompositedBlock:
     """So many samples of density, at most `longest` apart, and one of colour at their mean."""
-    step = np.minimum((rays.end - rays.begin) / count, longest).astype(np.float32)
+    step = np.minimum((rays.end - rays.begin) / count, max_spacing).astype(np.float32)
     weights, mean = np.zeros(len(step)), np.zeros(len(step))
     for turn in range(count):
         way = step * (turn + 0.5)
-        density = read(bricks, rays.start + way[:, None] * rays.direction)[1]
+        density = sample_bricks(bricks, rays.start_canonical + way[:, None] * rays.direction_canonical)[1]
         weight = light * -np.expm1(-density * step)
         weights, mean, light = weights + weight, mean + weight * way, light - weight
     middle = (mean / np.maximum(weights, 1e-9)).astype(np.float32)
-    rgb = read(bricks, rays.start + middle[:, None] * rays.direction)[0]
+    rgb = sample_bricks(bricks, rays.start_canonical + middle[:, None] * rays.direction_canonical)[0]
     colors = np.concatenate([rgb, np.ones((len(rgb), 1))], axis=1) * weights[:, None]
-    return Block(colors=colors.astype(np.float32), light=light, way=step * count)
+    return CompositedBlock(colors=colors.astype(np.float32), transmittance=light, length_m=step * count)
 
 
-def march(
-    bricks: Bricks, rules: DrawingRules, posed: PosedNodes, rays: Rays, samples: int
+def march_rays(
+    bricks: BrickTable, rules: RenderSettings, posed: PosedNodes, rays: CanonicalRays, samples: int
 ) -> Float32[np.ndarray, "rays 4"]:
     """Premultiplied colour and alpha: blocks of samples, a Newton step between them."""
     colors, light = np.zeros((len(rays.begin), 4), dtype=np.float32), np.ones(len(rays.begin))
     alive, rest = np.arange(len(light)), rays
     scale = -(-samples // rules.samples)
-    for turn in range(rules.blocks * scale):
+    for turn in range(rules.max_blocks * scale):
         if turn > 0:
-            rest = led_back(rules, posed, rest)
-        most = longest(rules, samples, turn, rest)
-        block = sampled(bricks, rest, light[alive], rules.block, most)
+            rest = newton_correction(rules, posed, rest)
+        most = max_sample_spacing(rules, samples, turn, rest)
+        block = composite_block(bricks, rest, light[alive], rules.block_samples, most)
         colors[alive] += block.colors
-        light[alive] = block.light
+        light[alive] = block.transmittance
         rest = rest._replace(
-            begin=rest.begin + block.way, start=rest.start + rest.direction * block.way[:, None]
+            begin=rest.begin + block.length_m, start_canonical=rest.start_canonical + rest.direction_canonical * block.length_m[:, None]
         )
-        going = (block.light > rules.ended) & (rest.begin < rest.end - 1e-5)
-        alive, rest = alive[going], Rays(*(part[going] for part in rest))
+        going = (block.transmittance > rules.min_transmittance) & (rest.begin < rest.end - 1e-5)
+        alive, rest = alive[going], CanonicalRays(*(part[going] for part in rest))
     return colors
 
 
-def longest(
-    rules: DrawingRules, samples: int, turn: int, rays: Rays
+def max_sample_spacing(
+    rules: RenderSettings, samples: int, turn: int, rays: CanonicalRays
 ) -> Float32[np.ndarray, "rays"]:
     """How far apart the samples of rays' `turn`-th block may be, metres."""
     scale = -(-samples // rules.samples)
-    if turn > 0 and turn == rules.blocks * scale - 1:
-        return np.full(len(rays.begin), rules.longest_m, dtype=np.float32)
-    usual = rules.span_m / samples * 2.0 ** max(0, turn + 1 - rules.steady * scale)
-    return np.float32(usual) * unsquashed(rules, rays.direction)
+    if turn > 0 and turn == rules.max_blocks * scale - 1:
+        return np.full(len(rays.begin), rules.max_segment_m, dtype=np.float32)
+    usual = rules.sample_span_m / samples * 2.0 ** max(0, turn + 1 - rules.uniform_blocks * scale)
+    return np.float32(usual) * compression_factor(rules, rays.direction_canonical)
 
 
-def unsquashed(
-    rules: DrawingRules, direction: Float32[np.ndarray, "rays 3"]
+def compression_factor(
+    rules: RenderSettings, direction: Float32[np.ndarray, "rays 3"]
 ) -> Float32[np.ndarray, "rays"]:
     """Factor by which lengths along rays shrink where the pose compresses canonical space."""
     canonical_per_m = np.linalg.norm(direction, axis=1)
-    return np.minimum(np.float32(rules.squash_limit) / canonical_per_m, np.float32(1.0))
+    return np.minimum(np.float32(rules.max_compression) / canonical_per_m, np.float32(1.0))
 
 
-def led_back(rules: DrawingRules, posed: PosedNodes, rays: Rays) -> Rays:
+def newton_correction(rules: RenderSettings, posed: PosedNodes, rays: CanonicalRays) -> CanonicalRays:
     """Canonical starts and directions after a Newton step."""
-    camera, derivative = carried(posed, rays.start)
+    camera, derivative = skin_trilinear(posed, rays.start_canonical)
     volume = np.linalg.det(derivative)
-    sound = (volume > 1 / rules.stretch) & (volume < rules.stretch)
+    sound = (volume > 1 / rules.max_volume_ratio) & (volume < rules.max_volume_ratio)
     inverse = np.linalg.inv(derivative[sound])
-    off = rays.begin[sound, None] * rays.ray[sound] - camera[sound]
+    off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
     shift = np.einsum("nij,nj->ni", inverse, off)
     length = np.linalg.norm(shift, axis=1, keepdims=True)
-    start, direction = rays.start.copy(), rays.direction.copy()
-    start[sound] += shift * np.minimum(rules.longest_correction_m / np.maximum(length, 1e-10), 1.0)
-    direction[sound] = np.einsum("nij,nj->ni", inverse, rays.ray[sound])
-    return rays._replace(start=start, direction=direction)
+    start, direction = rays.start_canonical.copy(), rays.direction_canonical.copy()
+    start[sound] += shift * np.minimum(rules.max_correction_m / np.maximum(length, 1e-10), 1.0)
+    direction[sound] = np.einsum("nij,nj->ni", inverse, rays.direction_camera[sound])
+    return rays._replace(start_canonical=start, direction_canonical=direction)
 
 
-def read(
-    bricks: Bricks, points: Float32[np.ndarray, "points 3"]
+def sample_bricks(
+    bricks: BrickTable, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points"]]:
-    """Colour in [0, 1] and density (1/m) at canonical points, interpolated in tetrahedra.
+    """SrgbColor in [0, 1] and density (1/m) at canonical points, interpolated in tetrahedra.
 
     Log-density is interpolated, and below half a code there is nothing.
     """
-    last = np.array(bricks.index.shape) * BRICK - 1e-3
+    last = np.array(bricks.index.shape) * BRICK_SIZE - 1e-3
     place = np.clip((points - bricks.low) / bricks.voxel_m, 0.0, last).astype(np.float32)
     voxel = np.floor(place).astype(np.int64)
-    brick = bricks.index[tuple((voxel // BRICK).T)]
-    corner = (voxel % BRICK).astype(np.int32)
-    assert corner.max(initial=0) < NODES - 1
+    brick = bricks.index[tuple((voxel // BRICK_SIZE).T)]
+    corner = (voxel % BRICK_SIZE).astype(np.int32)
+    assert corner.max(initial=0) < BRICK_NODES - 1
     codes = np.zeros((len(points), 4), dtype=np.float32)
-    for step, share in _way(place - voxel):
+    for step, share in _tetrahedron_walk(place - voxel):
         codes += bricks.voxels[(brick, *(corner + step).T)] * share[:, None]
-    low, high = LOG_DENSITY
+    low, high = LOG_DENSITY_RANGE
     density = np.exp(codes[:, 3] / 255.0 * (high - low) + low)
     density = np.where(codes[:, 3] > 0.5, density, 0.0)
     return (codes[:, :3] / 255.0).astype(np.float32), density.astype(np.float32)

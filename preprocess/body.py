@@ -10,7 +10,7 @@ from preprocess.pose import BodyPose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Body:
+class BodyModel:
     """A 24-joint body with linear blend skinning (SMPL's tree; Loper et al. 2015).
 
     Attributes:
@@ -55,7 +55,7 @@ class ShapedBody:
         joints: Rest joints, metres; `joints[0]` is the pelvis J0 that the root turns about.
     """
 
-    body: Body
+    body: BodyModel
     vertices: Float[np.ndarray, "vertices 3"]
     joints: Float[np.ndarray, "24 3"]
 

@@ -4,16 +4,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
-POSES = ["poses.npz", "poses.pkl", "hmr4d_results.pt", "wham_output.pkl", "vibe_output.pkl"]
+POSE_FILE_NAMES = ["poses.npz", "poses.pkl", "hmr4d_results.pt", "wham_output.pkl", "vibe_output.pkl"]
 """Names under which poses lie in a capture folder."""
 
-MASKS = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
+MASK_NAMES = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
 """Names under which masks lie in a capture folder."""
 
 
-CAMERAS = ["cameras.npz", "transforms.json", "sparse"]
+CAMERA_NAMES = ["cameras.npz", "transforms.json", "sparse"]
 """Where cameras are looked for, in this order."""
 
 
@@ -34,18 +34,18 @@ class CapturePaths:
     cameras: Path | None
 
 
-def parts_in(folders: Iterable[Path]) -> list[Path]:
+def find_parts(folders: Iterable[Path]) -> list[Path]:
     """What lies in some folders under the names of a capture's parts."""
-    names = [*POSES, *MASKS, *CAMERAS, "images"]
+    names = [*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES, "images"]
     return [path for folder in folders for name in names if (path := folder / name).exists()]
 
 
-def poses_in(path: Path) -> Path:
+def resolve_pose_path(path: Path) -> Path:
     """The pose file of a capture folder, where the folder was named; else what was named."""
-    return _first([path], POSES) or path
+    return _first_existing([path], POSE_FILE_NAMES) or path
 
 
-def find_capture(
+def find_capture_paths(
     video: Path,
     poses: Path | None = None,
     masks: Path | None = None,
@@ -64,7 +64,7 @@ def find_capture(
             moving one, for which no file is looked for either.
 
     Raises:
-        BadInput: If something that was named, or the poses, is not there.
+        InputError: If something that was named, or the poses, is not there.
     """
     if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
         cameras = "static"
@@ -73,13 +73,13 @@ def find_capture(
         named.append(Path(cameras))
     for path in named:
         if not path.exists():
-            raise BadInput(f"{path} does not exist; check the path.")
+            raise InputError(f"{path} does not exist; check the path.")
     if poses is None:
-        poses = _first([video], POSES)
+        poses = _first_existing([video], POSE_FILE_NAMES)
     if poses is None:
-        beside = _first([video.parent], POSES)
+        beside = _first_existing([video.parent], POSE_FILE_NAMES)
         there = "" if beside is None else f" {beside} lies beside it: is it meant?"
-        raise BadInput(
+        raise InputError(
             f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
             f"tracker wrote: docs/formats.md).{there} Finding poses in the video is a tracker's "
             "work."
@@ -87,16 +87,16 @@ def find_capture(
     inside = video.is_dir() and video.name != "images"
     places = [video if inside else video.parent, poses.parent]
     if cameras is None:
-        cameras = _first(places, CAMERAS)
+        cameras = _first_existing(places, CAMERA_NAMES)
     return CapturePaths(
         video=video,
         poses=poses,
-        masks=masks or _first(places, MASKS),
+        masks=masks or _first_existing(places, MASK_NAMES),
         cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
     )
 
 
-def find_live_capture(
+def find_live_capture_paths(
     video: Path,
     poses: Path | None = None,
     masks: Path | None = None,
@@ -111,23 +111,23 @@ def find_live_capture(
         cameras: Camera file, or "static".
 
     Raises:
-        BadInput: If nobody says where the poses will be, or a camera file is not there.
+        InputError: If nobody says where the poses will be, or a camera file is not there.
     """
     inside = video.parent if video.name == "images" else video
     is_folder = video.is_dir()
     if poses is None and is_folder:
-        poses = _first([inside], ["poses.npz", "poses.jsonl"]) or inside / "poses.npz"
+        poses = _first_existing([inside], ["poses.npz", "poses.jsonl"]) or inside / "poses.npz"
     if poses is None:
-        raise BadInput(
+        raise InputError(
             f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "
             "written anew again and again, or a .jsonl, a frame a line)."
         )
     if masks is None:
         masks = (inside if is_folder else poses.parent) / "masks"
     if cameras is None:
-        cameras = _first([inside, poses.parent], ["cameras.npz"])
+        cameras = _first_existing([inside, poses.parent], ["cameras.npz"])
     elif str(cameras) != "static" and not Path(cameras).exists():
-        raise BadInput(f"{cameras} does not exist; check the path.")
+        raise InputError(f"{cameras} does not exist; check the path.")
     return CapturePaths(
         video=video,
         poses=poses,
@@ -136,6 +136,6 @@ def find_live_capture(
     )
 
 
-def _first(places: list[Path], names: list[str]) -> Path | None:
+def _first_existing(places: list[Path], names: list[str]) -> Path | None:
     candidates = (place / name for place in places if place.is_dir() for name in names)
     return next((path for path in candidates if path.exists()), None)

@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from capture.errors import BadInput
-from capture.images import natural_key
-from preprocess.pickles.content import MAX_BYTES, bounded_bytes, guarded, plain_pickle
+from capture.errors import InputError
+from capture.images import natural_sort_key
+from preprocess.pickles.content import MAX_BYTES, read_limited, explain_failures, load_plain_pickle
 from preprocess.pickles.inert import product
 
-SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"})
+POSE_FILE_SUFFIXES = frozenset({".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"})
 """Endings of files that may hold poses; in a folder only these are read."""
 
-OTHERS = frozenset({".txt", ".csv", ".md", ".bvh", ".fbx", ".glb", ".obj", ".mp4", ".mov", ".png"})
+NON_POSE_SUFFIXES = frozenset({".txt", ".csv", ".md", ".bvh", ".fbx", ".glb", ".obj", ".mp4", ".mov", ".png"})
 """Endings of files that people name by mistake."""
 
-NO_PICKLES = {
+UNSUPPORTED_MAGIC = {
     b"\x89HDF": "an HDF5 file; of PeopleSnapshot's: python -c \"import h5py, numpy; f = "
     "h5py.File('reconstructed_poses.hdf5'); numpy.savez('poses.npz', **{k: f[k][()] for k in f})\"",
     b"MATLAB": "a .mat of MATLAB; write global_orient, body_pose and transl to an .npz",
@@ -35,44 +35,44 @@ NO_PICKLES = {
 }
 """What files begin with that can be no poses, and what they are."""
 
-PIECE = 1 << 20
+CHUNK_BYTES = 1 << 20
 """Bytes that are unpacked at a time."""
 
-MOST_FILES = 100_000
+MAX_FOLDER_FILES = 100_000
 """Of a folder: more files are no poses, a file a frame."""
 
 
-def read_content(path: Path) -> Any:
+def read_untrusted_file(path: Path) -> Any:
     """What a file holds; of a folder a dictionary of its files in natural order, by their names.
 
     Raises:
-        BadInput: If it is missing, damaged, too large, or asks to run something.
+        InputError: If it is missing, damaged, too large, or asks to run something.
     """
     if path.is_dir():
         return _folder(path)
     if not path.is_file():
-        raise BadInput(f"{path} does not exist (or is no file); a file of poses was expected.")
-    if path.suffix.lower() in OTHERS:
-        raise BadInput(
+        raise InputError(f"{path} does not exist (or is no file); a file of poses was expected.")
+    if path.suffix.lower() in NON_POSE_SUFFIXES:
+        raise InputError(
             f"{path} holds no poses that are read; expected a file ending in "
-            f"{', '.join(sorted(SUFFIXES))} or .jsonl (docs/formats.md)."
+            f"{', '.join(sorted(POSE_FILE_SUFFIXES))} or .jsonl (docs/formats.md)."
         )
-    return guarded(path, lambda: _decoded(bounded_bytes(path), path), "file of poses")
+    return explain_failures(path, lambda: _decode(read_limited(path), path), "file of poses")
 
 
 def _folder(path: Path) -> dict[str, Any]:
     files = sorted(
-        (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=natural_key
+        (file for file in path.iterdir() if file.suffix.lower() in POSE_FILE_SUFFIXES), key=natural_sort_key
     )
-    if not files or len(files) > MOST_FILES:
-        raise BadInput(
-            f"{path} is a folder with {len(files)} files ({', '.join(sorted(SUFFIXES))}); expected "
+    if not files or len(files) > MAX_FOLDER_FILES:
+        raise InputError(
+            f"{path} is a folder with {len(files)} files ({', '.join(sorted(POSE_FILE_SUFFIXES))}); expected "
             "a file of poses, or a folder with one for each frame or person."
         )
-    return {file.name: read_content(file) for file in files}
+    return {file.name: read_untrusted_file(file) for file in files}
 
 
-def _decoded(data: bytes, path: Path) -> Any:
+def _decode(data: bytes, path: Path) -> Any:
     """What the bytes hold, whatever they are packed in."""
     if not data:
         raise ValueError("it is empty")
@@ -81,19 +81,19 @@ def _decoded(data: bytes, path: Path) -> Any:
     if data.startswith(b"\x93NUMPY"):
         return _npy(data)
     if data[:1] == b"\x78" and (data[0] * 256 + data[1]) % 31 == 0:
-        return plain_pickle(_unpacked(lambda: _inflated(data, zlib.MAX_WBITS)))
+        return load_plain_pickle(_decompress(lambda: _inflated(data, zlib.MAX_WBITS)))
     if data.startswith(b"\x1f\x8b"):
-        return plain_pickle(_unpacked(lambda: _inflated(data, 16 + zlib.MAX_WBITS)))
+        return load_plain_pickle(_decompress(lambda: _inflated(data, 16 + zlib.MAX_WBITS)))
     if data.startswith(b"BZ"):
-        return plain_pickle(_unpacked(lambda: _blocks(BZ2Decompressor(), data)))
+        return load_plain_pickle(_decompress(lambda: _blocks(BZ2Decompressor(), data)))
     if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
-        return plain_pickle(_unpacked(lambda: _blocks(lzma.LZMADecompressor(), data)))
-    for magic, words in NO_PICKLES.items():
+        return load_plain_pickle(_decompress(lambda: _blocks(lzma.LZMADecompressor(), data)))
+    for magic, words in UNSUPPORTED_MAGIC.items():
         if data.startswith(magic):
             raise ValueError(words)
     if data[:64].lstrip()[:1] in (b"{", b"["):
         return _json(data, path)
-    return plain_pickle(data)
+    return load_plain_pickle(data)
 
 
 def _json(data: bytes, path: Path) -> Any:
@@ -102,7 +102,7 @@ def _json(data: bytes, path: Path) -> Any:
     except (ValueError, RecursionError):
         if path.suffix.lower() == ".json":
             raise
-        return plain_pickle(data)  # a pickle may begin with a bracket, too
+        return load_plain_pickle(data)  # a pickle may begin with a bracket, too
 
 
 def _zip(data: bytes) -> Any:
@@ -126,7 +126,7 @@ def _zip(data: bytes) -> Any:
                 raise ValueError("a storage that is cut off")
             return raw or bytes(1)
 
-        return plain_pickle(archive.read(program), fetch)
+        return load_plain_pickle(archive.read(program), fetch)
 
 
 def _npy(data: bytes) -> Any:
@@ -140,7 +140,7 @@ def _npy(data: bytes) -> Any:
     )
     shape, by_columns, kind = read(stream)
     if kind.hasobject:
-        return plain_pickle(data[stream.tell() :])
+        return load_plain_pickle(data[stream.tell() :])
     if kind.names or kind.subdtype:
         raise ValueError("an array of records")
     numbers = np.frombuffer(data, kind, product(shape), stream.tell())
@@ -150,7 +150,7 @@ def _npy(data: bytes) -> Any:
     return array
 
 
-def _unpacked(pieces: Callable[[], Iterator[bytes]]) -> bytes:
+def _decompress(pieces: Callable[[], Iterator[bytes]]) -> bytes:
     """All pieces as one, once their sizes were counted: what is too large is not kept at all."""
     size = 0
     for piece in pieces():
@@ -163,18 +163,18 @@ def _unpacked(pieces: Callable[[], Iterator[bytes]]) -> bytes:
 def _inflated(data: bytes, bits: int) -> Iterator[bytes]:
     """zlib's and gzip's content, piece after piece."""
     inflater = zlib.decompressobj(bits)
-    for start in range(0, len(data), PIECE):
-        packed = data[start : start + PIECE]
+    for start in range(0, len(data), CHUNK_BYTES):
+        packed = data[start : start + CHUNK_BYTES]
         while packed and not inflater.eof:
-            yield inflater.decompress(packed, PIECE)
+            yield inflater.decompress(packed, CHUNK_BYTES)
             packed = inflater.unconsumed_tail
 
 
 def _blocks(unpacker: BZ2Decompressor | lzma.LZMADecompressor, data: bytes) -> Iterator[bytes]:
     """bzip2's and LZMA's content, piece after piece."""
-    for start in range(0, len(data), PIECE):
+    for start in range(0, len(data), CHUNK_BYTES):
         if unpacker.eof:
             return
-        yield unpacker.decompress(data[start : start + PIECE], PIECE)
+        yield unpacker.decompress(data[start : start + CHUNK_BYTES], CHUNK_BYTES)
         while not (unpacker.needs_input or unpacker.eof):
-            yield unpacker.decompress(b"", PIECE)
+            yield unpacker.decompress(b"", CHUNK_BYTES)

@@ -6,24 +6,24 @@ from typing import final
 
 import numpy as np
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.pace import Pace
-from preprocess.plausibility import plausible, without_impossible
+from capture.pace import PacingClock
+from preprocess.plausibility import require_plausible, invalidate_implausible_rows
 from preprocess.pose import BodyPose, Motion
 from preprocess.poses import read_poses
 
-PATIENCE_S = 2.0
+MAX_WAIT_S = 2.0
 """So long after it was filmed a frame waits for its pose or its mask; then it is left out."""
-LOOK_EVERY_S = 0.02
-SINCE_1970_S = 1e8
+POLL_INTERVAL_S = 0.02
+MIN_EPOCH_TIME_S = 1e8
 """Times beyond this are no seconds of a clip."""
-REACH_S = 0.02
+MAX_TIME_OFFSET_S = 0.02
 """Of a pose whose time is given: how far it may lie from its frame's."""
 
 
 @final
-class GrowingPoses:
+class LivePoses:
     """The poses of a live source, which come late or not at all.
 
     A pose belongs to its frame by `frame`, by `time` (seconds from the first picture, or since
@@ -33,11 +33,11 @@ class GrowingPoses:
     def __init__(
         self,
         path: Path,
-        pace: Pace,
+        pace: PacingClock,
         *,
         default_model: str,
         first_within_s: float,
-        patience_s: float = PATIENCE_S,
+        patience_s: float = MAX_WAIT_S,
         started_at: float = 0.0,
     ) -> None:
         """Waits for the first valid pose.
@@ -51,7 +51,7 @@ class GrowingPoses:
             started_at: When the source's first picture was taken, in seconds since 1970.
 
         Raises:
-            BadInput: If there is no valid pose after `first_within_s`, with the reason, or the
+            InputError: If there is no valid pose after `first_within_s`, with the reason, or the
                 first ones cannot be poses in radians and metres.
         """
         self._path, self._pace, self._patience_s = path, pace, patience_s
@@ -63,13 +63,13 @@ class GrowingPoses:
         self._trouble = f"There are no poses {path}."
         deadline = pace.now() + first_within_s
         while not self._has_any():
-            if pace.now() >= deadline or pace.ended:
-                raise BadInput(
+            if pace.now() >= deadline or pace.stopped:
+                raise InputError(
                     f"{self._trouble} Within {first_within_s:.0f} s (--idle-seconds) a first valid "
                     "pose was expected there. Is the tracker running?"
                 )
-            pace.until(pace.now() + LOOK_EVERY_S)
-            self._look()
+            pace.wait_until(pace.now() + POLL_INTERVAL_S)
+            self._poll()
 
     @property
     def motion(self) -> Motion:
@@ -77,20 +77,20 @@ class GrowingPoses:
         assert self._motion is not None
         return self._motion
 
-    def place(self, placed: Callable[[Motion], Motion]) -> None:
+    def set_placement(self, placed: Callable[[Motion], Motion]) -> None:
         """Brings these poses, and all that come, to the body and the cameras that are used."""
         self._placed, self._motion = placed, placed(self.motion)
 
-    def of(self, frame: Frame) -> BodyPose | str:
+    def wait_for_pose(self, frame: Frame) -> BodyPose | str:
         """The pose of a frame; waits for it. Or why there is none."""
         deadline = (self._pace.now() if frame.due_s is None else frame.due_s) + self._patience_s
         while (row := self._row(frame)) is None:
             if self._is_past(frame):
                 return "no pose"
-            if self._pace.now() >= deadline or self._pace.ended:
+            if self._pace.now() >= deadline or self._pace.stopped:
                 return f"no pose within {self._patience_s:g} s"
-            self._pace.until(min(deadline, self._pace.now() + LOOK_EVERY_S))
-            self._look()
+            self._pace.wait_until(min(deadline, self._pace.now() + POLL_INTERVAL_S))
+            self._poll()
         return self.motion[row] if self.motion.valid[row] else "pose invalid"
 
     def _has_any(self) -> bool:
@@ -104,23 +104,23 @@ class GrowingPoses:
             return frame.index if frame.index < len(motion) else None
         gaps = np.abs(self._times() - frame.time_s)
         nearest = int(np.argmin(np.where(np.isnan(gaps), np.inf, gaps)))
-        return nearest if gaps[nearest] <= REACH_S else None
+        return nearest if gaps[nearest] <= MAX_TIME_OFFSET_S else None
 
     def _is_past(self, frame: Frame) -> bool:
         """Whether poses of later frames have come already."""
         if self.motion.frames is not None:
             return int(self.motion.frames.max()) > frame.index
         if self.motion.times_s is not None:
-            return float(np.nanmax(self._times())) > frame.time_s + REACH_S
+            return float(np.nanmax(self._times())) > frame.time_s + MAX_TIME_OFFSET_S
         return False
 
     def _times(self) -> np.ndarray:
         """Times from the first picture on."""
         times = self.motion.times_s
         assert times is not None
-        return times - self._started_at if np.nanmax(times) > SINCE_1970_S else times
+        return times - self._started_at if np.nanmax(times) > MIN_EPOCH_TIME_S else times
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Reads the file again if it has changed; a half-written one is left for the next look."""
         try:
             status = self._path.stat()
@@ -131,12 +131,12 @@ class GrowingPoses:
             return
         try:
             read = read_poses(self._path, default_model=self._default_model)
-        except BadInput as cause:
+        except InputError as cause:
             self._trouble = str(cause)
             return
         if not self._has_any() and read.valid.any():
-            plausible(read, self._path)
-        self._motion = self._placed(without_impossible(read))
+            require_plausible(read, self._path)
+        self._motion = self._placed(invalidate_implausible_rows(read))
         self._version = version
         if self._motion.frames is not None:
             self._row_of = {int(number): row for row, number in enumerate(self._motion.frames)}

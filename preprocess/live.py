@@ -4,22 +4,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.images import cuts_out
-from capture.pace import Pace
-from capture.source import Source
+from capture.images import has_cutout_alpha
+from capture.pace import PacingClock
+from capture.source import FrameSource
 from preprocess.camera_file import CameraTrack
 from preprocess.capture_folder import CapturePaths
-from preprocess.fit.growing import GrowingFit
-from preprocess.growing_poses import GrowingPoses
-from preprocess.masks.choice import MaskChoice, choose_masks
-from preprocess.masks.growing import GrowingMasks
+from preprocess.fit.growing import LiveAlignment
+from preprocess.growing_poses import LivePoses
+from preprocess.masks.choice import MaskOrigin, choose_mask_origin
+from preprocess.masks.growing import LiveMasks
 from preprocess.masks.segmenter import Segmenter, segmenter_name
 from preprocess.observation import Observation
-from preprocess.observe import Dropped, joiner, own_alpha, shrunk
+from preprocess.observe import DroppedFrame, compose_observation_builder, alpha_channel_mask, shrink_to_longer_side
 
-ALPHA_CAME_LATE = (
+LATE_ALPHA_WARNING = (
     "Some of the pictures have an alpha channel that cuts the person out, but those that were "
     "there at the start had none: masks were estimated. Learn from the finished folder, without "
     "--live, to use the alpha channel."
@@ -27,7 +27,7 @@ ALPHA_CAME_LATE = (
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LiveParts:
+class LiveInputs:
     """What is written beside a live source by other programs.
 
     Attributes:
@@ -37,23 +37,23 @@ class LiveParts:
         pace: The clock by which both are waited for.
     """
 
-    poses: GrowingPoses
-    masks: GrowingMasks | None
-    choice: MaskChoice
-    pace: Pace
+    poses: LivePoses
+    masks: LiveMasks | None
+    choice: MaskOrigin
+    pace: PacingClock
 
     @classmethod
     def open(
         cls,
         paths: CapturePaths,
-        source: Source,
-        pace: Pace,
+        source: FrameSource,
+        pace: PacingClock,
         *,
         family: str,
         invert: bool | None,
         first_within_s: float,
         given_masks: Path | None = None,
-    ) -> "LiveParts":
+    ) -> "LiveInputs":
         """Waits for the first pose; then what there is by way of masks is what is used.
 
         Args:
@@ -66,31 +66,31 @@ class LiveParts:
             given_masks: What --masks names, if it was given.
 
         Raises:
-            BadInput: If no pose comes, or what --masks names is no folder.
+            InputError: If no pose comes, or what --masks names is no folder.
         """
         named = given_masks if segmenter_name(given_masks) is None else None
         if named is not None and not named.is_dir():
-            raise BadInput(
+            raise InputError(
                 f"There is no folder of masks {named}. Give --masks: the folder to which "
                 "they will be written, or segmenter:grabcut to have them estimated."
             )
-        poses = GrowingPoses(
+        poses = LivePoses(
             paths.poses, pace, default_model=family, first_within_s=first_within_s,
             started_at=source.started_at,
         )  # fmt: skip
         found = paths.masks if paths.masks is not None and paths.masks.is_dir() else None
-        choice = choose_masks(given_masks, found, has_alpha=source.has_alpha)
-        masks = None if choice.path is None else GrowingMasks(choice.path, pace, invert=invert)
+        choice = choose_mask_origin(given_masks, found, has_alpha=source.has_alpha)
+        masks = None if choice.path is None else LiveMasks(choice.path, pace, invert=invert)
         return cls(poses=poses, masks=masks, choice=choice, pace=pace)
 
-    def observer(
+    def observation_builder(
         self,
-        source: Source,
+        source: FrameSource,
         cameras: CameraTrack,
         size_px: int | None,
         segment: Segmenter | None = None,
-        fit: GrowingFit | None = None,
-    ) -> Callable[[Frame], Observation | Dropped]:
+        fit: LiveAlignment | None = None,
+    ) -> Callable[[Frame], Observation | DroppedFrame]:
         """What makes an observation of a frame, waiting for its pose and its mask.
 
         Args:
@@ -101,32 +101,32 @@ class LiveParts:
             fit: What fits the poses to another body than their tracker's, if that is needed.
 
         Raises:
-            BadInput: If there are many cameras: nobody knows yet whose they are.
+            InputError: If there are many cameras: nobody knows yet whose they are.
         """
-        if cameras.moves:
-            raise BadInput(
+        if cameras.is_moving:
+            raise InputError(
                 f"{cameras.source} holds {len(cameras.cameras)} cameras; a live source has one "
                 "that stands still."
             )
-        alpha_of = own_alpha if self.masks is None else self.masks.of
-        target_px = shrunk(source.size_px, size_px)
-        pose_of = self.poses.of
-        if fit is not None and not fit.masked:
-            pose_of = fit.posing(pose_of, cameras[0])
-        seen = joiner(pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment)
-        if self.choice.fallback:
-            seen = _noticing_alpha(seen, source)
-        return fit.observing(seen) if fit is not None and fit.masked else seen
+        alpha_of = alpha_channel_mask if self.masks is None else self.masks.wait_for_mask
+        target_px = shrink_to_longer_side(source.size_px, size_px)
+        pose_of = self.poses.wait_for_pose
+        if fit is not None and not fit.uses_masks:
+            pose_of = fit.align_poses(pose_of, cameras[0])
+        seen = compose_observation_builder(pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment)
+        if self.choice.is_fallback:
+            seen = _warn_of_late_alpha(seen, source)
+        return fit.align_observations(seen) if fit is not None and fit.uses_masks else seen
 
 
-def _noticing_alpha(
-    seen: Callable[[Frame], Observation | Dropped], source: Source
-) -> Callable[[Frame], Observation | Dropped]:
+def _warn_of_late_alpha(
+    seen: Callable[[Frame], Observation | DroppedFrame], source: FrameSource
+) -> Callable[[Frame], Observation | DroppedFrame]:
     """The same, with a warning once a picture comes whose alpha channel would have been a mask."""
 
-    def observed(frame: Frame) -> Observation | Dropped:
-        if cuts_out(frame.alpha) and ALPHA_CAME_LATE not in source.warnings:
-            source.warnings.append(ALPHA_CAME_LATE)
+    def observed(frame: Frame) -> Observation | DroppedFrame:
+        if has_cutout_alpha(frame.alpha) and LATE_ALPHA_WARNING not in source.warnings:
+            source.warnings.append(LATE_ALPHA_WARNING)
         return seen(frame)
 
     return observed

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
-MAX_BYTES = 4 << 30
+MAX_UNPACKED_BYTES = 4 << 30
 """Archives that would unpack to more are refused."""
 
 
@@ -18,25 +18,25 @@ def read_npz(
     """The arrays of an archive (only those of `keys` that it has, if given); never executes any.
 
     Raises:
-        BadInput: If the file is missing, damaged, too large, or holds pickled objects under a key
+        InputError: If the file is missing, damaged, too large, or holds pickled objects under a key
             that is asked for.
     """
     if not path.is_file():
-        raise BadInput(f"{path} does not exist (or is no file); an .npz archive was expected.")
+        raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > MAX_BYTES:
-            raise BadInput(
-                f"{path} unpacks to {size >> 20} MiB; more than {MAX_BYTES >> 20} MiB are not read."
+        if size > MAX_UNPACKED_BYTES:
+            raise InputError(
+                f"{path} unpacks to {size >> 20} MiB; more than {MAX_UNPACKED_BYTES >> 20} MiB are not read."
             )
         with np.load(path, allow_pickle=False) as archive:
             wanted = [key for key in (keys or archive.files) if key in archive.files]
             found = {key: archive[key] for key in wanted}
-    except BadInput:
+    except InputError:
         raise
     except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
-        raise BadInput(
+        raise InputError(
             f"{path} is no readable .npz of plain arrays ({cause}). "
             "Is the file complete, and written without pickled objects?"
         ) from cause

@@ -7,23 +7,23 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from capture.camera import Camera, same_shape
-from capture.errors import BadInput
+from capture.camera import Camera, same_aspect_ratio
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.images import cuts_out
-from capture.source import Source
+from capture.images import has_cutout_alpha
+from capture.source import FrameSource
 from preprocess.camera_file import CameraTrack
 from preprocess.masks.files import Masks
-from preprocess.masks.naming import rows_by_name
+from preprocess.masks.naming import associate_by_name
 from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
-from preprocess.pairing import row_by_order
-from preprocess.pairing_by_time import row_by_time
+from preprocess.pairing import associate_by_order
+from preprocess.pairing_by_time import associate_by_time
 from preprocess.pose import BodyPose, Motion
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dropped:
+class DroppedFrame:
     """A frame that cannot be used.
 
     Attributes:
@@ -36,28 +36,28 @@ class Dropped:
 
 
 def observe(
-    source: Source,
+    source: FrameSource,
     motion: Motion,
     masks: Masks | None,
     cameras: CameraTrack,
     *,
     size_px: int | None = None,
     segment: Segmenter | None = None,
-) -> Iterator[Observation | Dropped]:
-    """Observations of the wanted frames in order, lazily; `observer` says the rest."""
-    observed = observer(source, motion, masks, cameras, size_px=size_px, segment=segment)
+) -> Iterator[Observation | DroppedFrame]:
+    """Observations of the wanted frames in order, lazily; `observation_builder` says the rest."""
+    observed = observation_builder(source, motion, masks, cameras, size_px=size_px, segment=segment)
     return map(observed, source.frames())
 
 
-def observer(
-    source: Source,
+def observation_builder(
+    source: FrameSource,
     motion: Motion,
     masks: Masks | None,
     cameras: CameraTrack,
     *,
     size_px: int | None = None,
     segment: Segmenter | None = None,
-) -> Callable[[Frame], Observation | Dropped]:
+) -> Callable[[Frame], Observation | DroppedFrame]:
     """What makes an observation of a frame, after everything was checked.
 
     Args:
@@ -69,15 +69,15 @@ def observer(
         segment: What estimates the mask where there are no `masks`, whatever the alpha channel.
 
     Raises:
-        BadInput: At once, if the parts do not fit together.
+        InputError: At once, if the parts do not fit together.
     """
-    row_of = check_motion(motion, source)
+    row_of = associate_poses(motion, source)
     made = masks is None and segment is not None
-    mask_row = (lambda index: index) if made else check_masks(masks, source)
-    camera_row = check_cameras(cameras, source)
+    mask_row = (lambda index: index) if made else associate_masks(masks, source)
+    camera_row = associate_cameras(cameras, source)
 
     def pose_of(frame: Frame) -> BodyPose | str:
-        if frame.index in cameras.missing:
+        if frame.index in cameras.frames_without_camera:
             return "no camera"
         row = row_of(frame)
         if row is None:
@@ -86,11 +86,11 @@ def observer(
 
     def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         if masks is None:
-            return own_alpha(frame, size_px)
+            return alpha_channel_mask(frame, size_px)
         return masks.alpha(mask_row(frame.index), size_px)
 
-    target_px = shrunk(source.size_px, size_px)
-    return joiner(
+    target_px = shrink_to_longer_side(source.size_px, size_px)
+    return compose_observation_builder(
         pose_of,
         alpha_of,
         lambda index: cameras[camera_row(index)],
@@ -99,127 +99,127 @@ def observer(
     )
 
 
-def joiner(
+def compose_observation_builder(
     pose_of: Callable[[Frame], BodyPose | str],
     alpha_of: Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "height width"]],
     camera_of: Callable[[int], Camera],
     target_px: tuple[int, int],
     *,
     segment: Segmenter | None = None,
-) -> Callable[[Frame], Observation | Dropped]:
+) -> Callable[[Frame], Observation | DroppedFrame]:
     """What joins a frame with its pose, mask and camera, each found by a function of its own.
 
     Args:
         pose_of: The frame's pose, or why it has none.
-        alpha_of: Its mask at a size; raises BadInput if it has none.
+        alpha_of: Its mask at a size; raises InputError if it has none.
         camera_of: The camera of a frame's number, of the frames' size.
         target_px: Width and height of the observations.
         segment: What finds the mask in place of `alpha_of`, once the frame was scaled.
     """
 
-    def joined(frame: Frame) -> Observation | Dropped:
+    def joined(frame: Frame) -> Observation | DroppedFrame:
         if "corrupt" in frame.flags:
-            return Dropped(index=frame.index, reason="picture damaged")
+            return DroppedFrame(index=frame.index, reason="picture damaged")
         pose = pose_of(frame)
         if isinstance(pose, str):
-            return Dropped(index=frame.index, reason=pose)
-        camera = camera_of(frame.index).resized(target_px)
+            return DroppedFrame(index=frame.index, reason=pose)
+        camera = camera_of(frame.index).resize(target_px)
         try:
             if segment is None:
-                alpha, scaled = alpha_of(frame, target_px), _resized(frame, target_px)
+                alpha, scaled = alpha_of(frame, target_px), _resize_frame(frame, target_px)
             else:
-                scaled = _resized(frame, target_px)
+                scaled = _resize_frame(frame, target_px)
                 alpha = segment(scaled, pose, camera)
-        except BadInput as cause:
-            return Dropped(index=frame.index, reason=f"mask unusable: {cause}")
+        except InputError as cause:
+            return DroppedFrame(index=frame.index, reason=f"mask unusable: {cause}")
         if not (alpha > 0.5).any():
-            return Dropped(index=frame.index, reason="mask empty")
+            return DroppedFrame(index=frame.index, reason="mask empty")
         return Observation(frame=scaled, alpha=alpha, pose=pose, camera=camera)
 
     return joined
 
 
-def check_motion(motion: Motion, source: Source) -> Callable[[Frame], int | None]:
+def associate_poses(motion: Motion, source: FrameSource) -> Callable[[Frame], int | None]:
     """Whether the poses fit the frames; cheap unless their numbers differ.
 
     Returns:
         From a frame to its row in the motion, or to None where it has none.
 
     Raises:
-        BadInput: If most poses are unusable, none belongs to a frame that is wanted, or rows and
+        InputError: If most poses are unusable, none belongs to a frame that is wanted, or rows and
             frames are of different number and nothing tells which belong together.
     """
     usable = int(motion.valid.sum())
     if 2 * usable < len(motion):
-        raise BadInput(
+        raise InputError(
             f"Only {usable} of {len(motion)} poses are usable, the others are NaN or marked as "
             "not valid; at least half were expected. Did the tracker lose the person?"
         )
     if motion.frames is not None:
         rows = {int(frame): row for row, frame in enumerate(motion.frames)}
-        if not any(source.selection.wants(f) and 0 <= f < source.frames_in_file for f in rows):
-            raise BadInput(
+        if not any(source.selection.contains(f) and 0 <= f < source.frames_in_file for f in rows):
+            raise InputError(
                 f"The poses belong to the frames {min(rows)} to {max(rows)}, and none of those is "
                 f"among the {source.frame_count} wanted frames of {source.path}."
             )
         return lambda frame: rows.get(frame.index)
     if motion.times_s is not None:
-        by_time = row_by_time(motion.times_s, source)
+        by_time = associate_by_time(motion.times_s, source)
         return lambda frame: by_time(frame.time_s)
-    by_order = row_by_order(len(motion), source, "poses")
+    by_order = associate_by_order(len(motion), source, "poses")
     return lambda frame: by_order(frame.index)
 
 
-def check_masks(masks: Masks | None, source: Source) -> Callable[[int], int]:
+def associate_masks(masks: Masks | None, source: FrameSource) -> Callable[[int], int]:
     """Whether the masks fit the frames; returns the mask's row by the frame's number.
 
     Raises:
-        BadInput: If there are none, or of another shape, or not one per frame and their names do
+        InputError: If there are none, or of another shape, or not one per frame and their names do
             not tell whose they are. What is returned raises it for frames without a mask.
     """
     if masks is None:
         if source.has_alpha:
             return lambda index: index
-        raise BadInput(
+        raise InputError(
             f"No masks were found for {source.path}. Give --masks: a folder with one 8-bit picture "
             "a frame, 255 where the person is, or segmenter:grabcut to have them estimated."
         )
-    if not same_shape(masks.size_px, source.size_px):
-        raise BadInput(
+    if not same_aspect_ratio(masks.size_px, source.size_px):
+        raise InputError(
             f"The masks in {masks.path} have {masks.size_px[0]}x{masks.size_px[1]} px, the frames "
             f"{source.size_px[0]}x{source.size_px[1]}; expected the same shape. Was the video "
             "cropped or rotated?"
         )
     if masks.names is not None and masks.count not in (source.frames_in_file, source.frame_count):
-        named = rows_by_name(masks.names, source)
+        named = associate_by_name(masks.names, source)
         if named is not None:
-            return _row_named(named, masks)
-    return row_by_order(masks.count, source, f"masks in {masks.path}")
+            return _row_by_name(named, masks)
+    return associate_by_order(masks.count, source, f"masks in {masks.path}")
 
 
-def _row_named(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
+def _row_by_name(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
     """Rows of masks that belong to frames by their names, some of which have none."""
 
     def row(index: int) -> int:
         if index not in named:
-            raise BadInput(f"{masks.path} holds none for frame {index}")
+            raise InputError(f"{masks.path} holds none for frame {index}")
         return named[index]
 
     return row
 
 
-def check_cameras(cameras: CameraTrack, source: Source) -> Callable[[int], int]:
+def associate_cameras(cameras: CameraTrack, source: FrameSource) -> Callable[[int], int]:
     """Whether there is a camera for each frame; returns its row by the frame's number.
 
     Raises:
-        BadInput: If there are many, but not one per frame.
+        InputError: If there are many, but not one per frame.
     """
-    if not cameras.moves:
+    if not cameras.is_moving:
         return lambda index: 0
-    return row_by_order(len(cameras.cameras), source, f"cameras in {cameras.source}")
+    return associate_by_order(len(cameras.cameras), source, f"cameras in {cameras.source}")
 
 
-def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
+def shrink_to_longer_side(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
     """Width and height with the longer side shrunk to `longer_px`; never enlarged."""
     if longer_px is None or longer_px >= max(size_px):
         return size_px
@@ -227,23 +227,23 @@ def shrunk(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
-def own_alpha(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
     """The picture's own alpha channel, scaled.
 
     Raises:
-        BadInput: If it has none, or an opaque one, which does not say where the person is.
+        InputError: If it has none, or an opaque one, which does not say where the person is.
     """
     if frame.alpha is None:
-        raise BadInput("the picture has no alpha channel")
-    if not cuts_out(frame.alpha):
-        raise BadInput("the picture's alpha channel is opaque, unlike that of others")
+        raise InputError("the picture has no alpha channel")
+    if not has_cutout_alpha(frame.alpha):
+        raise InputError("the picture's alpha channel is opaque, unlike that of others")
     alpha = frame.alpha.astype(np.float32) / np.float32(255.0)
     if frame.size_px == size_px:
         return alpha
     return cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA)
 
 
-def _resized(frame: Frame, size_px: tuple[int, int]) -> Frame:
+def _resize_frame(frame: Frame, size_px: tuple[int, int]) -> Frame:
     if frame.size_px == size_px:
         return frame
     alpha = frame.alpha

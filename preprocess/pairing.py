@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
-from capture.errors import BadInput
-from capture.source import Source
+from capture.errors import InputError
+from capture.source import FrameSource
 
-NUMBERED = "; or say which frame each belongs to (the keys `frame` or `time`)"
+NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `time`)"
 
 
-def row_by_order(rows: int, source: Source, things: str) -> Callable[[int], int]:
+def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:
     """From a frame's number to its row: one row a frame, of all frames or of the wanted ones.
 
     The container's claim counts, so that a truncated video still fits its poses; where it does not
@@ -20,7 +20,7 @@ def row_by_order(rows: int, source: Source, things: str) -> Callable[[int], int]
         things: What the rows are, for the message ("poses in poses.npz").
 
     Raises:
-        BadInput: If there are more or fewer rows than frames.
+        InputError: If there are more or fewer rows than frames.
     """
     for total in (source.frames_in_file, None):
         count = source.count_frames() if total is None else total
@@ -28,13 +28,13 @@ def row_by_order(rows: int, source: Source, things: str) -> Callable[[int], int]
             return lambda index: index
         if rows == source.selection.count(count):
             return source.selection.position
-    raise BadInput(
+    raise InputError(
         f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
-        f"frame, in order{NUMBERED if things.startswith('poses') else ''}.{_guess(rows, count)}"
+        f"frame, in order{NUMBERING_HINT if things.startswith('poses') else ''}.{_mismatch_hint(rows, count)}"
     )
 
 
-def _guess(rows: int, count: int) -> str:
+def _mismatch_hint(rows: int, count: int) -> str:
     """What may have happened, and what to do then."""
     if rows > count:
         return " Was the video cut, or written anew with fewer frames a second?"

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.errors import BadInput
-from preprocess.body import Body, ShapedBody
+from capture.errors import InputError
+from preprocess.body import BodyModel, ShapedBody
 from preprocess.npz import read_npz
 
-KEYS = ("family", "vertices", "joints")
+SHAPED_BODY_KEYS = ("family", "vertices", "joints")
 
 
-def write_person(path: Path, person: ShapedBody) -> None:
+def write_shaped_body(path: Path, person: ShapedBody) -> None:
     """Writes the resting vertices and joints, and whose betas would shape the body.
 
     Raises:
@@ -25,22 +25,22 @@ def write_person(path: Path, person: ShapedBody) -> None:
     )
 
 
-def read_person(path: Path, body: Body) -> ShapedBody:
-    """The person that `write_person` wrote, on the same body.
+def read_shaped_body(path: Path, body: BodyModel) -> ShapedBody:
+    """The person that `write_shaped_body` wrote, on the same body.
 
     Args:
         path: The file.
         body: What the user names now (--body), or the embedded body.
 
     Raises:
-        BadInput: If it is another body than then, or the file cannot be read.
+        InputError: If it is another body than then, or the file cannot be read.
     """
     arrays = read_npz(path)
-    if not set(KEYS) <= arrays.keys() or arrays["joints"].shape != (24, 3):
-        raise BadInput(f"{path} holds no person; expected {', '.join(KEYS)}. Is it ours?")
+    if not set(SHAPED_BODY_KEYS) <= arrays.keys() or arrays["joints"].shape != (24, 3):
+        raise InputError(f"{path} holds no person; expected {', '.join(SHAPED_BODY_KEYS)}. Is it ours?")
     family, vertices = str(arrays["family"]), arrays["vertices"].astype(np.float64)
     if family != body.family or vertices.shape != body.template.shape:
-        raise BadInput(
+        raise InputError(
             f"{path}: the avatar was learnt on a {family!r} body of {len(vertices)} vertices, "
             f"now it is {body.family!r} with {len(body.template)}. Give the same --body as then "
             "(none is the embedded body), or learn the avatar anew (--overwrite)."

@@ -34,12 +34,12 @@ class BodyPose:
         )
 
 
-Anchor = Literal["pelvis", "origin", "hips"]
-Space = Literal["camera", "world"]
+RootAnchor = Literal["pelvis", "origin", "hips"]
+PoseSpace = Literal["camera", "world"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens:
+class RelativeFocalLength:
     """A focal length that is known only as a share of the picture, looking at its middle.
 
     Attributes:
@@ -47,20 +47,20 @@ class Lens:
         of: The picture's longer side, or its diagonal.
     """
 
-    share: float
-    of: Literal["longer side", "diagonal"] = "longer side"
+    ratio: float
+    reference: Literal["longer side", "diagonal"] = "longer side"
 
-    def intrinsic(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    def intrinsic_matrix(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
         """The camera matrix K for pictures of a size (width, height)."""
         width, height = size_px
-        unit = max(size_px) if self.of == "longer side" else float(np.hypot(width, height))
-        focal = self.share * unit
+        unit = max(size_px) if self.reference == "longer side" else float(np.hypot(width, height))
+        focal = self.ratio * unit
         return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
 
     @property
     def is_plausible(self) -> bool:
         """Whether a camera may have it; trackers that cut out the person assume far longer ones."""
-        return 0.4 <= self.share <= 2.5
+        return 0.4 <= self.ratio <= 2.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,7 +72,7 @@ class Motion:
         valid: Which rows may be used (finite, and not marked as lost by the tracker).
         betas: Shape coefficients; they mean something only to the body family named in `model`.
         model: Body family whose tracker made the poses: "smpl" or "body24".
-        model_said: Whether the file names that family; if not, it is a guess.
+        model_is_stated: Whether the file names that family; if not, it is a guess.
         frames: Index of the video frame that each row belongs to, if the file says so.
         times_s: Time of each row in seconds, if the file says so.
         intrinsic: The tracker's own camera matrix K, if the file holds one.
@@ -92,16 +92,16 @@ class Motion:
     joint_rotations: Float[np.ndarray, "poses 23 3"]
     valid: Bool[np.ndarray, "poses"]
     betas: Float[np.ndarray, "betas"]
-    model: str
-    model_said: bool = True
+    body_model: str
+    model_is_stated: bool = True
     frames: Int[np.ndarray, "poses"] | None = None
     times_s: Float[np.ndarray, "poses"] | None = None
     intrinsic: Float[np.ndarray, "3 3"] | None = None
-    lens: Lens | None = None
-    anchor: Anchor = "pelvis"
-    space: Space = "world"
+    assumed_focal: RelativeFocalLength | None = None
+    anchor: RootAnchor = "pelvis"
+    space: PoseSpace = "world"
     camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
-    bridged: Bool[np.ndarray, "poses"] | None = None
+    interpolated: Bool[np.ndarray, "poses"] | None = None
     note: str | None = None
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class Motion:
             joint_rotations=self.joint_rotations[row],
         )
 
-    def taken(
+    def select_rows(
         self, rows: Int[np.ndarray, "some"], frames: Int[np.ndarray, "some"] | None = None
     ) -> "Motion":
         """Some of its rows, for frames of other numbers.
@@ -125,7 +125,7 @@ class Motion:
             rows: Which ones, in their new order.
             frames: The frame that each belongs to; None if nobody says so.
         """
-        cameras, bridged = self.camera_from_world, self.bridged
+        cameras, bridged = self.camera_from_world, self.interpolated
         return replace(
             self,
             root_rotations=self.root_rotations[rows],
@@ -135,5 +135,5 @@ class Motion:
             frames=frames,
             times_s=None,
             camera_from_world=None if cameras is None else cameras[rows],
-            bridged=None if bridged is None else bridged[rows],
+            interpolated=None if bridged is None else bridged[rows],
         )

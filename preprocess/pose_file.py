@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.npz import read_npz
-from preprocess.pose import Motion, Space
-from preprocess.rotations import joint_rotations
+from preprocess.pose import Motion, PoseSpace
+from preprocess.rotations import stack_axis_angles
 
-LAYOUTS = (
+POSE_KEY_LAYOUTS = (
     ("global_orient", "body_pose", "transl"),
     ("thetas", "transl"),
     ("poses", "trans"),
@@ -21,7 +21,7 @@ LAYOUTS = (
 
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 
-LARGEST = 1e9
+MAX_MAGNITUDE = 1e9
 """Angles and places beyond this are damage, and nothing can be computed with them."""
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
@@ -44,42 +44,42 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
         default_model: Body family of files that do not say theirs.
 
     Raises:
-        BadInput: If there is no such file, or it holds no such poses.
+        InputError: If there is no such file, or it holds no such poses.
     """
     if path.suffix.lower() not in (".npz", ".jsonl"):
-        raise BadInput(
+        raise InputError(
             f"{path}: poses are read from .npz files (InstantAvatar's keys), or from .jsonl files "
             "with the same keys, a frame a line."
         )
     arrays = read_npz(path) if path.suffix.lower() == ".npz" else _read_lines(path)
-    return motion_of(arrays, path, default_model=default_model)
+    return motion_from_arrays(arrays, path, default_model=default_model)
 
 
-def motion_of(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
+def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
     """The poses in the arrays of a file (see `read_motion`).
 
     Raises:
-        BadInput: If they are no such poses; `path` is for the message.
+        InputError: If they are no such poses; `path` is for the message.
     """
-    layout = next((keys for keys in LAYOUTS if set(keys) <= arrays.keys()), None)
+    layout = next((keys for keys in POSE_KEY_LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
-        expected = "; or ".join(" and ".join(keys) for keys in LAYOUTS)
-        raise BadInput(
+        expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
+        raise InputError(
             f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}."
         )
     rows = [_rows(arrays, key, path) for key in layout]
     translations = rows.pop().reshape(len(rows[0]), -1)
     count = len(translations)
     try:
-        poses = joint_rotations(rows).reshape(count, 72)
+        poses = stack_axis_angles(rows).reshape(count, 72)
     except ValueError as cause:
-        raise BadInput(
+        raise InputError(
             f"{path}: {' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} "
             f"numbers ({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or "
             "rotation matrices."
         ) from cause
     if translations.shape != (count, 3):
-        raise BadInput(
+        raise InputError(
             f"`{layout[-1]}` in {path} has {translations.shape}; expected (N, 3) metres."
         )
     times = _per_row(arrays, "time", count, path)
@@ -89,8 +89,8 @@ def motion_of(arrays: Arrays, path: Path, *, default_model: str = "body24") -> M
         joint_rotations=poses[:, 3:].reshape(count, 23, 3),
         valid=_valid(arrays, np.column_stack([poses, translations]), times, path),
         betas=_betas(arrays, path),
-        model=str(arrays["model"]) if "model" in arrays else default_model,
-        model_said="model" in arrays,
+        body_model=str(arrays["model"]) if "model" in arrays else default_model,
+        model_is_stated="model" in arrays,
         frames=_frame_numbers(arrays, count, path),
         times_s=times,
         intrinsic=_intrinsic(arrays, path),
@@ -103,7 +103,7 @@ def _read_lines(path: Path) -> Arrays:
     """One array for each key that every line has; of words, what the first line says.
 
     Raises:
-        BadInput: If there is no such file, or a line before the last holds no JSON object.
+        InputError: If there is no such file, or a line before the last holds no JSON object.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -113,7 +113,7 @@ def _read_lines(path: Path) -> Arrays:
         words = {"model", "space"} & keys
         arrays = {key: np.array([line[key] for line in lines]) for key in keys - words}
     except (OSError, ValueError, TypeError) as cause:
-        raise BadInput(f"{path} is no file of one JSON object a line ({cause}).") from cause
+        raise InputError(f"{path} is no file of one JSON object a line ({cause}).") from cause
     return {**arrays, **{key: np.array(lines[0][key]) for key in words}}
 
 
@@ -125,7 +125,7 @@ def write_motion(path: Path, motion: Motion) -> None:
         "body_pose": motion.joint_rotations.reshape(len(motion), 69),
         "transl": motion.root_translations,
         "valid": motion.valid,
-        "model": np.array(motion.model),
+        "model": np.array(motion.body_model),
         "frame": motion.frames,
         "time": motion.times_s,
         "K": motion.intrinsic,
@@ -136,20 +136,20 @@ def write_motion(path: Path, motion: Motion) -> None:
     np.savez_compressed(path, **present)
 
 
-def _numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
+def _read_numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
     if arrays[key].dtype.kind not in "biuf":
-        raise BadInput(f"`{key}` in {path} holds no numbers.")
+        raise InputError(f"`{key}` in {path} holds no numbers.")
     return arrays[key].astype(np.float64)
 
 
 def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses *numbers"]:
     """An array of one row a pose."""
-    rows = _numbers(arrays, key, path)
+    rows = _read_numbers(arrays, key, path)
     if rows.ndim < 2 or not rows.size:
-        raise BadInput(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
+        raise InputError(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
     first = arrays["transl"] if "transl" in arrays else arrays["trans"]
     if len(rows) != len(np.atleast_1d(first)):
-        raise BadInput(
+        raise InputError(
             f"{path} holds {len(rows)} rows of `{key}` but {len(np.atleast_1d(first))} "
             "translations; expected one of each per pose."
         )
@@ -160,9 +160,9 @@ def _per_row(arrays: Arrays, key: str, count: int, path: Path) -> Float[np.ndarr
     """An optional array of one number a pose."""
     if key not in arrays:
         return None
-    numbers = _numbers(arrays, key, path).reshape(-1)
+    numbers = _read_numbers(arrays, key, path).reshape(-1)
     if len(numbers) != count:
-        raise BadInput(f"{path} holds {len(numbers)} numbers in `{key}` for {count} poses.")
+        raise InputError(f"{path} holds {len(numbers)} numbers in `{key}` for {count} poses.")
     return numbers
 
 
@@ -173,7 +173,7 @@ def _valid(
     path: Path,
 ) -> Bool[np.ndarray, "poses"]:
     """Rows that are finite, of a size that angles and places have, and not marked as lost."""
-    valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < LARGEST).all(axis=1))
+    valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < MAX_MAGNITUDE).all(axis=1))
     marked = _per_row(arrays, "valid", len(valid), path)
     if marked is not None:
         valid &= marked > 0
@@ -184,15 +184,15 @@ def _betas(arrays: Arrays, path: Path) -> Float[np.ndarray, "betas"]:
     """One shape for the whole motion: the mean, where each row has its own."""
     if "betas" not in arrays:
         return np.zeros(0)
-    betas = _numbers(arrays, "betas", path)
+    betas = _read_numbers(arrays, "betas", path)
     if betas.ndim > 2:
-        raise BadInput(
+        raise InputError(
             f"`betas` in {path} have the shape {betas.shape}; expected (10,) or (1, 10)."
         )
     rows = np.atleast_2d(betas)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
-        raise BadInput(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
+        raise InputError(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
     return rows.mean(axis=0)
 
 
@@ -201,10 +201,10 @@ def _frame_numbers(arrays: Arrays, count: int, path: Path) -> Int[np.ndarray, "p
     if numbers is None:
         return None
     if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
-        raise BadInput(f"`frame` in {path} holds numbers that are no frame numbers.")
+        raise InputError(f"`frame` in {path} holds numbers that are no frame numbers.")
     frames = numbers.astype(np.int64)
     if len(np.unique(frames)) < count:
-        raise BadInput(f"`frame` in {path} names a frame twice; expected one person's poses.")
+        raise InputError(f"`frame` in {path} names a frame twice; expected one person's poses.")
     return frames
 
 
@@ -212,20 +212,20 @@ def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
     """The tracker's K; the median, where each row has its own."""
     if "K" not in arrays:
         return None
-    intrinsic = _numbers(arrays, "K", path)
+    intrinsic = _read_numbers(arrays, "K", path)
     if intrinsic.ndim == 3:
         intrinsic = np.nanmedian(intrinsic, axis=0)
     if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
-        raise BadInput(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
+        raise InputError(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
     return intrinsic
 
 
-def _space(arrays: Arrays, path: Path) -> Space:
+def _space(arrays: Arrays, path: Path) -> PoseSpace:
     """Where the poses are."""
     said = str(arrays["space"]) if "space" in arrays else "world"
     if said == "world" or said == "camera":
         return said
-    raise BadInput(f"`space` in {path} is {said!r}; expected world or camera.")
+    raise InputError(f"`space` in {path} is {said!r}; expected world or camera.")
 
 
 def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses 4 4"] | None:
@@ -233,13 +233,13 @@ def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses
     key = next((key for key in CAMERA_KEYS if key in arrays), None)
     if key is None:
         return None
-    cameras = _numbers(arrays, key, path)
+    cameras = _read_numbers(arrays, key, path)
     if cameras.shape not in ((4, 4), (count, 4, 4)) or not np.isfinite(cameras).all():
-        raise BadInput(
+        raise InputError(
             f"`{key}` in {path} has the shape {cameras.shape}; expected finite camera-from-world "
             f"transforms (4, 4) or ({count}, 4, 4)."
         )
     rotations = cameras[..., :3, :3]
     if np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max() > 1e-3:
-        raise BadInput(f"`{key}` in {path} is not rigid; expected no scale, OpenCV's axes.")
+        raise InputError(f"`{key}` in {path} is not rigid; expected no scale, OpenCV's axes.")
     return np.broadcast_to(cameras, (count, 4, 4)).copy()

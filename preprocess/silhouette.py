@@ -10,11 +10,11 @@ from capture.camera import Camera
 from preprocess.body import ShapedBody
 from preprocess.pose import BodyPose
 
-POINTS = 8000
+SKIN_POINTS = 8000
 """On the skin: about three on each pixel of a person who is `PERSON_PX` high."""
-PERSON_PX = 96
+SILHOUETTE_PERSON_PX = 96
 """Height of a person in the small pictures, in pixels: one is about 2 cm."""
-NEAR_M = 0.05
+NEAR_PLANE_M = 0.05
 """Points nearer to the camera than this are not drawn."""
 
 
@@ -33,7 +33,7 @@ class SkinPoints:
     weights: Float32[np.ndarray, "points 24"]
 
     @classmethod
-    def of(cls, shaped: ShapedBody, count: int = POINTS) -> "SkinPoints":
+    def of(cls, shaped: ShapedBody, count: int = SKIN_POINTS) -> "SkinPoints":
         """Systematic samples of the surface: every `count`-th part of the area has its point.
 
         Within a triangle they follow the R2 sequence (the plane's golden ratio).
@@ -61,7 +61,7 @@ class SkinPoints:
         return np.einsum("pab,pb->pa", blended[:, :, :3], self.rest) + blended[:, :, 3]
 
 
-def silhouette(
+def splat_silhouette(
     points_world: Float[np.ndarray, "points 3"], camera: Camera
 ) -> Bool[np.ndarray, "height width"]:
     """The pixels that dense points of a surface cover; nothing of what is behind the camera.
@@ -70,13 +70,13 @@ def silhouette(
     """
     width, height = camera.size_px
     drawn = np.zeros((height, width), dtype=np.uint8)
-    x, y, depth = _projected(points_world, camera)
-    inside = (depth > NEAR_M) & (x >= 0.0) & (x < width) & (y >= 0.0) & (y < height)
+    x, y, depth = _project(points_world, camera)
+    inside = (depth > NEAR_PLANE_M) & (x >= 0.0) & (x < width) & (y >= 0.0) & (y < height)
     drawn[y[inside].astype(np.int64), x[inside].astype(np.int64)] = 1
     return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
 
 
-def _projected(
+def _project(
     points_world: Float[np.ndarray, "points 3"], camera: Camera
 ) -> Float32[np.ndarray, "3 points"]:
     """x and y in pixels, and the depth; as `Camera.project`, but twice as fast without a lens.
@@ -88,18 +88,18 @@ def _projected(
     with np.errstate(divide="ignore", invalid="ignore"):
         projected[:2] /= projected[2]
     if camera.distortion:
-        before = projected[2] > NEAR_M
+        before = projected[2] > NEAR_PLANE_M
         projected[:2, before] = camera.project(points_world[before].astype(np.float64)).T
     return projected
 
 
-def agreement(
-    drawn: Bool[np.ndarray, "height width"], alpha: Float32[np.ndarray, "height width"]
+def soft_iou(
+    body: Bool[np.ndarray, "height width"], alpha: Float32[np.ndarray, "height width"]
 ) -> float:
     """Intersection over union of a silhouette and a soft mask, in [0, 1].
 
     The soft kind: the sum of the smaller over the sum of the larger of each pixel's two.
     """
-    both, either = float(alpha[drawn].sum()), float(alpha.sum() + drawn.sum())
+    both, either = float(alpha[body].sum()), float(alpha.sum() + body.sum())
     union = either - both
     return both / union if union > 0.0 else 0.0

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from capture.images import list_images, orientation
-from capture.source import Source
+from capture.errors import InputError
+from capture.images import list_images, exif_orientation
+from capture.source import FrameSource
 from preprocess.camera_file import CameraTrack, read_cameras
-from preprocess.cameras.colmap import find_model
+from preprocess.cameras.colmap import find_colmap_model
 
-MIRRORED = {2: 0, 4: 2, 5: 1, 7: 3}
+MIRRORED_EXIF_QUARTER_TURNS = {2: 0, 4: 2, 5: 1, 7: 3}
 """EXIF's orientations of photographs that are mirrored: how many turns by 90° against the clock
 make them upright, once left and right were exchanged."""
 
 
-def upright_cameras(path: Path, source: Source) -> CameraTrack:
+def read_upright_cameras(path: Path, source: FrameSource) -> CameraTrack:
     """The cameras of frames that were turned to stand upright, by a video's or a picture's flag.
 
     Cameras that were made for the pictures as they are stored are turned with them. Which they were
@@ -35,63 +35,63 @@ def upright_cameras(path: Path, source: Source) -> CameraTrack:
         source: The frames; see `read_cameras`.
 
     Raises:
-        BadInput: As `read_cameras`.
+        InputError: As `read_cameras`.
     """
-    of_colmap = find_model(path) if path.is_dir() else path.suffix.lower() in (".bin", ".txt")
-    if (tag := _mirroring(source)) is not None:
-        return _of_mirrored(path, source, tag, of_colmap=bool(of_colmap))
+    of_colmap = find_colmap_model(path) if path.is_dir() else path.suffix.lower() in (".bin", ".txt")
+    if (tag := _mirrored_exif_orientation(source)) is not None:
+        return _read_mirrored(path, source, tag, of_colmap=bool(of_colmap))
     if source.quarter_turns % 2 == 0:
         track = read_cameras(path, source.size_px, None if source.live else source)
         hang = source.quarter_turns == 2 and source.path.is_dir()
-        return _turned(track, path, source) if hang and of_colmap else track
+        return _rotate_track(track, path, source) if hang and of_colmap else track
     width, height = source.size_px
-    shown = _tried(path, (width, height), source)
-    stored = _tried(path, (height, width), source)
-    if isinstance(stored, BadInput) or (
-        isinstance(shown, CameraTrack) and _off(shown) <= _off(stored)
+    shown = _try_read(path, (width, height), source)
+    stored = _try_read(path, (height, width), source)
+    if isinstance(stored, InputError) or (
+        isinstance(shown, CameraTrack) and _principal_point_offset_px(shown) <= _principal_point_offset_px(stored)
     ):
-        if isinstance(shown, BadInput):
+        if isinstance(shown, InputError):
             raise shown
         return shown
-    return _turned(stored, path, source)
+    return _rotate_track(stored, path, source)
 
 
-def _mirroring(source: Source) -> int | None:
+def _mirrored_exif_orientation(source: FrameSource) -> int | None:
     """EXIF's orientation of photographs that it mirrors; None of all others."""
     if source.live or not source.path.is_dir():
         return None
     for path in list_images(source.path):
         data = path.read_bytes()
         if data:
-            tag = orientation(data)
-            return tag if tag in MIRRORED else None
+            tag = exif_orientation(data)
+            return tag if tag in MIRRORED_EXIF_QUARTER_TURNS else None
     return None
 
 
-def _of_mirrored(path: Path, source: Source, tag: int, *, of_colmap: bool) -> CameraTrack:
+def _read_mirrored(path: Path, source: FrameSource, tag: int, *, of_colmap: bool) -> CameraTrack:
     """Cameras of photographs that a tag mirrors, of them as shown or as stored."""
     width, height = source.size_px
-    stored_px = (height, width) if MIRRORED[tag] % 2 else (width, height)
-    shown, stored = _tried(path, (width, height), source), _tried(path, stored_px, source)
-    if isinstance(stored, CameraTrack) and (of_colmap or isinstance(shown, BadInput)):
+    stored_px = (height, width) if MIRRORED_EXIF_QUARTER_TURNS[tag] % 2 else (width, height)
+    shown, stored = _try_read(path, (width, height), source), _try_read(path, stored_px, source)
+    if isinstance(stored, CameraTrack) and (of_colmap or isinstance(shown, InputError)):
         said = f"The cameras in {path.name} were mirrored with the pictures, by their EXIF tag."
-        return _with(stored, said, lambda camera: camera.mirrored().turned(MIRRORED[tag]))
-    if isinstance(shown, BadInput):
+        return _map_cameras(stored, said, lambda camera: camera.mirror().rotate_quarter_turns(MIRRORED_EXIF_QUARTER_TURNS[tag]))
+    if isinstance(shown, InputError):
         raise shown
     said = (
         f"The photographs are mirrored by their EXIF tag (orientation {tag}); the cameras in "
         f"{path.name} are taken for those of the pictures as shown."
     )
-    return _with(shown, said, lambda camera: camera)
+    return _map_cameras(shown, said, lambda camera: camera)
 
 
-def _turned(stored: CameraTrack, path: Path, source: Source) -> CameraTrack:
+def _rotate_track(stored: CameraTrack, path: Path, source: FrameSource) -> CameraTrack:
     """Cameras of stored pictures, turned with them."""
     said = f"The cameras in {path.name} were turned with the pictures, by their rotation flag."
-    return _with(stored, said, lambda camera: camera.turned(source.quarter_turns))
+    return _map_cameras(stored, said, lambda camera: camera.rotate_quarter_turns(source.quarter_turns))
 
 
-def _with(track: CameraTrack, said: str, change: Callable[[Camera], Camera]) -> CameraTrack:
+def _map_cameras(track: CameraTrack, said: str, change: Callable[[Camera], Camera]) -> CameraTrack:
     """All cameras changed, and that it is said."""
     return replace(
         track,
@@ -100,15 +100,15 @@ def _with(track: CameraTrack, said: str, change: Callable[[Camera], Camera]) -> 
     )
 
 
-def _tried(path: Path, size_px: tuple[int, int], source: Source) -> CameraTrack | BadInput:
+def _try_read(path: Path, size_px: tuple[int, int], source: FrameSource) -> CameraTrack | InputError:
     """The cameras for pictures of a size, or why they are none."""
     try:
         return read_cameras(path, size_px, None if source.live else source)
-    except BadInput as cause:
+    except InputError as cause:
         return cause
 
 
-def _off(track: CameraTrack) -> float:
+def _principal_point_offset_px(track: CameraTrack) -> float:
     """How far the first camera's principal point is from the middle of its picture, in pixels."""
     camera = track.cameras[0]
     return float(np.abs(np.array(camera.center_px) - np.array(camera.size_px) / 2.0).sum())

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import settings
 
 from preprocess.body import ShapedBody
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 
 settings.register_profile("busy", deadline=None)  # a machine may be busy with something else
 settings.load_profile("busy")
@@ -24,4 +24,4 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def shaped() -> ShapedBody:
-    return load_body().with_shape()
+    return load_body_model().with_shape()

@@ -3,33 +3,33 @@
 import shlex
 from pathlib import Path
 
-from apps.recording.wanted import RecordingPaths
+from apps.recording.wanted import CaptureInputs
 
 
-def check_command(wanted: RecordingPaths, *, fix: bool = True) -> str:
+def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
     """The command line with the user's own inputs.
 
     Args:
         wanted: What the user named.
         fix: Whether it writes a corrected copy, to a folder that is not there yet.
     """
-    words = ["ia-check", str(wanted.video)]
+    words = ["ia-check", str(inputs.video)]
     named = {
-        "--poses": wanted.poses, "--masks": wanted.masks, "--cameras": wanted.cameras,
-        "--body": wanted.body, "--person": wanted.person,
+        "--poses": inputs.poses, "--masks": inputs.masks, "--cameras": inputs.cameras,
+        "--body": inputs.body, "--person": inputs.person,
     }  # fmt: skip
     for option, value in named.items():
         words += [] if value is None else [option, str(value)]
-    if wanted.mask_invert is not None:
-        words.append("--mask-invert" if wanted.mask_invert else "--no-mask-invert")
-    if wanted.frames is not None and wanted.frames != slice(None):
-        chosen = (wanted.frames.start, wanted.frames.stop, wanted.frames.step)
+    if inputs.invert_masks is not None:
+        words.append("--mask-invert" if inputs.invert_masks else "--no-mask-invert")
+    if inputs.frames is not None and inputs.frames != slice(None):
+        chosen = (inputs.frames.start, inputs.frames.stop, inputs.frames.step)
         words.append("--frames=" + ":".join("" if n is None else str(n) for n in chosen))
-    words += ["--fix", str(corrected_folder(wanted.video))] if fix else []
+    words += ["--fix", str(unused_corrected_folder(inputs.video))] if fix else []
     return shlex.join(words)
 
 
-def corrected_folder(video: Path) -> Path:
+def unused_corrected_folder(video: Path) -> Path:
     """A folder beside a capture that is not there yet, named after it."""
     place = video if video.name else video.resolve()
     stem = place.name if place.is_dir() else place.stem

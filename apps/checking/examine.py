@@ -6,39 +6,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32
 
-from apps.recording.opening import open_recording
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
-from capture.camera import same_shape
-from capture.errors import BadInput
-from preprocess.doctor.claim import Claim
-from preprocess.doctor.cure import shifted
-from preprocess.doctor.diagnosis import GOOD, USABLE, Diagnosis, diagnose, film_errs, mean
-from preprocess.doctor.evidence import FRAMES, Evidence, gather
-from preprocess.doctor.film_evidence import PICTURES, WITHIN, FilmEvidence, gather_film
-from preprocess.doctor.soundness import unsound
-from preprocess.fit.pictures import edges, glance
+from apps.recording.opening import open_capture
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
+from capture.camera import same_aspect_ratio
+from capture.errors import InputError
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.doctor.cure import undo_pose_delay
+from preprocess.doctor.diagnosis import GOOD_IOU, USABLE_IOU, CorrectionResult, find_corrections, needs_video_correction, mean_score
+from preprocess.doctor.evidence import SAMPLED_FRAMES, SilhouetteObjective, sample_masks
+from preprocess.doctor.film_evidence import SAMPLED_IMAGES, MAX_DECODED_FRAMES, EdgeObjective, sample_images
+from preprocess.doctor.soundness import sanity_warnings
+from preprocess.fit.pictures import edge_contrast, sample_video
 from preprocess.masks.files import Masks
-from preprocess.observe import check_cameras, check_masks
-from preprocess.plausibility import impossible
+from preprocess.observe import associate_cameras, associate_masks
+from preprocess.plausibility import implausibility_reason
 from preprocess.silhouette import SkinPoints
 
-FEW = 8
-"""Frames that are looked at before a run begins."""
-FIRST = 96
-"""Frames of the film's beginning among which its pictures are then looked at."""
-GOOD_EDGES = 2.0
+QUICK_FRAMES = 8
+"""EvaluationFrames that are looked at before a run begins."""
+QUICK_FILM_FRAMES = 96
+"""EvaluationFrames of the film's beginning among which its pictures are then looked at."""
+GOOD_EDGE_RATIO = 2.0
 """Least ratio of the edges across the body's outline to those beside it, if poses fit."""
-UNEXPLAINED = (
+NO_KNOWN_MISTAKE = (
     "None of the usual mistakes explains it. Are the poses or the masks of another video or "
     "person, or did the tracker lose the person? Make them again from this video."
 )
-NEAR = (1, 2)
+QUICK_OFFSETS = (1, 2)
 """Offsets of the poses, in frames, that are tried even where all seems well."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Examined:
+class CaptureValidation:
     """What the doctor found.
 
     Attributes:
@@ -53,52 +53,52 @@ class Examined:
             outline as beside it; None with masks, or if no picture can be looked at.
     """
 
-    recording: Recording
-    claim: Claim
-    evidence: Evidence | None
-    diagnosis: Diagnosis | None
-    refused: str | None
-    odd: tuple[str, ...]
-    agreed: float | None
-    edges: float | None = None
+    recording: Capture
+    hypothesis: CaptureGeometry
+    sampled_masks: SilhouetteObjective | None
+    diagnosis: CorrectionResult | None
+    refusal: str | None
+    anomalies: tuple[str, ...]
+    mask_iou: float | None
+    edge_ratio: float | None = None
 
     @property
     def causes(self) -> tuple[str, ...]:
         """Names of the mistakes found, the one that matters most first."""
-        cures = self.diagnosis.cures if self.diagnosis else ()
+        cures = self.diagnosis.corrections if self.diagnosis else ()
         return tuple(dict.fromkeys(cure.cause for cure in cures))
 
     @property
     def verdict(self) -> str:
-        """`good`, `warn`, or `unusable`."""
-        if self.refused is not None or (self.agreed is not None and self.agreed < USABLE):
+        """`good`, `warning`, or `unusable`."""
+        if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
             return "unusable"
-        well = self.agreed is not None and self.agreed >= GOOD
-        well = well and (not self.causes or self.mends_itself)
-        well |= self.edges is not None and self.edges >= GOOD_EDGES
-        return "good" if well and not self.odd else "warn"
+        well = self.mask_iou is not None and self.mask_iou >= GOOD_IOU
+        well = well and (not self.causes or self.is_auto_corrected)
+        well |= self.edge_ratio is not None and self.edge_ratio >= GOOD_EDGE_RATIO
+        return "good" if well and not self.anomalies else "warn"
 
     @property
-    def mends_itself(self) -> bool:
+    def is_auto_corrected(self) -> bool:
         """Whether all that is wrong is what ia-ingest corrects without being asked."""
         masks = self.recording.masks
         return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
     @property
-    def film_errs(self) -> bool:
+    def has_film_errors(self) -> bool:
         """Whether a mistake was found that concerns the pictures alone."""
-        return any(cause.startswith("film_") for cause in self.causes)
+        return any(cause.startswith("video_") for cause in self.causes)
 
     @property
-    def promise(self) -> str:
+    def expected_improvement(self) -> str:
         """What correcting the named mistakes would bring, for people; empty without masks."""
         if self.diagnosis is None or not self.causes:
             return ""
         told = []
-        if not all(cause.startswith("film_") for cause in self.causes):
-            told.append(f"body and masks would agree by {self.after:.2f}")
-        if self.film_errs and self.diagnosis.film is not None:
-            film = self.diagnosis.film
+        if not all(cause.startswith("video_") for cause in self.causes):
+            told.append(f"body and masks would agree by {self.corrected_iou:.2f}")
+        if self.has_film_errors and self.diagnosis.video is not None:
+            film = self.diagnosis.video
             before = f" instead of {film.now:.2f}" if film.now > 0.0 else ""
             told.append(
                 f"the masks' outlines would score {film.after:.2f}{before} on the pictures' edges "
@@ -107,42 +107,42 @@ class Examined:
         return f"Once corrected, {', and '.join(told)}."
 
     @property
-    def now(self) -> float:
+    def stored_iou(self) -> float:
         """Agreement of the files as they are stored; NaN without masks."""
-        return self.diagnosis.now if self.diagnosis else float("nan")
+        return self.diagnosis.iou_before if self.diagnosis else float("nan")
 
     @property
-    def after(self) -> float:
+    def corrected_iou(self) -> float:
         """Agreement with all cures; NaN without masks."""
-        return self.diagnosis.after if self.diagnosis else float("nan")
+        return self.diagnosis.iou_after if self.diagnosis else float("nan")
 
 
-def examine(wanted: RecordingPaths) -> Examined:
+def check_capture(inputs: CaptureInputs) -> CaptureValidation:
     """Opens a capture and looks at it; nothing is trained and hardly a frame is decoded.
 
     Raises:
-        BadInput: If a part is missing or unreadable, so that there is nothing to examine.
+        InputError: If a part is missing or unreadable, so that there is nothing to examine.
     """
     try:
-        return examined(*_opened(wanted))
-    except BadInput as error:
-        found = _transposed(wanted, str(error))
+        return check_opened_capture(*_open_inputs(inputs))
+    except InputError as error:
+        found = _check_transposed(inputs, str(error))
         if found is None:
             raise
         return found
 
 
-def _transposed(wanted: RecordingPaths, refused: str) -> Examined | None:
+def _check_transposed(inputs: CaptureInputs, refusal: str) -> CaptureValidation | None:
     """What is found if the film was rotated by a quarter turn; None if that explains nothing."""
     try:
-        recording = open_recording(replace(wanted, transposed=True), doubtful=True)
-        found = examined(recording, refused)
-    except BadInput:
+        recording = open_capture(replace(inputs, transposed=True), skip_checks=True)
+        found = check_opened_capture(recording, refusal)
+    except InputError:
         return None
-    return found if found.film_errs else None
+    return found if found.has_film_errors else None
 
 
-def examined(recording: Recording, undecided: str | None = None) -> Examined:
+def check_opened_capture(recording: Capture, polarity_error: str | None = None) -> CaptureValidation:
     """The same for a capture that is open already.
 
     Args:
@@ -150,31 +150,31 @@ def examined(recording: Recording, undecided: str | None = None) -> Examined:
         undecided: Why nobody knows which side of the masks is the person, if so.
 
     Raises:
-        BadInput: If a part is unreadable, so that there is nothing to examine.
+        InputError: If a part is unreadable, so that there is nothing to examine.
     """
-    claim, refused = _claim(recording), impossible(recording.motion) or undecided
+    claim, refused = _stored_hypothesis(recording), implausibility_reason(recording.motion) or polarity_error
     try:
         recording.check()
-    except BadInput as error:
+    except InputError as error:
         refused = refused or str(error)
     masked = recording.masks is not None or recording.source.has_alpha
-    evidence = _evidence(recording) if masked else None
+    evidence = _sample_masks(recording) if masked else None
     count = recording.source.frame_count or len(recording.motion)
     selection = recording.source.selection
     frames = [selection.start + selection.step * number for number in range(count)]
     diagnosis = agreed = None
     if evidence is not None:
-        diagnosis = diagnose(claim, evidence, count, _film(recording, evidence))
-        agreed = mean(evidence.scores(replace(claim, inverted=False)))
-    odd = unsound(claim, frames, evidence, recording.source.size_px[1])
-    return Examined(
-        recording=recording, claim=claim, evidence=evidence, diagnosis=diagnosis,
-        refused=refused, odd=tuple(odd), agreed=agreed,
-        edges=None if masked or refused else _edges(recording, claim),
+        diagnosis = find_corrections(claim, evidence, count, _sample_film(recording, evidence))
+        agreed = mean_score(evidence.frame_scores(replace(claim, masks_inverted=False)))
+    odd = sanity_warnings(claim, frames, evidence, recording.source.size_px[1])
+    return CaptureValidation(
+        recording=recording, hypothesis=claim, sampled_masks=evidence, diagnosis=diagnosis,
+        refusal=refused, anomalies=tuple(odd), mask_iou=agreed,
+        edge_ratio=None if masked or refused else _edge_ratio(recording, claim),
     )  # fmt: skip
 
 
-def looks_well(recording: Recording) -> bool:
+def passes_quick_check(recording: Capture) -> bool:
     """A glance at a few masks, in a few hundredths of a second: whether there is nothing to say.
 
     Poses that are a frame or two late are noticed, too.
@@ -182,107 +182,107 @@ def looks_well(recording: Recording) -> bool:
     if recording.live is not None or not (recording.masks or recording.source.has_alpha):
         return True  # what is not there cannot be looked at
     try:
-        evidence = _evidence(recording, FEW)
-    except BadInput:  # nobody in these few; whoever reads all of them will say so
+        evidence = _sample_masks(recording, QUICK_FRAMES)
+    except InputError:  # nobody in these few; whoever reads all of them will say so
         return True
-    claim = replace(_claim(recording), inverted=False)
-    now = mean(evidence.scores(claim))
-    shifts = [mean(evidence.scores(shifted(k).undo(claim))) for n in NEAR for k in (n, -n)]
-    if now < GOOD or now < max(shifts):
+    claim = replace(_stored_hypothesis(recording), masks_inverted=False)
+    now = mean_score(evidence.frame_scores(claim))
+    shifts = [mean_score(evidence.frame_scores(undo_pose_delay(k).apply(claim))) for n in QUICK_OFFSETS for k in (n, -n)]
+    if now < GOOD_IOU or now < max(shifts):
         return False
-    film = None if evidence.boxes else _film(recording, evidence, FEW, FIRST)
-    return film is None or not film_errs(claim, film, recording.source.frame_count or 1)
+    film = None if evidence.are_boxes else _sample_film(recording, evidence, QUICK_FRAMES, QUICK_FILM_FRAMES)
+    return film is None or not needs_video_correction(claim, film, recording.source.frame_count or 1)
 
 
-def _edges(recording: Recording, claim: Claim) -> float | None:
+def _edge_ratio(recording: Capture, claim: CaptureGeometry) -> float | None:
     """How the body's outline runs along the pictures' edges; None if none can be looked at."""
     skin = SkinPoints.of(recording.shaped)
     try:
-        return edges(claim, skin, glance(claim, skin, recording.cameras, recording.source))
-    except BadInput:
+        return edge_contrast(claim, skin, sample_video(claim, skin, recording.cameras, recording.source))
+    except InputError:
         return None
 
 
-def _film(
-    recording: Recording, evidence: Evidence, count: int = PICTURES, within: int = WITHIN
-) -> FilmEvidence | None:
+def _sample_film(
+    recording: Capture, evidence: SilhouetteObjective, count: int = SAMPLED_IMAGES, within: int = MAX_DECODED_FRAMES
+) -> EdgeObjective | None:
     """Some pictures and all masks; None where the masks lie in the pictures themselves."""
     masks = recording.masks
     if masks is None:
         return None
-    return gather_film(
-        recording.source, masks_of(recording, masks, evidence.size_px), masks.count,
+    return sample_images(
+        recording.source, mask_lookup(recording, masks, evidence.size_px), masks.count,
         evidence.size_px, count=count, within=within,
     )  # fmt: skip
 
 
-def masks_of(
-    recording: Recording, masks: Masks, size_px: tuple[int, int]
+def mask_lookup(
+    recording: Capture, masks: Masks, size_px: tuple[int, int]
 ) -> Callable[[int], Float32[np.ndarray, "height width"]]:
     """From a frame's number, which may be beyond the film's, to its mask of a given size.
 
-    What is returned raises BadInput where there is no such mask.
+    What is returned raises InputError where there is no such mask.
     """
-    row_of = _mask_rows(recording)
+    row_of = _mask_row_lookup(recording)
 
     def alpha(number: int) -> Float32[np.ndarray, "height width"]:
         row = row_of(number)
         if not 0 <= row < masks.count:
-            raise BadInput(f"There is no mask for frame {number} in {masks.path}.")
+            raise InputError(f"There is no mask for frame {number} in {masks.path}.")
         return masks.alpha(row, size_px)
 
     return alpha
 
 
-def _mask_rows(recording: Recording) -> Callable[[int], int]:
+def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
     """From a frame's number to its mask; in order where there is not one mask for each frame.
 
     Raises:
-        BadInput: If they are of another shape.
+        InputError: If they are of another shape.
     """
     try:
-        return check_masks(recording.masks, recording.source)
-    except BadInput:
+        return associate_masks(recording.masks, recording.source)
+    except InputError:
         masks = recording.masks
-        if masks is None or not same_shape(masks.size_px, recording.source.size_px):
+        if masks is None or not same_aspect_ratio(masks.size_px, recording.source.size_px):
             raise
         path, count = masks.path, masks.count
 
     def in_order(index: int) -> int:
         if index >= count:
-            raise BadInput(f"There is no mask for frame {index} in {path}.")
+            raise InputError(f"There is no mask for frame {index} in {path}.")
         return index
 
     return in_order
 
 
-def _evidence(recording: Recording, count: int = FRAMES) -> Evidence:
-    mask_row = _mask_rows(recording)
-    camera_row = check_cameras(recording.cameras, recording.source)
-    return gather(
+def _sample_masks(recording: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteObjective:
+    mask_row = _mask_row_lookup(recording)
+    camera_row = associate_cameras(recording.cameras, recording.source)
+    return sample_masks(
         recording.source, recording.masks, mask_row, camera_row, SkinPoints.of(recording.shaped),
-        count=count, without=recording.cameras.missing,
+        count=count, excluded_frames=recording.cameras.frames_without_camera,
     )  # fmt: skip
 
 
-def _claim(recording: Recording) -> Claim:
+def _stored_hypothesis(recording: Capture) -> CaptureGeometry:
     """As the files say; masks that are turned while they are read were claimed the other way."""
-    claim = Claim.of(recording.motion, recording.cameras, recording.source)
+    claim = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
     turned = recording.masks is not None and recording.masks.inverted
-    return replace(claim, inverted=turned)
+    return replace(claim, masks_inverted=turned)
 
 
-def _opened(wanted: RecordingPaths) -> tuple[Recording, str | None]:
+def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
     """The capture, and why a run would refuse its masks if it cannot tell which side is whom."""
     try:
-        return open_recording(wanted, doubtful=True), None
-    except BadInput as error:
-        if wanted.mask_invert is not None:
+        return open_capture(inputs, skip_checks=True), None
+    except InputError as error:
+        if inputs.invert_masks is not None:
             raise
-        recording = open_recording(replace(wanted, mask_invert=False), doubtful=True)
+        recording = open_capture(replace(inputs, invert_masks=False), skip_checks=True)
         return recording, str(error)
 
 
-def share(value: float | None) -> float | None:
+def json_number(value: float | None) -> float | None:
     """A number for JSON, which knows no NaN."""
     return None if value is None or not np.isfinite(value) else round(float(value), 4)

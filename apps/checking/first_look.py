@@ -1,17 +1,17 @@
 """The check before a run begins: silent, a warning, or the reason why it should not begin."""
 
 from apps.checking.command import check_command
-from apps.checking.examine import UNEXPLAINED, Examined, examine, examined, looks_well
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
+from apps.checking.examine import NO_KNOWN_MISTAKE, CaptureValidation, check_capture, check_opened_capture, passes_quick_check
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
 from apps.terminal.console import Console
 from capture.camera_device import camera_address
-from capture.errors import BadInput
-from preprocess.doctor.diagnosis import GOOD
+from capture.errors import InputError
+from preprocess.doctor.diagnosis import GOOD_IOU
 
 
-def first_look(
-    recording: Recording, wanted: RecordingPaths, console: Console, *, force: bool
+def preflight_check(
+    recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
 ) -> None:
     """Checks a few masks and pictures; only where they disagree, looks for the reason.
 
@@ -22,49 +22,49 @@ def first_look(
         force: Whether an unusable capture is warned of instead of refused.
 
     Raises:
-        BadInput: If body and masks disagree so much that nothing could be learnt.
+        InputError: If body and masks disagree so much that nothing could be learnt.
     """
-    if looks_well(recording):
+    if passes_quick_check(recording):
         return
-    with console.waiting("poses, masks and pictures disagree; looking for the reason"):
-        found = examined(recording)
+    with console.status("poses, masks and pictures disagree; looking for the reason"):
+        found = check_opened_capture(recording)
     causes = [cause for cause in found.causes if cause != "mask_polarity"]
     if found.verdict == "unusable":
         message = (
-            f"Body and masks agree by {found.agreed:.2f} only (0 to 1; {GOOD} or more was "
-            f"expected). {_reason(found)} {_what_to_do(found, wanted)}"
+            f"Body and masks agree by {found.mask_iou:.2f} only (0 to 1; {GOOD_IOU} or more was "
+            f"expected). {_explain(found)} {_suggest_command(found, inputs)}"
         )
         if not force:
-            raise BadInput(f"{message} Or go on all the same with --force.")
-        console.warn(message)
+            raise InputError(f"{message} Or go on all the same with --force.")
+        console.warning(message)
     elif causes:
-        but = ", but not with the pictures" if found.film_errs else ""
-        console.warn(
-            f"Body and masks agree by {found.agreed:.2f}{but}. {_reason(found)} "
-            f"{_what_to_do(found, wanted)}"
+        but = ", but not with the pictures" if found.has_film_errors else ""
+        console.warning(
+            f"Body and masks agree by {found.mask_iou:.2f}{but}. {_explain(found)} "
+            f"{_suggest_command(found, inputs)}"
         )
 
 
-def hint(wanted: RecordingPaths) -> str:
+def correction_hint(inputs: CaptureInputs) -> str:
     """What might mend a capture that was refused for other reasons; empty if that is unknown."""
-    if wanted.live or camera_address(wanted.video) is not None:
+    if inputs.live or camera_address(inputs.video) is not None:
         return ""
     try:
-        found = examine(wanted)
-    except BadInput:
+        found = check_capture(inputs)
+    except InputError:
         return ""
-    return f"{_reason(found)} {_what_to_do(found, wanted)}" if found.causes else ""
+    return f"{_explain(found)} {_suggest_command(found, inputs)}" if found.causes else ""
 
 
-def _reason(found: Examined) -> str:
-    if found.diagnosis is None or not found.diagnosis.cures:
-        return UNEXPLAINED
-    words = "; and ".join(cure.words for cure in found.diagnosis.cures)
-    return f"It looks as if {words}. {found.promise}".strip()
+def _explain(check: CaptureValidation) -> str:
+    if check.diagnosis is None or not check.diagnosis.corrections:
+        return NO_KNOWN_MISTAKE
+    words = "; and ".join(cure.description for cure in check.diagnosis.corrections)
+    return f"It looks as if {words}. {check.expected_improvement}".strip()
 
 
-def _what_to_do(found: Examined, wanted: RecordingPaths) -> str:
+def _suggest_command(check: CaptureValidation, inputs: CaptureInputs) -> str:
     """The command that corrects it, or that shows it."""
-    if found.causes:
-        return f"To correct it: {check_command(wanted)}"
-    return f"To look at it: {check_command(wanted, fix=False)}"
+    if check.causes:
+        return f"To correct it: {check_command(inputs)}"
+    return f"To look at it: {check_command(inputs, fix=False)}"

@@ -11,37 +11,37 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import Rotation, Slerp
 
-from apps.checking.examine import Examined, masks_of
-from apps.terminal.places import check_place
-from capture.atomic_files import whole_folder
-from capture.errors import BadInput
+from apps.checking.examine import CaptureValidation, mask_lookup
+from apps.terminal.places import check_writable
+from capture.atomic_files import atomic_folder
+from capture.errors import InputError
 from capture.images import list_images
 from capture.opening import open_source
-from capture.source import Source
-from preprocess.doctor.claim import Claim, step_of
-from preprocess.doctor.film import AS_FILMED, WHOLE_WINDOW, FilmView
+from capture.source import FrameSource
+from preprocess.doctor.claim import CaptureGeometry, frame_step
+from preprocess.doctor.film import IDENTITY_TRANSFORM, FULL_WINDOW, VideoTransform
 from preprocess.masks.files import Masks
 from preprocess.pose import Motion
 from preprocess.pose_file import write_motion
 
-WHOLE = 1e-6
+INTEGER_TOLERANCE = 1e-6
 """Frame numbers this close to whole ones are whole."""
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
+JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
 """Of a video's pictures, which have lost what compression takes already; colors unsampled."""
 
 
-def check_new_folder(out: Path) -> None:
+def check_new_or_empty(out: Path) -> None:
     """Whether a capture can be written there.
 
     Raises:
-        BadInput: If something is there already, or nothing can be.
+        InputError: If something is there already, or nothing can be.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise BadInput(f"--fix {out} is there already; name a folder that is new or empty.")
-    check_place(out, "--fix")
+        raise InputError(f"--fix {out} is there already; name a folder that is new or empty.")
+    check_writable(out, "--fix")
 
 
-def write_mended(examined: Examined, out: Path) -> None:
+def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     """Writes a native capture folder: video or pictures as they are, the rest with the cures.
 
     Files that stay as they are become hard links where that is possible. Pictures that must be
@@ -49,31 +49,31 @@ def write_mended(examined: Examined, out: Path) -> None:
     are changed instead.
 
     Raises:
-        BadInput: If nothing was found that could be mended.
+        InputError: If nothing was found that could be mended.
         OSError: If the disk is full; then nothing is written.
     """
-    if examined.diagnosis is None or not examined.diagnosis.cures:
-        raise BadInput("No mistake was found that could be mended, so --fix writes nothing.")
-    check_new_folder(out)
-    source, healed = examined.recording.source, examined.diagnosis.healed
+    if check.diagnosis is None or not check.diagnosis.corrections:
+        raise InputError("No mistake was found that could be mended, so --fix writes nothing.")
+    check_new_or_empty(out)
+    source, healed = check.recording.source, check.diagnosis.corrected
     frames = source.frames_in_file
-    with whole_folder(out, listed=False) as part:
-        missing = _write_film(source, healed.film, part)
-        _write_masks(examined, healed, part)
-        claim = _of_film(healed, frames)
-        motion = numbered(claim, frames, resampled="frame_rate" in examined.causes)
+    with atomic_folder(out, listed=False) as part:
+        missing = _write_film(source, healed.video_transform, part)
+        _write_masks(check, healed, part)
+        claim = _to_film_frames(healed, frames)
+        motion = renumber_motion(claim, frames, resampled="frame_rate" in check.causes)
         if missing and motion.frames is not None:
             kept = np.flatnonzero(~np.isin(motion.frames, list(missing)))
-            motion = motion.taken(kept, motion.frames[kept])
+            motion = motion.select_rows(kept, motion.frames[kept])
         write_motion(part / "poses.npz", motion)
         _write_cameras(claim, part / "cameras.npz")
 
 
-def _write_film(source: Source, film: FilmView, folder: Path) -> set[int]:
+def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[int]:
     """The film, rotated and mirrored if it must be; the frames that have no picture then."""
-    if not film.reshapes:
+    if not film.reorients:
         if source.path.is_dir():
-            _linked(list_images(source.path), folder / "images")
+            _link_all(list_images(source.path), folder / "images")
         else:
             _link(source.path, folder / f"video{source.path.suffix}")
         return set()
@@ -82,8 +82,8 @@ def _write_film(source: Source, film: FilmView, folder: Path) -> set[int]:
     missing = set(range(source.frames_in_file))
     code = b""
     for frame in open_source(source.path).frames():
-        picture = film.upright(frame.rgb)[..., ::-1]
-        suffix, options = (".png", []) if png else (".jpg", JPEG)
+        picture = film.reorient(frame.rgb)[..., ::-1]
+        suffix, options = (".png", []) if png else (".jpg", JPEG_OPTIONS)
         code = cv2.imencode(suffix, np.ascontiguousarray(picture), options)[1].tobytes()
         (folder / "images" / f"{frame.index:06d}{suffix}").write_bytes(code)
         missing -= set() if "corrupt" in frame.flags else {frame.index}
@@ -94,32 +94,32 @@ def _write_film(source: Source, film: FilmView, folder: Path) -> set[int]:
     return missing
 
 
-def _of_film(claim: Claim, frames: int) -> Claim:
+def _to_film_frames(hypothesis: CaptureGeometry, frames: int) -> CaptureGeometry:
     """Poses and cameras with the film's own frame numbers and its own window.
 
     Args:
         claim: After all cures.
         frames: How many frames the film has.
     """
-    film = claim.film
+    film = hypothesis.video_transform
     left, top, right, bottom = film.window
-    corner = np.array([left, top]) * np.array(claim.size_px)
+    corner = np.array([left, top]) * np.array(hypothesis.size_px)
     scale = np.array([right - left, bottom - top])
-    intrinsics, extrinsics = claim.intrinsics.copy(), claim.extrinsics
+    intrinsics, extrinsics = hypothesis.intrinsics.copy(), hypothesis.extrinsics
     intrinsics[:, :2, 2] -= corner
     intrinsics[:, :2] /= scale[:, None]
-    if film.renumbers:
-        numbers = np.array([film.number(frame) for frame in range(frames)])
+    if film.renumbers_frames:
+        numbers = np.array([film.mask_frame(frame) for frame in range(frames)])
         intrinsics, extrinsics = (
             each if len(each) == 1 else each[numbers.clip(0, len(each) - 1)]
             for each in (intrinsics, extrinsics)
         )
-        places = film.first - claim.places if film.backwards else claim.places - film.first
-        claim = replace(claim, places=places)
-    return replace(claim, intrinsics=intrinsics, extrinsics=extrinsics, film=AS_FILMED)
+        places = film.first_frame - hypothesis.row_frames if film.backwards else hypothesis.row_frames - film.first_frame
+        hypothesis = replace(hypothesis, row_frames=places)
+    return replace(hypothesis, intrinsics=intrinsics, extrinsics=extrinsics, video_transform=IDENTITY_TRANSFORM)
 
 
-def numbered(claim: Claim, frames: int, *, resampled: bool) -> Motion:
+def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
     """The poses with the numbers of the frames they belong to.
 
     Args:
@@ -129,21 +129,21 @@ def numbered(claim: Claim, frames: int, *, resampled: bool) -> Motion:
             between frames, each frame gets its pose by spherical interpolation between the rows
             around it.
     """
-    if not resampled and np.abs(claim.places - claim.places.round()).max() < WHOLE:
-        numbers = claim.places.round().astype(np.int64)
+    if not resampled and np.abs(hypothesis.row_frames - hypothesis.row_frames.round()).max() < INTEGER_TOLERANCE:
+        numbers = hypothesis.row_frames.round().astype(np.int64)
         inside = np.flatnonzero((numbers >= 0) & (numbers < frames))
-        return claim.motion.taken(inside, numbers[inside])
-    return _between(claim, frames)
+        return hypothesis.motion.select_rows(inside, numbers[inside])
+    return _interpolate_motion(hypothesis, frames)
 
 
-def _between(claim: Claim, frames: int) -> Motion:
-    order = np.argsort(claim.places, kind="stable")
-    order = order[claim.motion.valid[order]]
-    order = order[np.unique(claim.places[order], return_index=True)[1]]
-    places, motion = claim.places[order], claim.motion
+def _interpolate_motion(hypothesis: CaptureGeometry, frames: int) -> Motion:
+    order = np.argsort(hypothesis.row_frames, kind="stable")
+    order = order[hypothesis.motion.valid[order]]
+    order = order[np.unique(hypothesis.row_frames[order], return_index=True)[1]]
+    places, motion = hypothesis.row_frames[order], hypothesis.motion
     numbers = np.arange(max(0, int(np.ceil(places[0]))), min(frames, int(places[-1]) + 1))
     right = np.searchsorted(places, numbers).clip(1, len(places) - 1)
-    near = places[right] - places[right - 1] <= 1.5 * step_of(places)
+    near = places[right] - places[right - 1] <= 1.5 * frame_step(places)
 
     def turned(vectors: np.ndarray) -> np.ndarray:
         return Slerp(places, Rotation.from_rotvec(vectors[order]))(numbers).as_rotvec()
@@ -161,88 +161,88 @@ def _between(claim: Claim, frames: int) -> Motion:
         frames=numbers,
         times_s=None,
         camera_from_world=None,
-        bridged=None,
+        interpolated=None,
     )
 
 
-def _write_masks(examined: Examined, healed: Claim, folder: Path) -> None:
-    masks = examined.recording.masks
+def _write_masks(check: CaptureValidation, corrected: CaptureGeometry, folder: Path) -> None:
+    masks = check.recording.masks
     if masks is None:  # in the pictures themselves
         return
-    if healed.film.renumbers or healed.film.window != WHOLE_WINDOW or healed.alone:
-        _write_pictures(_new_masks(examined, masks, healed), folder / "masks")
+    if corrected.video_transform.renumbers_frames or corrected.video_transform.window != FULL_WINDOW or corrected.keeps_person_only:
+        _write_mask_images(_transformed_masks(check, masks, corrected), folder / "masks")
         return
-    stored = not masks.inverted and not healed.inverted
+    stored = not masks.inverted and not corrected.masks_inverted
     if stored and masks.path.is_dir():
-        _linked(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
+        _link_all(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
         return
     suffix = masks.path.suffix.lower()
     if stored and suffix in (".npz", ".npy"):
         _link(masks.path, folder / f"masks{suffix}")
         return
-    _write_pictures(_stored_masks(masks, healed), folder / "masks")
+    _write_mask_images(_stored_masks(masks, corrected), folder / "masks")
 
 
-def _write_pictures(
-    pictures: Iterator[tuple[str, Float32[np.ndarray, "height width"]]], folder: Path
+def _write_mask_images(
+    masks: Iterator[tuple[str, Float32[np.ndarray, "height width"]]], folder: Path
 ) -> None:
     folder.mkdir()
-    for name, alpha in pictures:
+    for name, alpha in masks:
         _, code = cv2.imencode(".png", (alpha * 255.0 + 0.5).astype(np.uint8))
         (folder / f"{name}.png").write_bytes(code.tobytes())
 
 
 def _stored_masks(
-    masks: Masks, healed: Claim
+    masks: Masks, corrected: CaptureGeometry
 ) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
     """Name and content of each mask that can be read, under its own name."""
     for row in range(masks.count):
         try:
             alpha = masks.alpha(row, masks.size_px)
-        except BadInput:  # one of many; its frame will be without
+        except InputError:  # one of many; its frame will be without
             continue
-        alpha = np.float32(1.0) - alpha if healed.inverted else alpha
+        alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
         yield f"{row:06d}" if masks.names is None else masks.names[row], alpha
 
 
-def _new_masks(
-    examined: Examined, masks: Masks, healed: Claim
+def _transformed_masks(
+    check: CaptureValidation, masks: Masks, corrected: CaptureGeometry
 ) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
     """Name and content of the mask of each of the film's frames; empty where there is none."""
-    source, film, evidence = examined.recording.source, healed.film, examined.evidence
-    folder = source.path.is_dir() and not film.reshapes
+    source, film, evidence = check.recording.source, corrected.video_transform, check.sampled_masks
+    folder = source.path.is_dir() and not film.reorients
     names = [file.stem for file in list_images(source.path)] if folder else []
     width, height = masks.size_px
-    stored = masks_of(examined.recording, masks, masks.size_px)
+    stored = mask_lookup(check.recording, masks, masks.size_px)
     for frame in range(source.frames_in_file):
-        alpha, number = np.zeros((height, width), dtype=np.float32), film.number(frame)
+        alpha, number = np.zeros((height, width), dtype=np.float32), film.mask_frame(frame)
         try:
             alpha = stored(number)
-        except BadInput:  # one of many; its frame will be left out
+        except InputError:  # one of many; its frame will be left out
             pass
         else:
-            alpha = np.float32(1.0) - alpha if healed.inverted else alpha
-            if healed.alone and evidence is not None:
-                alpha = evidence.person_of(healed, number, alpha)
-        if film.window != WHOLE_WINDOW:
-            affine = np.linalg.inv(film.mask_from_film((width, height)))[:2]
+            alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
+            if corrected.keeps_person_only and evidence is not None:
+                alpha = evidence.keep_person(corrected, number, alpha)
+        if film.window != FULL_WINDOW:
+            affine = np.linalg.inv(film.mask_from_video((width, height)))[:2]
             alpha = np.asarray(cv2.warpAffine(alpha, affine, (width, height)), dtype=np.float32)
         yield names[frame] if frame < len(names) else f"{frame:06d}", alpha
 
 
-def _write_cameras(claim: Claim, path: Path) -> None:
-    one = len(claim.extrinsics) == 1
+def _write_cameras(hypothesis: CaptureGeometry, path: Path) -> None:
+    one = len(hypothesis.extrinsics) == 1
     np.savez(
         path,
-        intrinsic=claim.intrinsics[0] if one else claim.intrinsics,
-        extrinsic=claim.extrinsics[0] if one else claim.extrinsics,
-        width=claim.size_px[0],
-        height=claim.size_px[1],
-        distortion=np.array(claim.distortion),
+        intrinsic=hypothesis.intrinsics[0] if one else hypothesis.intrinsics,
+        extrinsic=hypothesis.extrinsics[0] if one else hypothesis.extrinsics,
+        width=hypothesis.size_px[0],
+        height=hypothesis.size_px[1],
+        distortion=np.array(hypothesis.distortion),
     )
 
 
-def _linked(files: Iterable[Path], folder: Path) -> None:
+def _link_all(files: Iterable[Path], folder: Path) -> None:
     folder.mkdir()
     for file in files:
         _link(file, folder / file.name)

@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.ingest_arguments import parsed_frames
-from apps.recording.wanted import RecordingPaths
-from apps.terminal.places import check_file_place
-from capture.errors import BadInput
+from apps.ingest_arguments import parse_frame_range
+from apps.recording.wanted import CaptureInputs
+from apps.terminal.places import check_output_file
+from capture.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class EvaluateArguments:
     Exit codes: 0 done; 2 bad input; 3 disk full; 130 Ctrl-C, after a table of what was scored.
     """
 
-    what: Annotated[
+    targets: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="RUN|AVATAR|DATASET", help_behavior_hint="")
     ]
     """Folders that ia-ingest wrote, .iavatar packages, or a folder of PeopleSnapshot's subjects."""
@@ -73,49 +73,49 @@ class EvaluateArguments:
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the files that --json and --markdown name, if they are there."""
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Refuses what cannot be meant.
 
         Raises:
-            BadInput: Naming the option.
+            InputError: Naming the option.
         """
-        if not self.what:
-            raise BadInput("Name a run, a package or a dataset: ia-evaluate run (see --help).")
+        if not self.targets:
+            raise InputError("Name a run, a package or a dataset: ia-evaluate run (see --help).")
         if self.size is not None and self.size < 16:
-            raise BadInput(f"--size is {self.size}; at least 16 pixels were expected.")
+            raise InputError(f"--size is {self.size}; at least 16 pixels were expected.")
         if not 0.0 < self.seconds < float("inf"):
-            raise BadInput(f"--seconds is {self.seconds}; a positive number was expected.")
+            raise InputError(f"--seconds is {self.seconds}; a positive number was expected.")
         if self.steps is not None and self.steps < 1:
-            raise BadInput(f"--steps is {self.steps}; at least 1 was expected.")
-        parsed_frames(self.frames)
+            raise InputError(f"--steps is {self.steps}; at least 1 was expected.")
+        parse_frame_range(self.frames)
         told = [
             f"--{name}" for name in ("poses", "masks", "cameras") if getattr(self, name) is not None
         ]
         if self.frames != "::":
             told.append("--frames")
         if told and self.on is None:
-            raise BadInput(f"{', '.join(told)} belong to a capture: name it with --on.")
+            raise InputError(f"{', '.join(told)} belong to a capture: name it with --on.")
         for flag, place in (("--json", self.json), ("--markdown", self.markdown)):
             if place is not None:
-                check_file_place(place, flag, self._inputs(), overwrite=self.overwrite)
-        for path in self.what:
+                check_output_file(place, flag, self._inputs(), overwrite=self.overwrite)
+        for path in self.targets:
             if not path.exists():
-                raise BadInput(f"{path} does not exist; a run's folder or a package was expected.")
+                raise InputError(f"{path} does not exist; a run's folder or a package was expected.")
 
     def _inputs(self) -> list[Path]:
         """What is read and must not be written to."""
-        packages = [path for path in self.what if path.is_file()]
+        packages = [path for path in self.targets if path.is_file()]
         if self.on is not None:
-            return [*packages, *self.wanted(self.on).inputs()]
+            return [*packages, *self.capture_inputs(self.on).input_paths()]
         return packages if self.body is None else [*packages, self.body]
 
-    def wanted(self, video: Path) -> RecordingPaths:
+    def capture_inputs(self, video: Path) -> CaptureInputs:
         """What is to be opened of --on."""
-        return RecordingPaths(
+        return CaptureInputs(
             video=video,
             poses=self.poses,
             masks=self.masks,
             cameras=self.cameras,
             body=self.body,
-            frames=parsed_frames(self.frames),
+            frames=parse_frame_range(self.frames),
         )

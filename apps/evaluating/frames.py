@@ -7,38 +7,38 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from apps.ingest_arguments import IngestArguments, learnable_px
+from apps.ingest_arguments import IngestArguments, trainable_longer_side_px
 from apps.learning.run_folder import RunFolder
-from apps.recording.opening import open_recording
-from apps.recording.recording import Recording
-from apps.recording.wanted import RecordingPaths
-from capture.errors import BadInput
+from apps.recording.opening import open_capture
+from apps.recording.recording import Capture
+from apps.recording.wanted import CaptureInputs
+from capture.errors import InputError
 from preprocess.observation import Observation
 
-PATHS = ("video", "poses", "masks", "body", "out", "json")
+PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Frames:
-    """Frames of a recording.
+class EvaluationFrames:
+    """EvaluationFrames of a recording.
 
     Attributes:
         recording: Where they come from.
         numbers: Which of them count; None for all.
     """
 
-    recording: Recording
-    numbers: frozenset[int] | None = None
+    recording: Capture
+    frame_indices: frozenset[int] | None = None
 
     @property
     def count(self) -> int | None:
         """How many there are, if that is known."""
-        return self.recording.source.frame_count if self.numbers is None else len(self.numbers)
+        return self.recording.source.frame_count if self.frame_indices is None else len(self.frame_indices)
 
     def __iter__(self) -> Iterator[Observation]:
         """Those in which the person was found, in order; what is no longer needed is not read."""
-        recording, wanted = self.recording, self.numbers
-        observe, last = recording.observer(), max(wanted, default=-1) if wanted else None
+        recording, wanted = self.recording, self.frame_indices
+        observe, last = recording.observation_builder(), max(wanted, default=-1) if wanted else None
         for frame in recording.source.frames():
             counts = wanted is None or frame.index in wanted
             if counts or recording.segment is not None:  # masks are estimated frame after frame
@@ -49,7 +49,7 @@ class Frames:
                 return
 
 
-def frames_on(wanted: RecordingPaths, person: Path | None, size_px: int | None) -> Frames:
+def capture_frames(inputs: CaptureInputs, body_file: Path | None, size_px: int | None) -> EvaluationFrames:
     """All frames of a capture.
 
     Args:
@@ -58,50 +58,50 @@ def frames_on(wanted: RecordingPaths, person: Path | None, size_px: int | None) 
         size_px: Longer side; None for their own.
 
     Raises:
-        BadInput: If a part is missing or does not fit.
+        InputError: If a part is missing or does not fit.
     """
-    return Frames(recording=open_recording(wanted, size_px=size_px, avatars=person))
+    return EvaluationFrames(recording=open_capture(inputs, size_px=size_px, avatar_body=body_file))
 
 
-def held_out_frames(run: RunFolder, size_px: int | None) -> Frames:
+def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     """The frames that a run has kept for scores, read again from where it read them.
 
     Raises:
-        BadInput: If its report, or what it read, is not there any more.
+        InputError: If its report, or what it read, is not there any more.
     """
     report = read_report(run)
-    given = _given_then(report, run)
+    given = _run_arguments(report, run)
     if given.live or str(given.video).startswith("camera:"):
-        raise BadInput(
+        raise InputError(
             f"{run.path} was learnt from a live source, which nobody kept. Name another capture of "
             "the same person with --on."
         )
-    wanted = given.wanted()
+    wanted = given.capture_inputs()
     if given.cameras == "solve" and run.cameras.is_file():
         wanted = replace(wanted, cameras=str(run.cameras), poses=run.poses)
-    person = run.person if run.person.is_file() else None
-    recording = open_recording(wanted, avatars=person)
-    own_px = given.size or learnable_px(given.training_seconds(recording))
+    person = run.body_file if run.body_file.is_file() else None
+    recording = open_capture(wanted, avatar_body=person)
+    own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
     numbers = report["held_out"]["frames"]
     if not numbers:
-        raise BadInput(
+        raise InputError(
             f"{run.path} has held out no frame, so there is nothing to score it on. Name another "
             "capture of the same person with --on."
         )
-    return Frames(
-        recording=replace(recording, size_px=size_px or own_px), numbers=frozenset(numbers)
+    return EvaluationFrames(
+        recording=replace(recording, size_px=size_px or own_px), frame_indices=frozenset(numbers)
     )
 
 
-def learnt_px(run: RunFolder) -> int | None:
+def trained_longer_side_px(run: RunFolder) -> int | None:
     """Longer side of the pictures that a run has learnt from; None if nobody knows."""
-    size = read_report(run)["held_out"].get("size") if run.report.is_file() else None
+    size = read_report(run)["held_out"].get("size") if run.report_json.is_file() else None
     return max(size) if size else None
 
 
-def is_learnt(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
+def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
     """Whether a run's report says that it was trained for the steps, or else the seconds."""
-    if not (run.has_checkpoint() and run.report.is_file()):
+    if not (run.has_checkpoint() and run.report_json.is_file()):
         return False
     training = read_report(run)["training"]
     return training["wall_seconds"] >= seconds if steps is None else training["steps"] >= steps
@@ -111,48 +111,48 @@ def read_report(run: RunFolder) -> dict[str, Any]:
     """A run's report.json.
 
     Raises:
-        BadInput: If there is none, or it is damaged.
+        InputError: If there is none, or it is damaged.
     """
     try:
-        report = json.loads(run.report.read_text(encoding="utf-8"))
+        report = json.loads(run.report_json.read_text(encoding="utf-8"))
         if isinstance(report["command"], dict) and isinstance(report["held_out"]["frames"], list):
             return report
         raise KeyError("command")
     except FileNotFoundError as error:
-        raise BadInput(
-            f"{run.path} holds no {run.report.name}, which says what it was learnt from: finish "
+        raise InputError(
+            f"{run.path} holds no {run.report_json.name}, which says what it was learnt from: finish "
             "the run (ia-ingest … --resume), or name a capture with --on."
         ) from error
     except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(
-            f"{run.report} is no report that ia-ingest wrote ({type(error).__name__}: {error}). "
+        raise InputError(
+            f"{run.report_json} is no report that ia-ingest wrote ({type(error).__name__}: {error}). "
             "Let the run write it again (ia-ingest … --resume), or give both --on and --size."
         ) from error
 
 
-def _given_then(report: dict[str, Any], run: RunFolder) -> IngestArguments:
+def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
     """The arguments of the run; paths that were relative are looked for near it, too."""
     known = {item.name for item in fields(IngestArguments)}
     words = {key: value for key, value in report["command"].items() if key in known}
     try:
-        words |= {key: Path(words[key]) for key in PATHS if words.get(key) is not None}
+        words |= {key: Path(words[key]) for key in PATH_ARGUMENTS if words.get(key) is not None}
         given = IngestArguments(**words)
     except TypeError as error:
-        raise BadInput(
-            f"{run.report} does not say what was learnt from; name a capture with --on."
+        raise InputError(
+            f"{run.report_json} does not say what was learnt from; name a capture with --on."
         ) from error
-    base = _base(given, run)
-    near = {key: base / words[key] for key in PATHS if words.get(key) is not None}
+    base = _original_working_folder(given, run)
+    near = {key: base / words[key] for key in PATH_ARGUMENTS if words.get(key) is not None}
     if given.cameras is not None and (base / given.cameras).exists():
         near["cameras"] = str(base / given.cameras)
     return replace(given, **near, realtime=False)
 
 
-def _base(given: IngestArguments, run: RunFolder) -> Path:
+def _original_working_folder(arguments: IngestArguments, run: RunFolder) -> Path:
     """Where the command was run: here, or where its --out was this folder."""
-    if given.video.exists() or given.out is None or given.out.is_absolute():
+    if arguments.video.exists() or arguments.out is None or arguments.out.is_absolute():
         return Path()
     above = Path(os.path.abspath(run.path))
-    for _ in given.out.parts:
+    for _ in arguments.out.parts:
         above = above.parent
-    return above if (above / given.video).exists() else Path()
+    return above if (above / arguments.video).exists() else Path()

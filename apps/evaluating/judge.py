@@ -7,24 +7,24 @@ from itertools import islice
 from pathlib import Path
 from typing import final
 
-from apps.evaluating.frames import Frames
-from apps.evaluating.rows import Evaluation, Picture, Row, scored
-from apps.terminal.console import Bar, Console
-from avatar.fit import fitted
-from avatar.hold import HeldOut
+from apps.evaluating.frames import EvaluationFrames
+from apps.evaluating.rows import AvatarEvaluation, PremultipliedImage, ScoreRow, score_frame
+from apps.terminal.console import ProgressBar, Console
+from avatar.fit import fit_test_poses
+from avatar.hold import HeldOutFrame
 from avatar.render import render
 from avatar.trainer import Trainer
-from export.player import Player, premultiplied
+from export.player import Player, premultiply
 from preprocess.observation import Observation
 
-BEST = "hq"
+BEST_TIER = "hq"
 """The tier that every package has."""
-TOGETHER = 25
-"""Frames that poses are fitted to at a time."""
+FIT_BATCH_FRAMES = 25
+"""EvaluationFrames that poses are fitted to at a time."""
 
 
 @final
-class Judge:
+class AvatarScorer:
     """One avatar, to be compared with frames.
 
     Attributes:
@@ -32,7 +32,7 @@ class Judge:
         size_px: Of the pictures, width and height; None before the first.
     """
 
-    def __init__(self, trainer: Trainer | None, players: dict[str, Player], *, fits: bool) -> None:
+    def __init__(self, trainer: Trainer | None, players: dict[str, Player], *, fit_poses: bool) -> None:
         """Nothing is drawn yet.
 
         Args:
@@ -41,57 +41,57 @@ class Judge:
             fits: Whether poses are fitted to the frames, too.
         """
         self._trainer, self._players = trainer, players
-        self._given = Row(drawn_by="renderer", poses="given")
-        self._fitted = Row(drawn_by="renderer", poses="fitted")
-        self._played = {tier: Row(drawn_by=f"player {tier}", poses="given") for tier in players}
-        self.rows: list[Row] = [*([self._given] if trainer else []), *self._played.values()]
+        self._given = ScoreRow(renderer="renderer", poses="given")
+        self._fitted = ScoreRow(renderer="renderer", poses="fitted")
+        self._played = {tier: ScoreRow(renderer=f"player {tier}", poses="given") for tier in players}
+        self.rows: list[ScoreRow] = [*([self._given] if trainer else []), *self._played.values()]
         self.size_px: tuple[int, int] | None = None
-        self._fits = fits and trainer is not None
+        self._fits = fit_poses and trainer is not None
         if self._fits:
             self.rows.insert(1, self._fitted)
 
-    def look(self, frames: Iterable[Observation], bar: Bar, stop: threading.Event) -> None:
+    def score_frames(self, frames: Iterable[Observation], bar: ProgressBar, stop: threading.Event) -> None:
         """Scores frame after frame, until there is none left or somebody stops it."""
         done = 0
         rest = iter(frames)
-        while some := list(islice(rest, TOGETHER)):
+        while some := list(islice(rest, FIT_BATCH_FRAMES)):
             for seen in some:
                 if stop.is_set():
                     return
-                self._one(seen)
+                self._score_frame(seen)
                 done += 1
-                bar.move(float(done), f"frame {seen.frame.index}, {done} scored")
+                bar.update(float(done), f"frame {seen.frame.index}, {done} scored")
             if self._fits and not stop.is_set():
-                bar.move(float(done), f"fitting poses to {len(some)} frames")
-                self._fit(some)
+                bar.update(float(done), f"fitting poses to {len(some)} frames")
+                self._score_in_fitted_poses(some)
 
-    def _one(self, seen: Observation) -> None:
-        trainer, self.size_px = self._trainer, seen.camera.size_px
+    def _score_frame(self, observation: Observation) -> None:
+        trainer, self.size_px = self._trainer, observation.camera.size_px
         if trainer is not None:
-            draw = partial(render, trainer.avatar, seen.pose, seen.camera)
-            self._given.scores.append(scored(seen, draw))
+            draw = partial(render, trainer.avatar, observation.pose, observation.camera)
+            self._given.scores.append(score_frame(observation, draw))
         for tier, player in self._players.items():
-            self._played[tier].scores.append(scored(seen, partial(_played, player, seen)))
+            self._played[tier].scores.append(score_frame(observation, partial(_render_with_player, player, observation)))
 
-    def _fit(self, some: Sequence[Observation]) -> None:
+    def _score_in_fitted_poses(self, observations: Sequence[Observation]) -> None:
         trainer = self._trainer
         assert trainer is not None
-        for held, _ in fitted(trainer, [HeldOut(observation=seen) for seen in some]):
+        for held, _ in fit_test_poses(trainer, [HeldOutFrame(observation=seen) for seen in observations]):
             seen = held.observation
             draw = partial(render, trainer.avatar, seen.pose, seen.camera)
-            self._fitted.scores.append(scored(seen, draw))
+            self._fitted.scores.append(score_frame(seen, draw))
 
 
-def judged(
+def evaluate_avatar(
     name: str,
-    frames: Frames,
+    frames: EvaluationFrames,
     trainer: Trainer | None,
     package: Path | None,
     console: Console,
     stop: threading.Event,
     *,
-    fits: bool,
-) -> Evaluation:
+    fit_poses: bool,
+) -> AvatarEvaluation:
     """An avatar's rows.
 
     Args:
@@ -104,26 +104,26 @@ def judged(
         fits: Whether poses are fitted to the frames, too.
 
     Raises:
-        BadInput: If the package is damaged.
+        InputError: If the package is damaged.
     """
-    judge = Judge(trainer, _players(package, frames, console), fits=fits)
-    with console.bar(f"scoring {name}", float(frames.count or 0)) as bar:
-        judge.look(frames, bar, stop)
+    judge = AvatarScorer(trainer, _load_players(package, frames, console), fit_poses=fit_poses)
+    with console.progress(f"scoring {name}", float(frames.count or 0)) as bar:
+        judge.score_frames(frames, bar, stop)
     video = str(frames.recording.paths.video)
-    return Evaluation(name=name, capture=video, size=judge.size_px, rows=judge.rows)
+    return AvatarEvaluation(name=name, capture=video, size=judge.size_px, rows=judge.rows)
 
 
-def _played(player: Player, seen: Observation) -> Picture:
-    return premultiplied(player.render(seen.pose, seen.camera))
+def _render_with_player(player: Player, observation: Observation) -> PremultipliedImage:
+    return premultiply(player.render(observation.pose, observation.camera))
 
 
-def _players(package: Path | None, frames: Frames, console: Console) -> dict[str, Player]:
+def _load_players(package: Path | None, frames: EvaluationFrames, console: Console) -> dict[str, Player]:
     """A player for each tier; none for pictures that a lens has bent."""
     if package is None:
         return {}
     if frames.recording.cameras[0].distortion:
-        console.warn("The player draws pinhole pictures; this lens bends, so it is not scored.")
+        console.warning("The player draws pinhole pictures; this lens bends, so it is not scored.")
         return {}
     best = Player.load(package)
-    rest = [tier for tier in best.manifest.tiers if tier != BEST]
-    return {BEST: best, **{tier: Player.load(package, tier=tier) for tier in rest}}
+    rest = [tier for tier in best.manifest.tiers if tier != BEST_TIER]
+    return {BEST_TIER: best, **{tier: Player.load(package, tier=tier) for tier in rest}}

@@ -10,12 +10,12 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class DatasetSubject:
     """A subject of the dataset.
 
     Attributes:
         name: Of its folder.
-        train, test: Frames, START:STOP:STEP counted from 0.
+        train, test: EvaluationFrames, START:STOP:STEP counted from 0.
         paper: InstantAvatar's own figures after a minute, at 540 px.
     """
 
@@ -26,37 +26,37 @@ class Subject:
 
 
 SUBJECTS = (
-    Subject(
+    DatasetSubject(
         name="female-3-casual",
         train="0:446:4",
         test="446:648:4",
         paper={"psnr": 27.90, "ssim": 0.9722},
     ),
-    Subject(
+    DatasetSubject(
         name="female-4-casual",
         train="0:336:4",
         test="335:524:4",
         paper={"psnr": 28.92, "ssim": 0.9692},
     ),
-    Subject(
+    DatasetSubject(
         name="male-3-casual",
         train="0:456:4",
         test="456:676:4",
         paper={"psnr": 29.65, "ssim": 0.9730},
     ),
-    Subject(
+    DatasetSubject(
         name="male-4-casual",
         train="0:660:6",
         test="660:873:6",
         paper={"psnr": 27.97, "ssim": 0.9649},
     ),
 )
-PIXELS = 540
+LONGER_SIDE_PX = 540
 TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_nerf_test.npz")
 """Anim-NeRF's poses, a row for each frame of the list; where they are not, poses.npz serves."""
 
 
-def subjects_in(folder: Path) -> list[tuple[Subject, Path]]:
+def find_subjects(folder: Path) -> list[tuple[DatasetSubject, Path]]:
     """The subjects that lie in a folder, or the one that it is."""
     found = []
     for subject in SUBJECTS:
@@ -67,6 +67,6 @@ def subjects_in(folder: Path) -> list[tuple[Subject, Path]]:
     return found
 
 
-def poses_of(place: Path, sliced: Path) -> Path | None:
+def subject_poses(folder: Path, relative_path: Path) -> Path | None:
     """Poses of one list of frames, if they lie there; None leaves it to the capture folder."""
-    return place / sliced if (place / sliced).is_file() else None
+    return folder / relative_path if (folder / relative_path).is_file() else None

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from apps.reporting.report import mean
-from avatar.hold import SILHOUETTE, HeldOut, compared, on_white, truth_on_white
+from apps.reporting.report import finite_mean
+from avatar.hold import MASK_THRESHOLD, HeldOutFrame, score_rendering, composite_on_white, ground_truth_on_white
 from avatar.metrics import psnr
-from avatar.sharpness import Verdict, verdict_of
+from avatar.sharpness import SharpnessVerdict, overall_verdict
 from preprocess.observation import Observation
 
-Picture = Float32[np.ndarray, "height width 4"]
+PremultipliedImage = Float32[np.ndarray, "height width 4"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,47 +42,47 @@ class FrameScore:
     cpu_ms: float
 
 
-FIGURES = ("psnr", "psnr_box", "psnr_mask", "ssim", "cpu_ms")
+METRICS = ("psnr", "psnr_box", "psnr_mask", "ssim", "cpu_ms")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class ScoreRow:
     """One way to draw an avatar, scored.
 
     Attributes:
-        drawn_by: "renderer", "player hq" or "player lite".
+        renderer: "renderer", "player hq" or "player lite".
         poses: "given" or "fitted".
         scores: One for each frame.
     """
 
-    drawn_by: str
+    renderer: str
     poses: str
     scores: list[FrameScore] = field(default_factory=list)
 
-    def figure(self, name: str) -> float | None:
-        """The mean of one of `FIGURES` over the frames; None if no frame has it."""
-        return mean([getattr(score, name) for score in self.scores])
+    def mean_of(self, name: str) -> float | None:
+        """The mean of one of `METRICS` over the frames; None if no frame has it."""
+        return finite_mean([getattr(score, name) for score in self.scores])
 
     @property
-    def verdict(self) -> Verdict | None:
+    def verdict(self) -> SharpnessVerdict | None:
         """What the figures mean, in a word; None without a silhouette to look at."""
-        return verdict_of(self.scores)
+        return overall_verdict(self.scores)
 
     def as_json(self) -> dict[str, object]:
         """Means, then every frame."""
         return {
-            "drawn_by": self.drawn_by,
+            "renderer": self.renderer,
             "poses": self.poses,
-            **{name: _plain(self.figure(name)) for name in FIGURES},
+            **{name: _json_number(self.mean_of(name)) for name in METRICS},
             "verdict": self.verdict,
             "frames": [
-                {key: _plain(value) for key, value in vars(score).items()} for score in self.scores
+                {key: _json_number(value) for key, value in vars(score).items()} for score in self.scores
             ],
         }
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class AvatarEvaluation:
     """An avatar's rows.
 
     Attributes:
@@ -96,7 +96,7 @@ class Evaluation:
     name: str
     capture: str
     size: tuple[int, int] | None
-    rows: Sequence[Row]
+    rows: Sequence[ScoreRow]
     paper: dict[str, float] | None = None
 
     def as_json(self) -> dict[str, object]:
@@ -111,7 +111,7 @@ class Evaluation:
         }
 
 
-def scored(seen: Observation, draw: Callable[[], Picture]) -> FrameScore:
+def score_frame(observation: Observation, render_image: Callable[[], PremultipliedImage]) -> FrameScore:
     """Draws a picture and compares it with the frame.
 
     Args:
@@ -119,11 +119,11 @@ def scored(seen: Observation, draw: Callable[[], Picture]) -> FrameScore:
         draw: Makes the picture, premultiplied.
     """
     started = time.process_time()
-    picture = draw()
+    picture = render_image()
     cpu_ms = 1000.0 * (time.process_time() - started)
-    shown, truth = np.clip(on_white(picture), 0.0, 1.0), truth_on_white(seen)
-    rows, columns = _box(seen.alpha > SILHOUETTE)
-    score = compared(picture, HeldOut(observation=seen))
+    shown, truth = np.clip(composite_on_white(picture), 0.0, 1.0), ground_truth_on_white(observation)
+    rows, columns = _bounding_box(observation.alpha > MASK_THRESHOLD)
+    score = score_rendering(picture, HeldOutFrame(observation=observation))
     return FrameScore(
         **vars(score),
         psnr_box=psnr(shown[rows, columns], truth[rows, columns]),
@@ -131,13 +131,13 @@ def scored(seen: Observation, draw: Callable[[], Picture]) -> FrameScore:
     )
 
 
-def to_json(evaluations: Iterable[Evaluation]) -> str:
+def evaluations_to_json(evaluations: Iterable[AvatarEvaluation]) -> str:
     """The text of the file that --json names."""
     content = {"format": 1, "avatars": [each.as_json() for each in evaluations]}
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def _box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
+def _bounding_box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
     """Rows and columns of the smallest box around it; empty around nothing."""
     spans = []
     for axis in (1, 0):
@@ -146,5 +146,5 @@ def _box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _plain(value: float | int | None) -> float | int | None:
+def _json_number(value: float | int | None) -> float | int | None:
     return None if value is None or not np.isfinite(value) else round(value, 4)

@@ -5,41 +5,41 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apps.learning.learnt import Learnt
+from apps.learning.learnt import TrainingResult
 from apps.learning.run_folder import RunFolder
-from apps.learning.snapshot import Snapshot
+from apps.learning.snapshot import PackageSnapshot
 from apps.playing.follow import FollowingCamera
-from apps.playing.novel import novel_motion
-from apps.recording.recording import Recording
-from apps.reporting.body_map import BodyMap
-from apps.reporting.failure import failure_of
-from apps.reporting.page import Pair, report_page
-from apps.reporting.pictures import data_uri, eight_bit, moving_data_uri
+from apps.playing.novel import demo_motion
+from apps.recording.recording import Capture
+from apps.reporting.body_map import CoverageMap
+from apps.reporting.failure import diagnose_failure
+from apps.reporting.page import ComparisonPair, report_page
+from apps.reporting.pictures import webp_data_uri, to_uint8, animated_webp_data_uri
 from apps.reporting.report import (
-    CoverageNote,
-    FramesNote,
-    HeldOutNote,
-    MachineNote,
-    PackageNote,
+    CoverageStats,
+    FrameStats,
+    HeldOutStats,
+    MachineInfo,
+    PackageStats,
     Report,
-    TrainingNote,
+    TrainingStats,
 )
 from apps.terminal.console import Console
-from avatar.hold import on_white, spread, truth_on_white
+from avatar.hold import composite_on_white, subsample_evenly, ground_truth_on_white
 from avatar.render import render
-from avatar.sharpness import verdict_of
-from capture.atomic_files import write_text
+from avatar.sharpness import overall_verdict
+from capture.atomic_files import write_text_atomically
 from capture.memory import peak_memory_mb
 from export.build import ExportReport
 from export.player import Player
 
-SHOWN_PAIRS = 6
-NOVEL_PX = 320
-NOVEL_FPS = 16.0
+MAX_PAIRS = 6
+ANIMATION_PX = 320
+ANIMATION_FPS = 16.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunNote:
+class RunInfo:
     """What only the command knows.
 
     Attributes:
@@ -54,7 +54,7 @@ class RunNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Delivered:
+class RunOutcome:
     """What was written.
 
     Attributes:
@@ -64,18 +64,18 @@ class Delivered:
     """
 
     report: Report
-    refused: str | None
+    refusal: str | None
     failure: str | None
 
 
-def deliver(
-    learnt: Learnt,
-    taken: Snapshot,
-    recording: Recording,
+def write_report(
+    result: TrainingResult,
+    snapshot: PackageSnapshot,
+    recording: Capture,
     run: RunFolder,
-    note: RunNote,
+    info: RunInfo,
     console: Console,
-) -> Delivered:
+) -> RunOutcome:
     """Writes the report, then the page; each whole or not at all.
 
     Args:
@@ -89,31 +89,31 @@ def deliver(
     Raises:
         OSError: If the disk is full; what was written before stays.
     """
-    refused, package = taken.refused, None
-    if taken.exported is None:
+    refused, package = snapshot.refusal, None
+    if snapshot.export_report is None:
         run.remove(run.package)  # a resumed run's older avatar would contradict
     else:
-        for warning in taken.exported.warnings:
-            console.warn(warning)
-        package = _package_note(taken.exported, run)
-    ready_at = None if taken.exported is None else taken.ready_at
-    report = _report(learnt, recording, note, package, ready_at)
-    failure = failure_of(report)
-    write_text(run.report, report.to_json())
-    with console.waiting("drawing the report"):
+        for warning in snapshot.export_report.warnings:
+            console.warning(warning)
+        package = _package_stats(snapshot.export_report, run)
+    ready_at = None if snapshot.export_report is None else snapshot.ready_at
+    report = _build_report(result, recording, info, package, ready_at)
+    failure = diagnose_failure(report)
+    write_text_atomically(run.report_json, report.to_json())
+    with console.status("drawing the report"):
         page = report_page(
             report,
             name=recording.paths.video.name,
-            body_map=BodyMap(recording.shaped, learnt.coverage).svg(),
-            pairs=pairs(learnt),
-            novel=None if package is None else novel(Player.load(run.package)),
+            body_map=CoverageMap(recording.shaped, result.coverage).svg(),
+            pairs=comparison_pairs(result),
+            animation=None if package is None else demo_animation(Player.load(run.package)),
             warnings=[*console.warnings, *([] if refused is None else [refused])],
             failure=failure,
-            present=[path.name for path in (run.cameras, run.poses) if path.exists()],
-            play=None if package is None else play_command(run.package, recording.paths.poses),
+            present_files=[path.name for path in (run.cameras, run.poses) if path.exists()],
+            play_command=None if package is None else play_command(run.package, recording.paths.poses),
         )
-    write_text(run.page, page)
-    return Delivered(report=report, refused=refused, failure=failure)
+    write_text_atomically(run.report_html, page)
+    return RunOutcome(report=report, refusal=refused, failure=failure)
 
 
 def play_command(package: Path, poses: Path) -> str:
@@ -121,46 +121,46 @@ def play_command(package: Path, poses: Path) -> str:
     return shlex.join(["ia-play", str(package), "--poses", str(poses)])
 
 
-def pairs(learnt: Learnt) -> list[Pair]:
+def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
     """Held-out frames beside what the avatar shows, for the page."""
     shown = []
-    scores = {score.frame: score for score in learnt.scores}
-    for held in spread(learnt.held, SHOWN_PAIRS):
+    scores = {score.frame: score for score in result.scores}
+    for held in subsample_evenly(result.held_out, MAX_PAIRS):
         observation = held.observation
         if observation.frame.index not in scores:
             continue
         picture = render(
-            learnt.trainer.avatar, observation.pose, observation.camera, cells=held.cells
+            result.trainer.avatar, observation.pose, observation.camera, cells=held.correspondences
         )
         shown.append(
-            Pair(
+            ComparisonPair(
                 frame=observation.frame.index,
                 psnr=scores[observation.frame.index].psnr,
-                verdict=verdict_of([scores[observation.frame.index]]),
-                truth=data_uri(eight_bit(truth_on_white(observation))),
-                render=data_uri(eight_bit(on_white(picture))),
+                verdict=overall_verdict([scores[observation.frame.index]]),
+                truth=webp_data_uri(to_uint8(ground_truth_on_white(observation))),
+                render=webp_data_uri(to_uint8(composite_on_white(picture))),
             )
         )
     return shown
 
 
-def novel(player: Player) -> str:
+def demo_animation(player: Player) -> str:
     """The avatar in a motion of our own, drawn by the player, as a moving picture."""
-    motion = novel_motion(fps=NOVEL_FPS)
-    camera = FollowingCamera.of(player, motion, NOVEL_PX)
+    motion = demo_motion(fps=ANIMATION_FPS)
+    camera = FollowingCamera.of(player, motion, ANIMATION_PX)
     poses = [motion[row] for row in range(len(motion))]
-    return moving_data_uri([player.render(p, camera.at(p)) for p in poses], fps=NOVEL_FPS)
+    return animated_webp_data_uri([player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS)
 
 
-def _fitted_note(learnt: Learnt) -> HeldOutNote | None:
+def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
     """Scores in poses fitted to the frames, if there are any."""
-    if not learnt.fitted:
+    if not result.fitted_pose_scores:
         return None
-    return replace(HeldOutNote.of(learnt.fitted, learnt.meter.size_px), poses="fitted")
+    return replace(HeldOutStats.of(result.fitted_pose_scores, result.meter.size_px), poses="fitted")
 
 
-def _package_note(exported: ExportReport, run: RunFolder) -> PackageNote:
-    return PackageNote(
+def _package_stats(exported: ExportReport, run: RunFolder) -> PackageStats:
+    return PackageStats(
         path=run.package.name,
         bytes=exported.bytes,
         seconds=exported.seconds,
@@ -168,62 +168,62 @@ def _package_note(exported: ExportReport, run: RunFolder) -> PackageNote:
     )
 
 
-def _report(
-    learnt: Learnt,
-    recording: Recording,
-    note: RunNote,
-    package: PackageNote | None,
+def _build_report(
+    result: TrainingResult,
+    recording: Capture,
+    info: RunInfo,
+    package: PackageStats | None,
     ready_at: float | None,
 ) -> Report:
-    trainer = learnt.trainer
-    held = HeldOutNote.of(learnt.scores, learnt.meter.size_px if learnt.scores else None)
+    trainer = result.trainer
+    held = HeldOutStats.of(result.scores, result.meter.size_px if result.scores else None)
     recipe = asdict(trainer.config) | {
         "camera": recording.cameras.source,
         "body": recording.shaped.body.family,
-        "pose_model": recording.motion.model,
-        "body_fit": recording.told_of_body(),
-        **recording.told_of_masks(),
+        "pose_model": recording.motion.body_model,
+        "body_fit": recording.body_fit_report(),
+        **recording.mask_report(),
     }
     return Report(
-        command=note.command,
+        command=info.command,
         recipe=recipe,
-        machine=MachineNote(
+        machine=MachineInfo(
             device=trainer.avatar.field.table.device.type,
             backend=trainer.backend.name,
-            threads=note.threads,
+            threads=info.threads,
         ),
-        frames=_frames_note(learnt),
-        training=_training_note(learnt, note),
+        frames=_frame_stats(result),
+        training=_training_stats(result, info),
         held_out=held,
-        held_out_refined=_fitted_note(learnt),
-        curve=learnt.curve,
-        stream=learnt.meter.note(ready_at=ready_at),
+        held_out_refined=_fitted_pose_stats(result),
+        curve=result.curve,
+        stream=result.meter.stats(ready_at=ready_at),
         package=package,
-        coverage=CoverageNote.of(learnt.coverage),
-        extended=learnt.extended,
-        cameras=recording.solved,
+        coverage=CoverageStats.of(result.coverage),
+        earlier_videos=result.earlier_videos,
+        cameras=recording.camera_report,
     )
 
 
-def _frames_note(learnt: Learnt) -> FramesNote:
-    meter = learnt.meter
-    return FramesNote(
-        read=learnt.added + meter.held_out + meter.dropped_count + meter.passed_over,
-        used=learnt.added,
-        held_out=meter.held_out,
+def _frame_stats(result: TrainingResult) -> FrameStats:
+    meter = result.meter
+    return FrameStats(
+        read=result.frames_added + meter.held_out_count + meter.dropped_count + meter.near_duplicates,
+        used=result.frames_added,
+        held_out=meter.held_out_count,
         dropped=tuple(meter.dropped),
-        alike=meter.passed_over,
-        not_replayed=learnt.added - sum(i >= 0 for i in learnt.trainer.replay.indices),
+        near_duplicates=meter.near_duplicates,
+        not_replayed=result.frames_added - sum(i >= 0 for i in result.trainer.replay.frame_indices),
     )
 
 
-def _training_note(learnt: Learnt, note: RunNote) -> TrainingNote:
-    trainer = learnt.trainer
-    return TrainingNote(
+def _training_stats(result: TrainingResult, info: RunInfo) -> TrainingStats:
+    trainer = result.trainer
+    return TrainingStats(
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
-        cpu_waited_seconds=learnt.cpu.waited_s,
-        startup_seconds=note.startup_seconds,
+        cpu_contention_seconds=result.cpu_time.waited_s,
+        startup_seconds=info.startup_seconds,
         steps=trainer.steps,
         rays=trainer.rays,
         rays_per_second=trainer.rays / max(trainer.wall_seconds, 1e-6),

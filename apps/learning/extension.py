@@ -5,24 +5,24 @@ from pathlib import Path
 from typing import Any, final
 
 from apps.learning.run_folder import RunFolder
-from apps.reporting.report import ExtendedNote, decibels
+from apps.reporting.report import ForgettingStats, format_psnr
 from apps.terminal.console import Console
-from avatar.events import Score
-from avatar.hold import HeldOut, score
+from avatar.events import HeldOutScore
+from avatar.hold import HeldOutFrame, score_frame
 from avatar.kept_frames import (
-    CLIP,
-    EARLIER,
-    FINISHED,
-    KeptFrames,
+    INDEX_SHIFT_PER_VIDEO,
+    EARLIER_VIDEOS_FILE,
+    LAST_RUN_FILE,
+    SavedFrames,
     number_in_video,
-    videos_ago,
+    video_age,
 )
-from avatar.sharpness import verdict_of
+from avatar.sharpness import overall_verdict
 from avatar.trainer import Trainer
 
 
 @final
-class Extension:
+class EarlierVideos:
     """The videos that were learnt before this one.
 
     Their key frames stay in replay beside the new ones, and compete with them for their places; a
@@ -38,48 +38,48 @@ class Extension:
         """
         self._run, self._notes = run, notes
         began = "before" in notes  # else the file is of a run that was killed at its start
-        self._kept = KeptFrames.load(run.checkpoint / EARLIER) if began else KeptFrames([], [])
+        self._kept = SavedFrames.load(run.checkpoint / EARLIER_VIDEOS_FILE) if began else SavedFrames([], [])
 
     @property
-    def held(self) -> list[HeldOut]:
-        """Frames of earlier videos that were never trained on."""
-        return self._kept.held
+    def held_out(self) -> list[HeldOutFrame]:
+        """EvaluationFrames of earlier videos that were never trained on."""
+        return self._kept.held_out
 
-    def begin(self, trainer: Trainer, console: Console) -> None:
+    def start_new_video(self, trainer: Trainer, console: Console) -> None:
         """Makes the video that was learnt last an earlier one, and scores it for the last time."""
-        self._kept = KeptFrames.load(self._run.checkpoint / FINISHED).earlier()
-        self._kept.save(self._run.checkpoint / EARLIER)
-        trainer.corrections = {
-            index - CLIP: correction for index, correction in trainer.corrections.items()
+        self._kept = SavedFrames.load(self._run.checkpoint / LAST_RUN_FILE).as_earlier_video()
+        self._kept.save(self._run.checkpoint / EARLIER_VIDEOS_FILE)
+        trainer.pose_corrections = {
+            index - INDEX_SHIFT_PER_VIDEO: correction for index, correction in trainer.pose_corrections.items()
         }
-        if not self._kept.key_frames:
-            console.warn(
+        if not self._kept.replay_frames:
+            console.warning(
                 "The frames of the earlier video were not kept, for its run did not come to its "
                 "end: they are not learnt from again, and what they lose cannot be said."
             )
-        self.recall(trainer, console)
-        with console.waiting(f"scoring {len(self.held)} frames of the earlier video"):
-            scores = self._scores(trainer)
+        self.restore_key_frames(trainer, console)
+        with console.status(f"scoring {len(self.held_out)} frames of the earlier video"):
+            scores = self._score_earlier_videos(trainer)
         self._notes["before"] = {
-            "videos": [*earlier_videos(self._notes), self._name()],
+            "videos": [*earlier_video_names(self._notes), self._previous_video_name()],
             "frames": trainer.frames_seen,
             "seconds": trainer.wall_seconds,
             "steps": trainer.steps,
             "scores": [vars(each) for each in scores],
         }
 
-    def recall(self, trainer: Trainer, console: Console) -> None:
+    def restore_key_frames(self, trainer: Trainer, console: Console) -> None:
         """Puts the key frames of earlier videos back into the trainer's memory."""
-        if not self._kept.key_frames:
+        if not self._kept.replay_frames:
             return
-        count = len(self._kept.key_frames)
-        with console.waiting(f"preparing {count} frames of the earlier video"):
-            for frame in self._kept.prepared(trainer.avatar.rig):
-                trainer.add(frame, again=True)
+        count = len(self._kept.replay_frames)
+        with console.status(f"preparing {count} frames of the earlier video"):
+            for frame in self._kept.training_frames(trainer.avatar.rig):
+                trainer.add_frame(frame, is_restored=True)
 
-    def finish(
-        self, trainer: Trainer, held: list[HeldOut], console: Console
-    ) -> ExtendedNote | None:
+    def measure_forgetting(
+        self, trainer: Trainer, held_out: list[HeldOutFrame], console: Console
+    ) -> ForgettingStats | None:
         """Keeps the frames for the next video; says what the earlier ones lost, if there are any.
 
         Args:
@@ -90,38 +90,38 @@ class Extension:
         Raises:
             OSError: If the disk is full.
         """
-        kept = KeptFrames.of(trainer.replay, [*self.held, *held])
-        kept.save(self._run.checkpoint / FINISHED)
+        kept = SavedFrames.of(trainer.replay, [*self.held_out, *held_out])
+        kept.save(self._run.checkpoint / LAST_RUN_FILE)
         if "before" not in self._notes:
             return None
         history = self._notes["before"]
-        before = tuple(Score(**each) for each in history["scores"])
-        after, videos = self._scores(trainer), earlier_videos(self._notes)
-        places = [len(videos) + 1 - videos_ago(h.observation.frame.index) for h in self.held]
-        note = ExtendedNote.of(
+        before = tuple(HeldOutScore(**each) for each in history["scores"])
+        after, videos = self._score_earlier_videos(trainer), earlier_video_names(self._notes)
+        places = [len(videos) + 1 - video_age(h.observation.frame.index) for h in self.held_out]
+        note = ForgettingStats.of(
             before, after, videos=videos, video_of_frame=places,
-            used=history["frames"], wall_seconds=history["seconds"],
-            recalled=len(self._kept.key_frames),
+            frames_trained=history["frames"], wall_seconds=history["seconds"],
+            replayed_key_frames=len(self._kept.replay_frames),
         )  # fmt: skip
         if note.psnr_after is not None:
-            console.say(
+            console.info(
                 "Frames of the earlier video: "
-                f"{decibels(note.psnr_before, verdict_of(before))} before, "
-                f"{decibels(note.psnr_after, verdict_of(after))} now; none lost more than "
-                f"{note.largest_fall:.2f} dB."
+                f"{format_psnr(note.psnr_before, overall_verdict(before))} before, "
+                f"{format_psnr(note.psnr_after, overall_verdict(after))} now; none lost more than "
+                f"{note.largest_drop:.2f} dB."
             )
         return note
 
-    def _name(self) -> str:
+    def _previous_video_name(self) -> str:
         """Of the video that was learnt last, as its user named it."""
         return self._notes.get("name") or Path(self._notes["video"]).name
 
-    def _scores(self, trainer: Trainer) -> tuple[Score, ...]:
+    def _score_earlier_videos(self, trainer: Trainer) -> tuple[HeldOutScore, ...]:
         """Of the held-out frames, by the numbers that they had in their own video."""
-        scores = (score(trainer.avatar, frame) for frame in self.held)
+        scores = (score_frame(trainer.avatar, frame) for frame in self.held_out)
         return tuple(replace(each, frame=number_in_video(each.frame)) for each in scores)
 
 
-def earlier_videos(notes: dict[str, Any]) -> tuple[str, ...]:
+def earlier_video_names(notes: dict[str, Any]) -> tuple[str, ...]:
     """Names of the videos that were learnt before the present one, by what a checkpoint keeps."""
     return tuple(notes.get("before", {}).get("videos", ()))

@@ -4,16 +4,16 @@ from dataclasses import dataclass
 
 from apps.reporting.cpu_wait import CpuTime
 from apps.reporting.curve import CurvePoint
-from apps.reporting.meter import Meter
-from apps.reporting.report import ExtendedNote
+from apps.reporting.meter import StreamMeter
+from apps.reporting.report import ForgettingStats
 from avatar.coverage import Coverage
-from avatar.events import Score
-from avatar.hold import HeldOut
+from avatar.events import HeldOutScore
+from avatar.hold import HeldOutFrame
 from avatar.trainer import Trainer
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Learnt:
+class TrainingResult:
     """What training leaves in memory.
 
     Attributes:
@@ -22,7 +22,7 @@ class Learnt:
         curve: Scores on the way, and at the end.
         meter: What it saw of the stream.
         coverage: What of the person the frames show that it was trained on.
-        added: Frames that were put into the trainer's memory in this run.
+        added: EvaluationFrames that were put into the trainer's memory in this run.
         interrupted: Whether Ctrl-C ended it.
         scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
         fitted: The same in poses fitted to them, if poses are refined.
@@ -31,18 +31,18 @@ class Learnt:
     """
 
     trainer: Trainer
-    held: list[HeldOut]
+    held_out: list[HeldOutFrame]
     curve: tuple[CurvePoint, ...]
-    meter: Meter
+    meter: StreamMeter
     coverage: Coverage
-    added: int
+    frames_added: int
     interrupted: bool
-    cpu: CpuTime
-    scores: tuple[Score, ...] = ()
-    fitted: tuple[Score, ...] = ()
-    extended: ExtendedNote | None = None
+    cpu_time: CpuTime
+    scores: tuple[HeldOutScore, ...] = ()
+    fitted_pose_scores: tuple[HeldOutScore, ...] = ()
+    earlier_videos: ForgettingStats | None = None
 
     @property
-    def trained(self) -> bool:
+    def is_trained(self) -> bool:
         """Whether there is anything to show."""
-        return self.trainer.steps > 0 and self.added > 0
+        return self.trainer.steps > 0 and self.frames_added > 0

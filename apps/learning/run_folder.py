@@ -9,15 +9,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from apps.learning.run_lock import NAME as LOCK
-from apps.learning.run_lock import locked
+from apps.learning.run_lock import LOCK_FILE_NAME as LOCK
+from apps.learning.run_lock import lock_folder
 from apps.terminal.console import Console
-from apps.terminal.places import check_apart, check_place, free_name
-from capture.errors import BadInput
-from capture.file_list import FileList
+from apps.terminal.places import check_disjoint_from_inputs, check_writable, unused_path
+from capture.errors import InputError
+from capture.file_list import OutputFileList
 
-STATE = "state.pt"
-CHECKPOINT_FILES = (STATE, "person.npz", "frames.tensors", "earlier.tensors")
+STATE_FILE = "state.pt"
+CHECKPOINT_FILES = (STATE_FILE, "person.npz", "frames.tensors", "earlier.tensors")
 """What ia-ingest writes into checkpoint/."""
 
 
@@ -39,12 +39,12 @@ class RunFolder:
         return self.path / "avatar.iavatar"
 
     @property
-    def report(self) -> Path:
+    def report_json(self) -> Path:
         """What was done and how well, as JSON."""
         return self.path / "report.json"
 
     @property
-    def page(self) -> Path:
+    def report_html(self) -> Path:
         """The same to look at."""
         return self.path / "report.html"
 
@@ -54,7 +54,7 @@ class RunFolder:
         return self.path / "checkpoint"
 
     @property
-    def person(self) -> Path:
+    def body_file(self) -> Path:
         """The body that the avatar has, for videos that are added later."""
         return self.checkpoint / "person.npz"
 
@@ -71,18 +71,18 @@ class RunFolder:
     @property
     def files(self) -> tuple[Path, ...]:
         """All that a run may write, except for the stages of solved cameras."""
-        top = (self.package, self.report, self.page, self.cameras, self.poses)
+        top = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
 
-    def holds_a_run(self) -> bool:
+    def has_run(self) -> bool:
         """Whether any part of a run is there."""
         return any(path.exists() for path in self.files)
 
     def has_checkpoint(self) -> bool:
         """Whether training can go on from here."""
-        return (self.checkpoint / STATE).is_file()
+        return (self.checkpoint / STATE_FILE).is_file()
 
-    def check(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
+    def check_usable(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
         """Whether the folder is a place for a run; nothing is made yet.
 
         Args:
@@ -91,27 +91,27 @@ class RunFolder:
             overwrite: Whether it replaces one.
 
         Raises:
-            BadInput: If the path is no folder, has to do with an input, holds files that are not
+            InputError: If the path is no folder, has to do with an input, holds files that are not
                 ours where a run's would go, or cannot be written to.
         """
         if resume and overwrite:
-            raise BadInput("--resume goes on with a run, --overwrite removes it: give one of them.")
+            raise InputError("--resume goes on with a run, --overwrite removes it: give one of them.")
         if self.path.exists() and not self.path.is_dir():
-            raise BadInput(f"{self.path} is a file; --out names the folder that holds the run.")
-        check_apart(self.path, "--out", inputs)
-        stranger = self._stranger()
+            raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
+        check_disjoint_from_inputs(self.path, "--out", inputs)
+        stranger = self._foreign_file()
         if stranger is not None:
-            free = shlex.quote(str(free_name(self.path)))
-            raise BadInput(
+            free = shlex.quote(str(unused_path(self.path)))
+            raise InputError(
                 f"{stranger} is not what ia-ingest wrote there, and a run in {self.path} would "
                 f"have to replace it. Move it elsewhere, or name another folder: --out {free}"
             )
-        if resume and not (self.has_checkpoint() or self._began()):
-            raise BadInput(self._nothing_to_resume())
-        check_place(self.path, "--out")
+        if resume and not (self.has_checkpoint() or self._was_started()):
+            raise InputError(self._nothing_to_resume_message())
+        check_writable(self.path, "--out")
 
     @contextmanager
-    def claimed(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
+    def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
         """Makes the folder and keeps other runs out of it; if it stays empty, it goes again.
 
         Args:
@@ -120,42 +120,42 @@ class RunFolder:
             overwrite: Whether it replaces what is there.
 
         Raises:
-            BadInput: If there is a run that would be lost.
+            InputError: If there is a run that would be lost.
             Stop: If another run is writing there.
         """
         made = [p for p in (self.path, *self.path.parents) if not p.exists()]
         self.path.mkdir(parents=True, exist_ok=True)
         try:
-            with locked(self.path, console):
-                if self.holds_a_run() and not (resume or overwrite):
-                    raise BadInput(
+            with lock_folder(self.path, console):
+                if self.has_run() and not (resume or overwrite):
+                    raise InputError(
                         f"{self.path} already holds a run. Go on with it (--resume), replace it "
                         "(--overwrite), or name another folder (--out)."
                     )
                 try:
                     yield
                 finally:
-                    self.tidy()
+                    self.remove_empty_folders()
         finally:
             for folder in made:
                 with suppress(OSError):  # it is not empty
                     folder.rmdir()
 
-    def begin(self, *, resume: bool) -> None:
+    def start_run(self, *, resume: bool) -> None:
         """Starts the lists of what is ours; unless the run is resumed, an older one is removed.
 
         Call it when nothing can be wrong with the input any more.
 
         Raises:
-            BadInput: If files came meanwhile that are not ours.
+            InputError: If files came meanwhile that are not ours.
         """
-        older = self._older_run()
+        older = self._unlisted_run_files()
         self.checkpoint.mkdir(parents=True, exist_ok=True)
         for folder in (self.path, self.checkpoint):
-            listing = FileList(folder)
-            listing.make()
+            listing = OutputFileList(folder)
+            listing.create()
             listing.add_all({path.name: path for path in older if path.parent == folder})
-            listing.remove_unfinished()
+            listing.remove_temporaries()
         for path in () if resume else self.files:
             self.remove(path)
 
@@ -163,14 +163,14 @@ class RunFolder:
         """Removes one of the run's files.
 
         Raises:
-            BadInput: If a file is there that is not ours.
+            InputError: If a file is there that is not ours.
         """
-        if not FileList(path.parent).remove(path.name):
-            raise BadInput(f"{path} is not what ia-ingest wrote there; it was left alone.")
+        if not OutputFileList(path.parent).remove(path.name):
+            raise InputError(f"{path} is not what ia-ingest wrote there; it was left alone.")
 
-    def what_is_kept(self) -> str:
+    def describe_remaining_files(self) -> str:
         """What is there after a run has failed half-way, and what a user can do."""
-        files = (self.package, self.report, self.page, self.cameras, self.poses)
+        files = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
         names = [path.name for path in files if path.exists()]
         there = f"{self.path} holds {', '.join(names)}." if names else ""
         if not self.has_checkpoint() and self.package.exists():
@@ -182,49 +182,49 @@ class RunFolder:
             "with --resume, in place of any --overwrite, to go on from it."
         ).lstrip()
 
-    def abandon(self) -> None:
+    def release(self) -> None:
         """Gives up a folder that this process has claimed, where the process ends at once."""
         (self.path / LOCK).unlink(missing_ok=True)
-        self.tidy()
+        self.remove_empty_folders()
 
-    def tidy(self) -> None:
+    def remove_empty_folders(self) -> None:
         """Removes folders that nothing was written to."""
         for folder in (self.checkpoint, self.path):
-            FileList(folder).tidy()
+            OutputFileList(folder).remove_if_empty()
             with suppress(OSError):  # it is not empty, or not there
                 folder.rmdir()
 
-    def _began(self) -> bool:
+    def _was_started(self) -> bool:
         """Whether a run was here that was killed, perhaps before it had written anything."""
-        return FileList(self.path).exists() or (self.path / LOCK).is_file()
+        return OutputFileList(self.path).exists() or (self.path / LOCK).is_file()
 
-    def _stranger(self) -> Path | None:
+    def _foreign_file(self) -> Path | None:
         """A file that is not ours where a run's would go."""
-        older = self._older_run()
+        older = self._unlisted_run_files()
         for path in self.files:
             there = os.path.lexists(path)
-            if there and path not in older and not FileList(path.parent).holds(path.name):
+            if there and path not in older and not OutputFileList(path.parent).owns(path.name):
                 return path
         for folder in (self.checkpoint, self.path / "cameras"):
             if os.path.lexists(folder) and not folder.is_dir():
                 return folder
-        lists = (FileList(self.path), FileList(self.checkpoint))
-        return next((listing.path for listing in lists if listing.is_foreign()), None)
+        lists = (OutputFileList(self.path), OutputFileList(self.checkpoint))
+        return next((listing.path for listing in lists if listing.path_is_foreign()), None)
 
-    def _older_run(self) -> list[Path]:
+    def _unlisted_run_files(self) -> list[Path]:
         """The files of a run that was made before there were lists, known by its report."""
-        if FileList(self.path).exists() or not is_report(self.report):
+        if OutputFileList(self.path).exists() or not is_run_report(self.report_json):
             return []
-        solved = json.loads(self.report.read_text(encoding="utf-8")).get("cameras") or {}
+        solved = json.loads(self.report_json.read_text(encoding="utf-8")).get("cameras") or {}
         ours = set(self.files)
         if solved.get("verdict") != "solved":
             ours -= {self.cameras, self.poses}
         return [path for path in self.files if path in ours and path.is_file()]
 
-    def _nothing_to_resume(self) -> str:
+    def _nothing_to_resume_message(self) -> str:
         """That there is no run to go on with, and which one may have been meant."""
         beside = self.path.absolute().parent
-        runs = [p.parent.parent.name for p in sorted(beside.glob(f"*/checkpoint/{STATE}"))]
+        runs = [p.parent.parent.name for p in sorted(beside.glob(f"*/checkpoint/{STATE_FILE}"))]
         near = difflib.get_close_matches(self.path.absolute().name, runs, n=1, cutoff=0.5)
         meant = [shlex.quote(str(self.path.with_name(name))) for name in near]
         return (
@@ -234,7 +234,7 @@ class RunFolder:
         )
 
 
-def is_report(path: Path) -> bool:
+def is_run_report(path: Path) -> bool:
     """Whether a file is a report.json that ia-ingest wrote."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

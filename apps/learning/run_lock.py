@@ -9,22 +9,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import NO_ROOM, Stop
-from capture.errors import BadInput
-from capture.file_list import PREFIX
+from apps.terminal.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
+from capture.errors import InputError
+from capture.file_list import RESERVED_PREFIX
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
 
-NAME = f"{PREFIX}lock"
-LABEL = re.compile(r"instant-avatar-stream run, process (\d+), since (.+)\n?")
-TAKEN = frozenset({errno.EWOULDBLOCK, errno.EACCES})
+LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
+LOCK_LABEL_PATTERN = re.compile(r"instant-avatar-stream run, process (\d+), since (.+)\n?")
+LOCKED_ERRNOS = frozenset({errno.EWOULDBLOCK, errno.EACCES})
 
 
 @contextmanager
-def locked(folder: Path, console: Console) -> Iterator[None]:
+def lock_folder(folder: Path, console: Console) -> Iterator[None]:
     """Holds a folder for this process; the file that is locked is removed at the end.
 
     After `kill -9` the file stays, but not the lock. On file systems without locks a warning is
@@ -36,10 +36,10 @@ def locked(folder: Path, console: Console) -> Iterator[None]:
 
     Raises:
         Stop: If another process holds it.
-        BadInput: If a file of somebody else has the lock's name.
+        InputError: If a file of somebody else has the lock's name.
     """
-    path = folder / NAME
-    descriptor = _taken(path, console)
+    path = folder / LOCK_FILE_NAME
+    descriptor = _acquire(path, console)
     try:
         yield
     finally:
@@ -48,18 +48,18 @@ def locked(folder: Path, console: Console) -> Iterator[None]:
             os.close(descriptor)
 
 
-def _taken(path: Path, console: Console) -> int | None:
+def _acquire(path: Path, console: Console) -> int | None:
     """The locked file; None where files cannot be locked."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             label = os.read(descriptor, 1000).decode(errors="replace")
-            if label and LABEL.fullmatch(label) is None:
-                raise BadInput(
+            if label and LOCK_LABEL_PATTERN.fullmatch(label) is None:
+                raise InputError(
                     f"{path} is not a lock that ia-ingest made. Move it elsewhere, or name another "
                     "folder (--out)."
                 )
-            if not _lock(descriptor, path.parent, label, console):
+            if not _try_lock(descriptor, path.parent, label, console):
                 path.unlink(missing_ok=True)
                 os.close(descriptor)
                 return None
@@ -77,7 +77,7 @@ def _taken(path: Path, console: Console) -> int | None:
     return descriptor
 
 
-def _lock(descriptor: int, folder: Path, label: str, console: Console) -> bool:
+def _try_lock(descriptor: int, folder: Path, label: str, console: Console) -> bool:
     """Whether the file could be locked; False where there are no locks."""
     try:
         if fcntl is None:
@@ -85,17 +85,17 @@ def _lock(descriptor: int, folder: Path, label: str, console: Console) -> bool:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return True
     except OSError as error:
-        if error.errno in TAKEN:
-            raise Stop(_busy(folder, label), NO_ROOM) from None
-        console.warn(
+        if error.errno in LOCKED_ERRNOS:
+            raise CommandExit(_busy_message(folder, label), RESOURCE_UNAVAILABLE) from None
+        console.warning(
             f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "
             "ia-ingest writes into this folder meanwhile."
         )
         return False
 
 
-def _busy(folder: Path, label: str) -> str:
-    found = LABEL.fullmatch(label)
+def _busy_message(folder: Path, label: str) -> str:
+    found = LOCK_LABEL_PATTERN.fullmatch(label)
     who = f" (process {found[1]}, since {found[2]})" if found else ""
     return (
         f"Another ia-ingest is writing into {folder}{who}. Wait until it has ended, or name "

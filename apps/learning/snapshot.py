@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.recording.recording import Recording
+from apps.recording.recording import Capture
 from apps.reporting.curve import CurvePoint
-from avatar.hold import HeldOut, spread
+from avatar.hold import HeldOutFrame, subsample_evenly
 from avatar.trainer import Trainer
 from export.build import ExportReport, View, export_avatar
 from export.errors import ExportRefused
-from preprocess.observe import shrunk
+from preprocess.observe import shrink_to_longer_side
 
-CHECKED_VIEWS, HASTY_VIEWS = 4, 2
+VALIDATION_VIEWS, QUICK_VALIDATION_VIEWS = 4, 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Snapshot:
+class PackageSnapshot:
     """What became of it.
 
     Attributes:
@@ -28,28 +28,28 @@ class Snapshot:
         ready_at: When the package stood under its name, on `time.perf_counter`'s clock.
     """
 
-    exported: ExportReport | None
-    refused: str | None
+    export_report: ExportReport | None
+    refusal: str | None
     ready_at: float
 
 
-def snapshot(
+def write_package_snapshot(
     trainer: Trainer,
     path: Path,
     views: Sequence[View],
     *,
-    mark: CurvePoint | None,
-    hasty: bool = False,
-    fine_tuned: bool = True,
+    curve_point: CurvePoint | None,
+    quick: bool = False,
+    fine_tune: bool = True,
     progress: Callable[[float], None] = lambda _: None,
-) -> Snapshot:
+) -> PackageSnapshot:
     """Writes the package, whole or not at all; training may go on afterwards.
 
     Args:
         trainer: Whose avatar; not in the middle of a step.
         path: The `.iavatar` file; what is there already is replaced only by something better
             than nothing.
-        views: Poses and cameras to check it with (`views_of`).
+        views: Poses and cameras to check it with (`validation_views`).
         mark: How well held-out frames were rendered when that was last asked; goes with it.
         hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
         fine_tuned: Whether there are ten seconds more, for a better likeness.
@@ -59,36 +59,36 @@ def snapshot(
         OSError: If the disk is full; what was there before stays.
     """
     metrics = {
-        "held_out": None if mark is None else asdict(mark),
+        "held_out": None if curve_point is None else asdict(curve_point),
         "recipe": asdict(trainer.config),
     }
     try:
         exported = export_avatar(
             trainer.avatar,
             path,
-            views=views[:HASTY_VIEWS] if hasty else views,
+            views=views[:QUICK_VALIDATION_VIEWS] if quick else views,
             metrics=metrics,
-            hasty=hasty,
-            fine_tuned=fine_tuned,
+            quick=quick,
+            fine_tune_bricks=fine_tune,
             progress=progress,
         )
     except ExportRefused as error:
-        return Snapshot(exported=None, refused=str(error), ready_at=time.perf_counter())
-    return Snapshot(exported=exported, refused=None, ready_at=time.perf_counter())
+        return PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
+    return PackageSnapshot(export_report=exported, refusal=None, ready_at=time.perf_counter())
 
 
-def finer(first: Snapshot, later: Snapshot) -> Snapshot:
+def prefer_final(quick: PackageSnapshot, final: PackageSnapshot) -> PackageSnapshot:
     """What there is after a hasty package was replaced, if it was; it was ready with the first."""
-    if first.exported is None:
-        return later
-    return first if later.exported is None else replace(later, ready_at=first.ready_at)
+    if quick.export_report is None:
+        return final
+    return quick if final.export_report is None else replace(final, ready_at=quick.ready_at)
 
 
-def views_of(held: list[HeldOut], recording: Recording) -> Sequence[View]:
+def validation_views(held_out: list[HeldOutFrame], recording: Capture) -> Sequence[View]:
     """Poses and cameras to check a player with: held-out frames, else the first valid pose."""
-    seen = [frame.observation for frame in spread(held, CHECKED_VIEWS)]
+    seen = [frame.observation for frame in subsample_evenly(held_out, VALIDATION_VIEWS)]
     if seen:
         return [(observation.pose, observation.camera) for observation in seen]
     row = int(np.flatnonzero(recording.motion.valid)[0])
-    size = shrunk(recording.source.size_px, recording.size_px)
-    return [(recording.motion[row], recording.camera_of_row(row).resized(size))]
+    size = shrink_to_longer_side(recording.source.size_px, recording.size_px)
+    return [(recording.motion[row], recording.camera_of_pose(row).resize(size))]

@@ -6,14 +6,14 @@ from typing import Protocol, runtime_checkable
 from apps.reporting.curve import CurvePoint
 from avatar.coverage import Coverage
 from avatar.events import TrainEvent
-from avatar.hold import HeldOut, is_held_out
+from avatar.hold import HeldOutFrame, is_held_out
 from avatar.trainer import Trainer
 from preprocess.observation import Observation
-from preprocess.observe import Dropped
+from preprocess.observe import DroppedFrame
 
 
 @runtime_checkable
-class Watched(Protocol):
+class ObservableSession(Protocol):
     """A lesson, as those see it who look on.
 
     Attributes:
@@ -24,44 +24,44 @@ class Watched(Protocol):
     """
 
     trainer: Trainer
-    held: list[HeldOut]
+    held_out: list[HeldOutFrame]
     curve: list[CurvePoint]
     coverage: Coverage
 
     @property
-    def stopping(self) -> bool:
+    def stop_requested(self) -> bool:
         """Whether somebody wants it to end."""
         ...
 
 
 @runtime_checkable
-class Watcher(Protocol):
+class TrainingObserver(Protocol):
     """Somebody who looks on. A lesson without watchers does nothing for them."""
 
-    def frame(self, observation: Observation, *, held_out: bool) -> None:
+    def on_frame(self, observation: Observation, *, held_out: bool) -> None:
         """A frame in which the person was found, before the trainer has it.
 
         Called on the reader's thread: it must be quick, and may run no parallel kernel.
         """
 
-    def heard(self, event: TrainEvent) -> None:
+    def on_event(self, event: TrainEvent) -> None:
         """Something happened; called on the thread that trains."""
 
-    def tend(self, lesson: Watched) -> None:
-        """Between two steps, on the thread that trains: kernels may run here.
+    def between_steps(self, session: ObservableSession) -> None:
+        """ResectionResult two steps, on the thread that trains: kernels may run here.
 
         What it takes counts as training time, except inside `Trainer.held_up`.
         """
 
 
-def shown(
-    observations: Iterator[Observation | Dropped],
+def notify_observers(
+    observations: Iterator[Observation | DroppedFrame],
     coverage: Coverage,
-    watchers: Sequence[Watcher],
+    observers: Sequence[TrainingObserver],
     *,
-    every: int,
-    total: int | None,
-) -> Iterator[Observation | Dropped]:
+    hold_every: int,
+    frame_count: int | None,
+) -> Iterator[Observation | DroppedFrame]:
     """Passes observations on; watchers see them, and what will be trained on has been seen.
 
     Args:
@@ -72,9 +72,9 @@ def shown(
     """
     for position, item in enumerate(observations):
         if isinstance(item, Observation):
-            held_out = is_held_out(position, every=every, total=total)
+            held_out = is_held_out(position, stride=hold_every, total=frame_count)
             if not held_out:
                 coverage.add(item)
-            for watcher in watchers:
-                watcher.frame(item, held_out=held_out)
+            for watcher in observers:
+                watcher.on_frame(item, held_out=held_out)
         yield item

@@ -8,15 +8,15 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.playing.viewpoint import CLOSE_UP, Viewpoint
-from apps.terminal.places import check_file_place
-from capture.errors import BadInput
+from apps.playing.viewpoint import CLOSE_UP_ZOOM, Viewpoint
+from apps.terminal.places import check_output_file
+from capture.errors import InputError
 
 WEB_PORT = 8010
-TURN_S = 6.0
-SIZE_PX = 540
-SMALLEST_PX, LARGEST_PX = 16, 4096
-MOST_WORKERS = 64
+DEFAULT_TURN_S = 6.0
+DEFAULT_SIZE_PX = 540
+MIN_SIZE_PX, MAX_SIZE_PX = 16, 4096
+MAX_WORKERS = 64
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
@@ -84,7 +84,7 @@ class PlayArguments:
     tier: Literal["hq", "lite"] = "hq"
     """Quality: lite takes two thirds of the time."""
     samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Samples along 5 cm of a ray, 1 to 256; without it what the tier says."""
+    """RaySamples along 5 cm of a ray, 1 to 256; without it what the tier says."""
     workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Pictures that are drawn at the same time; without it one for each core. The pictures do not
     depend on it."""
@@ -104,41 +104,41 @@ class PlayArguments:
     """Replace the file that --out or --json names, if there is one. Without it a file is replaced
     only in a run's folder, and only if it is one of ours."""
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Whether the wishes fit together.
 
         Raises:
-            BadInput: If they do not, or a number cannot be.
+            InputError: If they do not, or a number cannot be.
         """
-        self._check_mode()
+        self._validate_mode()
         if self.json is not None and not (self.bench or self.verify):
-            raise BadInput("--json writes the figures of --bench or --verify; give one of them.")
+            raise InputError("--json writes the figures of --bench or --verify; give one of them.")
         if self.json is not None:
-            check_file_place(self.json, "--json", self.inputs, overwrite=self.overwrite)
+            check_output_file(self.json, "--json", self.inputs, overwrite=self.overwrite)
         if self.fps is not None and not 0.1 <= self.fps <= 240.0:
-            raise BadInput(f"--fps is {self.fps}; 0.1 to 240 pictures a second were expected.")
+            raise InputError(f"--fps is {self.fps}; 0.1 to 240 pictures a second were expected.")
         if not 0.01 <= self.speed <= 100.0:
-            raise BadInput(f"--speed is {self.speed}; 0.01 to 100 times were expected.")
-        if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:
-            raise BadInput(f"--workers is {self.workers}; 1 to {MOST_WORKERS} were expected.")
+            raise InputError(f"--speed is {self.speed}; 0.01 to 100 times were expected.")
+        if self.workers is not None and not 1 <= self.workers <= MAX_WORKERS:
+            raise InputError(f"--workers is {self.workers}; 1 to {MAX_WORKERS} were expected.")
         if self.still is not None and self.poses is None:
-            raise BadInput("--still takes a pose of --poses; give both.")
+            raise InputError("--still takes a pose of --poses; give both.")
         if self.camera is not None and self.viewpoint != Viewpoint():
-            raise BadInput(
+            raise InputError(
                 "--camera says where the camera stands: leave out --orbit, --elevation, "
                 "--distance, --zoom, --close-up and --turntable, or leave out --camera."
             )
         self.size_px  # noqa: B018 - raises
         self.viewpoint  # noqa: B018 - raises
 
-    def _check_mode(self) -> None:
+    def _validate_mode(self) -> None:
         """Refuses what would not be listened to."""
         given = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
         for mode, (does, heard) in MODES.items():
             unheard = given - heard - {"avatar", mode}
             if mode in given and unheard:
                 flag = min(unheard).replace("_", "-")
-                raise BadInput(f"--{mode} {does}: leave out --{flag}, or --{mode}.")
+                raise InputError(f"--{mode} {does}: leave out --{flag}, or --{mode}.")
 
     @property
     def size_px(self) -> tuple[int, int] | int | None:
@@ -147,9 +147,9 @@ class PlayArguments:
             return None
         found = re.fullmatch(r"(\d+)(?:[x×,](\d+))?", self.size.strip().lower())
         sides = [int(side) for side in found.groups() if side] if found else []
-        if not sides or not all(SMALLEST_PX <= side <= LARGEST_PX for side in sides):
-            raise BadInput(
-                f"--size is {self.size}; {SMALLEST_PX} to {LARGEST_PX} pixels can be drawn, as in "
+        if not sides or not all(MIN_SIZE_PX <= side <= MAX_SIZE_PX for side in sides):
+            raise InputError(
+                f"--size is {self.size}; {MIN_SIZE_PX} to {MAX_SIZE_PX} pixels can be drawn, as in "
                 "540 or 1280x720."
             )
         return sides[0] if len(sides) == 1 else (sides[0], sides[1])
@@ -157,14 +157,14 @@ class PlayArguments:
     @property
     def viewpoint(self) -> Viewpoint:
         """Where the camera stands."""
-        usual = 1.0 if self.close_up is None else CLOSE_UP
+        usual = 1.0 if self.close_up is None else CLOSE_UP_ZOOM
         return Viewpoint(
             orbit_deg=self.orbit,
             elevation_deg=self.elevation,
             zoom=usual if self.zoom is None else self.zoom,
             distance_m=self.distance,
             joint=self.close_up,
-            turn_s=self.turntable,
+            turn_period_s=self.turntable,
         )
 
     @property
@@ -176,15 +176,15 @@ class PlayArguments:
         return [path for path in given if path is not None]
 
     @property
-    def threads(self) -> int:
+    def worker_count(self) -> int:
         """How many pictures are drawn at the same time."""
         if self.workers is not None:
             return self.workers
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(cores or 1, MOST_WORKERS)
+        return min(cores or 1, MAX_WORKERS)
 
     @property
-    def clip(self) -> Path:
+    def output_path(self) -> Path:
         """Where the pictures go."""
         if self.out is not None:
             return self.out
@@ -193,7 +193,7 @@ class PlayArguments:
         return self.avatar.parent / (f"{stem}-{self.still}.png" if one else f"{stem}.webm")
 
 
-ALL = frozenset(field.name for field in fields(PlayArguments))
+ALL_ARGUMENTS = frozenset(field.name for field in fields(PlayArguments))
 MODES = {
     "verify": (
         "draws the golden frames as they were drawn",
@@ -203,6 +203,6 @@ MODES = {
         "shows a page that has a camera, a size and a choice of tiers of its own",
         frozenset({"poses", "person", "out", "fps", "speed"}),
     ),
-    "bench": ("writes no pictures", ALL - {"out", "background"}),
+    "bench": ("writes no pictures", ALL_ARGUMENTS - {"out", "background"}),
 }
 """What is done instead of a clip, and which arguments it listens to."""

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import ImageColor
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.images import read_image
 
-Blend = Callable[[UInt8[np.ndarray, "height width 4"]], UInt8[np.ndarray, "height width 3"]]
+Compositor = Callable[[UInt8[np.ndarray, "height width 4"]], UInt8[np.ndarray, "height width 3"]]
 TRANSPARENT = "transparent"
 
 
-def background(wish: str) -> Blend:
+def background_compositor(color_or_path: str) -> Compositor:
     """A function that puts pictures with straight alpha on a background.
 
     Args:
@@ -24,26 +24,26 @@ def background(wish: str) -> Blend:
             cropped in the middle to the shape that is needed.
 
     Raises:
-        BadInput: If it is neither.
+        InputError: If it is neither.
     """
     try:
-        color = np.array(ImageColor.getrgb(wish)[:3], dtype=np.uint8)
+        color = np.array(ImageColor.getrgb(color_or_path)[:3], dtype=np.uint8)
     except ValueError:
         color = None
     if color is not None:
-        return lambda rgba: _over(rgba, np.broadcast_to(color, (*rgba.shape[:2], 3)))
-    path = Path(wish)
+        return lambda rgba: _composite_over(rgba, np.broadcast_to(color, (*rgba.shape[:2], 3)))
+    path = Path(color_or_path)
     if not path.is_file():
-        raise BadInput(
-            f"--background {wish} is neither a colour (white, #203040), nor {TRANSPARENT}, nor a "
+        raise InputError(
+            f"--background {color_or_path} is neither a colour (white, #203040), nor {TRANSPARENT}, nor a "
             "picture that is there."
         )
     picture, _ = read_image(path)
-    fitted = lru_cache(1)(lambda width, height: _covering(picture, width, height))
-    return lambda rgba: _over(rgba, fitted(rgba.shape[1], rgba.shape[0]))
+    fitted = lru_cache(1)(lambda width, height: _crop_to_cover(picture, width, height))
+    return lambda rgba: _composite_over(rgba, fitted(rgba.shape[1], rgba.shape[0]))
 
 
-def _over(
+def _composite_over(
     rgba: UInt8[np.ndarray, "height width 4"], behind: UInt8[np.ndarray, "height width 3"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     alpha = rgba[..., 3:].astype(np.uint16)
@@ -51,7 +51,7 @@ def _over(
     return (mixed // 255).astype(np.uint8)
 
 
-def _covering(
+def _crop_to_cover(
     picture: UInt8[np.ndarray, "_ _ 3"], width: int, height: int
 ) -> UInt8[np.ndarray, "height width 3"]:
     rows, columns = picture.shape[:2]

@@ -15,13 +15,13 @@ from preprocess.pose import BodyPose
 
 REFERENCE_GRAPH = Path(__file__).with_name("reference.onnx")
 """Made by tests/apps/test_bench_graph.py, which compares it with what `onnx` makes."""
-WARM_UP = 3
-FEWEST = 10
+WARM_UP_IMAGES = 3
+MIN_IMAGES = 10
 """Pictures that are timed at least; short motions are repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Benchmark:
+class PlayerTiming:
     """Cost of a picture: kinematics, graph and 8-bit output, without decoding or encoding.
 
     Attributes:
@@ -34,7 +34,7 @@ class Benchmark:
         reference_ms: CPU time of one run of the reference graph, median.
         provider: onnxruntime's execution provider.
         workers: How many pictures were drawn at the same time.
-        pictures_per_second: Wall.
+        images_per_second: Wall.
         format: Of this record.
     """
 
@@ -48,7 +48,7 @@ class Benchmark:
     reference_ms: float
     provider: str = "CPUExecutionProvider"
     workers: int = 1
-    pictures_per_second: float = 0.0
+    images_per_second: float = 0.0
     format: int = 1
 
     def to_json(self) -> str:
@@ -57,35 +57,35 @@ class Benchmark:
         return json.dumps({"format": content.pop("format"), **content}, indent=1) + "\n"
 
 
-def benchmark(
+def benchmark_player(
     player: Player,
-    shots: Sequence[tuple[BodyPose, Camera]],
+    sequence: Sequence[tuple[BodyPose, Camera]],
     *,
     load_ms: float,
     tier: str = "hq",
     workers: int = 1,
     samples: int | None = None,
-) -> Benchmark:
+) -> PlayerTiming:
     """Draws every shot, after a few to warm up."""
-    shots = list(shots) * -(-FEWEST // len(shots))
-    list(player.render_all(shots[: WARM_UP * workers], workers=workers, samples=samples))
+    sequence = list(sequence) * -(-MIN_IMAGES // len(sequence))
+    list(player.render_all(sequence[: WARM_UP_IMAGES * workers], workers=workers, samples=samples))
     covered = 0.0
     wall, cpu = time.perf_counter(), time.process_time()
-    for picture in player.render_all(shots, workers=workers, samples=samples):
+    for picture in player.render_all(sequence, workers=workers, samples=samples):
         covered += float(np.count_nonzero(picture[..., 3])) / picture[..., 3].size
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return Benchmark(
+    return PlayerTiming(
         tier=tier,
-        size=max(shots[0][1].size_px),
-        frames=len(shots),
-        pixels_covered=covered / len(shots),
-        cpu_ms_per_frame=1000.0 * cpu / len(shots),
-        wall_ms_per_frame=1000.0 * wall / len(shots),
+        size=max(sequence[0][1].size_px),
+        frames=len(sequence),
+        pixels_covered=covered / len(sequence),
+        cpu_ms_per_frame=1000.0 * cpu / len(sequence),
+        wall_ms_per_frame=1000.0 * wall / len(sequence),
         load_ms=load_ms,
         reference_ms=_reference_ms(_reference_graph()),
         provider=player.provider,
         workers=workers,
-        pictures_per_second=len(shots) / wall,
+        images_per_second=len(sequence) / wall,
     )
 
 

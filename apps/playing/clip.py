@@ -8,22 +8,22 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from apps.playing.encoders import Encoder, video_encoder
-from apps.terminal.places import check_file_place, check_folder_place
-from capture.atomic_files import whole_file, whole_folder
-from capture.errors import BadInput
+from apps.playing.encoders import ClipEncoder, video_encoder
+from apps.terminal.places import check_output_file, check_output_folder
+from capture.atomic_files import atomic_file, atomic_folder
+from capture.errors import InputError
 
-CLIPS = (".webm", ".mp4", ".gif", ".webp", ".png")
-GIF_FPS = 50.0
+CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
+MAX_GIF_FPS = 50.0
 """Pictures a second of a GIF at most: browsers slow down what is faster."""
 
 Rgba = UInt8[np.ndarray, "height width 4"]
 Rgb = UInt8[np.ndarray, "height width 3"]
-Blend = Callable[[Rgba], Rgb]
+BackgroundBlend = Callable[[Rgba], Rgb]
 """Puts a picture with straight alpha on a background."""
 
 
-def check_clip(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
+def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
     """Whether something can be written there.
 
     Args:
@@ -32,25 +32,25 @@ def check_clip(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
         overwrite: Whether a file that is there already may go.
 
     Raises:
-        BadInput: If the suffix is unknown, or something is there that must stay.
+        InputError: If the suffix is unknown, or something is there that must stay.
     """
-    if path.suffix and path.suffix.lower() not in CLIPS and not path.is_dir():
-        raise BadInput(
-            f"{path} ends in {path.suffix!r}; a clip ends in {', '.join(CLIPS)}, and a name "
+    if path.suffix and path.suffix.lower() not in CLIP_SUFFIXES and not path.is_dir():
+        raise InputError(
+            f"{path} ends in {path.suffix!r}; a clip ends in {', '.join(CLIP_SUFFIXES)}, and a name "
             "without a suffix is a folder for PNG frames."
         )
     if path.is_dir():
-        if path.suffix.lower() in CLIPS:
-            raise BadInput(f"{path} is a folder, but its name is that of a clip. Name another.")
-    elif path.exists() and path.suffix.lower() not in CLIPS:
-        raise BadInput(f"{path} is a file; a folder for PNG frames was expected.")
-    if path.suffix.lower() in CLIPS:
-        check_file_place(path, "--out", inputs, overwrite=overwrite)
+        if path.suffix.lower() in CLIP_SUFFIXES:
+            raise InputError(f"{path} is a folder, but its name is that of a clip. Name another.")
+    elif path.exists() and path.suffix.lower() not in CLIP_SUFFIXES:
+        raise InputError(f"{path} is a file; a folder for PNG frames was expected.")
+    if path.suffix.lower() in CLIP_SUFFIXES:
+        check_output_file(path, "--out", inputs, overwrite=overwrite)
     else:
-        check_folder_place(path, "--out", inputs)
+        check_output_folder(path, "--out", inputs)
 
 
-def encoder_of(path: Path, blend: Blend | None) -> Encoder:
+def choose_encoder(path: Path, blend: BackgroundBlend | None) -> ClipEncoder:
     """How a clip of that name is written here.
 
     Args:
@@ -58,28 +58,28 @@ def encoder_of(path: Path, blend: Blend | None) -> Encoder:
         blend: The background; None keeps alpha.
 
     Raises:
-        BadInput: If alpha cannot be kept there.
+        InputError: If alpha cannot be kept there.
     """
     suffix = path.suffix.lower()
     if suffix == ".gif":
         hard = ", edges hard, for a GIF knows no half transparency" if blend is None else ""
-        return Encoder(said=f"a GIF of 256 colours a picture{hard}", write=_write_gif)
+        return ClipEncoder(description=f"a GIF of 256 colours a picture{hard}", write=_write_gif)
     if suffix == ".webp":
-        return Encoder(said="WebP, which browsers show like a picture", write=_write_webp)
+        return ClipEncoder(description="WebP, which browsers show like a picture", write=_write_webp)
     if suffix == ".png":
-        return Encoder(said="PNG", write=_write_png)
-    if suffix not in CLIPS:
-        return Encoder(said="PNG frames", write=_write_frames)
+        return ClipEncoder(description="PNG", write=_write_png)
+    if suffix not in CLIP_SUFFIXES:
+        return ClipEncoder(description="PNG frames", write=_write_frames)
     return video_encoder(suffix, transparent=blend is None)
 
 
 def write_clip(
     path: Path,
-    pictures: Iterable[Rgba],
+    images: Iterable[Rgba],
     *,
     fps: float,
-    blend: Blend | None,
-    encoder: Encoder,
+    blend: BackgroundBlend | None,
+    encoder: ClipEncoder,
     replace: bool | None = None,
 ) -> int:
     """Writes pictures as the encoder does.
@@ -89,8 +89,8 @@ def write_clip(
         pictures: With straight alpha, all of one size; at least one.
         fps: Pictures a second.
         blend: The background; None keeps alpha.
-        encoder: From `encoder_of`.
-        replace: Whether a file that is there already may go, as of `whole_file`.
+        encoder: From `choose_encoder`.
+        replace: Whether a file that is there already may go, as of `atomic_file`.
 
     Returns:
         How many pictures were written.
@@ -98,42 +98,42 @@ def write_clip(
     Raises:
         OSError: If the disk is full; then nothing is written.
     """
-    is_file = path.suffix.lower() in CLIPS
-    with whole_file(path, replace=replace) if is_file else whole_folder(path) as part:
-        shown = (picture if blend is None else blend(picture) for picture in pictures)
+    is_file = path.suffix.lower() in CLIP_SUFFIXES
+    with atomic_file(path, replace=replace) if is_file else atomic_folder(path) as part:
+        shown = (picture if blend is None else blend(picture) for picture in images)
         return encoder.write(part, iter(shown), fps)
 
 
-def _png(picture: UInt8[np.ndarray, "height width channels"]) -> bytes:
+def _encode_png(picture: UInt8[np.ndarray, "height width channels"]) -> bytes:
     # OpenCV wants BGR(A), and its own writer does not say when the disk is full
     code = cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR
     return cv2.imencode(".png", cv2.cvtColor(picture, code))[1].tobytes()
 
 
 def _write_png(path: Path, pictures: Iterator[Rgba | Rgb], fps: float) -> int:
-    path.write_bytes(_png(next(pictures)))
+    path.write_bytes(_encode_png(next(pictures)))
     return 1
 
 
 def _write_frames(folder: Path, pictures: Iterator[Rgba | Rgb], fps: float) -> int:
     count = 0
     for picture in pictures:
-        (folder / f"{count:04d}.png").write_bytes(_png(picture))
+        (folder / f"{count:04d}.png").write_bytes(_encode_png(picture))
         count += 1
     return count
 
 
 def _write_gif(path: Path, pictures: Iterator[Rgba | Rgb], fps: float) -> int:
     """A palette a picture: 46 dB on white, where one palette for all has 38 dB."""
-    first, *others = [_with_hard_edges(picture) for picture in pictures]
-    ends = np.round(100.0 * np.arange(2 + len(others)) / min(fps, GIF_FPS))  # hundredths of seconds
+    first, *others = [_binarize_alpha(picture) for picture in pictures]
+    ends = np.round(100.0 * np.arange(2 + len(others)) / min(fps, MAX_GIF_FPS))  # hundredths of seconds
     frame_ms = [int(10 * step) for step in np.diff(ends)]
     moving = {"save_all": True, "append_images": others, "duration": frame_ms, "loop": 0}
     first.save(path, disposal=2 if first.mode == "RGBA" else 0, **moving)
     return 1 + len(others)
 
 
-def _with_hard_edges(picture: Rgba | Rgb) -> Image.Image:
+def _binarize_alpha(picture: Rgba | Rgb) -> Image.Image:
     if picture.shape[2] == 3:
         return Image.fromarray(picture)
     hard = picture.copy()

@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from apps.terminal.console import Console
-from capture.errors import BadInput
-from preprocess.plausibility import oddities, plausible
+from capture.errors import InputError
+from preprocess.plausibility import plausibility_warnings, require_plausible
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
-from preprocess.poses.place import about_pelvis
+from preprocess.poses.place import anchor_at_pelvis
 
 
-def driving_motion(
+def load_driving_motion(
     path: Path,
     rest_joints: Float[np.ndarray, "24 3"],
     console: Console,
@@ -29,17 +29,17 @@ def driving_motion(
         person: Whose poses; None: of whom there are most.
 
     Raises:
-        BadInput: If there are none, or the numbers cannot be poses in radians and metres.
+        InputError: If there are none, or the numbers cannot be poses in radians and metres.
     """
-    read = plausible(read_poses(path, person=person, driving=True), path)
-    motion = about_pelvis(read, rest_joints)
+    read = require_plausible(read_poses(path, person=person, prefer_world=True), path)
+    motion = anchor_at_pelvis(read, rest_joints)
     if motion.note is not None:
-        console.say(f"note: {motion.note}")
-    for sentence in oddities(read):
-        console.warn(sentence)
+        console.info(f"note: {motion.note}")
+    for sentence in plausibility_warnings(read):
+        console.warning(sentence)
     lost = int((~motion.valid).sum())
     if lost == len(motion):
-        raise BadInput(f"None of the {len(motion)} poses in {path} is valid.")
+        raise InputError(f"None of the {len(motion)} poses in {path} is valid.")
     if lost:
-        console.warn(f"{lost} of {len(motion)} poses are not valid; left out.")
+        console.warning(f"{lost} of {len(motion)} poses are not valid; left out.")
     return motion

@@ -12,13 +12,13 @@ from preprocess.kinematics import body_from_rest, rotation_matrices, world_from_
 from preprocess.pose import BodyPose, Motion
 from preprocess.skeleton import JOINT_NAMES
 
-SHARE = 0.8
+PERSON_HEIGHT_SHARE = 0.8
 """Of the picture's height, how much the standing person takes."""
-WIDEST = 1.5
+MAX_HEIGHT_OVER_WIDTH = 1.5
 """Height over width of a picture beyond which the person is smaller, so that arms fit in."""
-AWAY = 3.5
+DISTANCE_HEIGHTS = 3.5
 """How far the camera stands, in heights of the person."""
-MEASURED_PX = 192
+MEASURING_PX = 192
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -37,10 +37,10 @@ class FollowingCamera:
     """
 
     size_px: tuple[int, int]
-    axes: Float[np.ndarray, "3 3"]
+    level_axes: Float[np.ndarray, "3 3"]
     player: Player
     height_m: float
-    middle_m: float
+    center_above_pelvis_m: float
     viewpoint: Viewpoint
 
     @classmethod
@@ -61,36 +61,36 @@ class FollowingCamera:
         """
         first = int(np.flatnonzero(motion.valid)[0])
         guess = cls(
-            size_px=(MEASURED_PX, MEASURED_PX),
+            size_px=(MEASURING_PX, MEASURING_PX),
             axes=np.diag([1.0, -1.0, -1.0]),
             player=player,
             height_m=2.2,
             middle_m=0.0,
             viewpoint=Viewpoint(),
         )
-        standing = standing_pose(player)
-        rows = np.flatnonzero((player.render(standing, guess.at(standing))[..., 3] > 127).any(1))
+        standing = canonical_pose_of(player)
+        rows = np.flatnonzero((player.render(standing, guess.camera_for(standing))[..., 3] > 127).any(1))
         if not len(rows):  # nothing to be seen: leave it at the guess
-            rows = np.array([0, MEASURED_PX - 1])
-        metres = 2.2 / SHARE / MEASURED_PX
+            rows = np.array([0, MEASURING_PX - 1])
+        metres = 2.2 / PERSON_HEIGHT_SHARE / MEASURING_PX
         return replace(
             guess,
             size_px=(size_px, size_px) if isinstance(size_px, int) else size_px,
-            axes=np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[first]).T,
+            level_axes=np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[first]).T,
             height_m=float(rows[-1] + 1 - rows[0]) * metres,
-            middle_m=float(MEASURED_PX - rows[0] - rows[-1] - 1) / 2.0 * metres,
+            center_above_pelvis_m=float(MEASURING_PX - rows[0] - rows[-1] - 1) / 2.0 * metres,
             viewpoint=viewpoint or Viewpoint(),
         )
 
-    def at(self, pose: BodyPose, seconds: float = 0.0) -> Camera:
+    def camera_for(self, pose: BodyPose, seconds: float = 0.0) -> Camera:
         """The camera for one pose, so many seconds after the first picture."""
         view, (width, height) = self.viewpoint, self.size_px
-        away = AWAY * self.height_m
-        focal = SHARE * min(height, WIDEST * width) * away / self.height_m * view.zoom
-        axes = view.turned(seconds) @ self.axes
+        away = DISTANCE_HEIGHTS * self.height_m
+        focal = PERSON_HEIGHT_SHARE * min(height, MAX_HEIGHT_OVER_WIDTH * width) * away / self.height_m * view.zoom
+        axes = view.rotation_at(seconds) @ self.level_axes
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3] = axes
-        camera_from_world[:3, 3] = -axes @ self._looked_at(pose)
+        camera_from_world[:3, 3] = -axes @ self._look_at_point(pose)
         camera_from_world[2, 3] += view.distance_m or away
         return Camera(
             focal_px=(focal, focal),
@@ -99,19 +99,19 @@ class FollowingCamera:
             camera_from_world=camera_from_world,
         )
 
-    def _looked_at(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
+    def _look_at_point(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
         """What is in the middle of the picture, in the world."""
         manifest, joint = self.player.manifest, self.viewpoint.joint
         pelvis = manifest.rest_joints[0]
         if joint is None:
-            return pelvis + pose.root_translation - self.middle_m * self.axes[1]
+            return pelvis + pose.root_translation - self.center_above_pelvis_m * self.level_axes[1]
         number = JOINT_NAMES.index(joint)
         body = body_from_rest(manifest.rest_joints, manifest.parents, pose.joint_rotations)
         world = world_from_body(pelvis, pose.root_rotation, pose.root_translation) @ body[number]
         return world[:3, :3] @ manifest.rest_joints[number] + world[:3, 3]
 
 
-def standing_pose(player: Player) -> BodyPose:
+def canonical_pose_of(player: Player) -> BodyPose:
     """The avatar in its canonical pose: upright, arms a little away."""
     return BodyPose(
         root_rotation=np.zeros(3),

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from apps.playing.driving import driving_motion
-from apps.playing.novel import novel_motion
-from apps.playing.rate import poses_a_second
+from apps.playing.driving import load_driving_motion
+from apps.playing.novel import demo_motion
+from apps.playing.rate import pose_rate
 from apps.terminal.console import Console
-from capture.atomic_files import whole_file
-from export.gltf import Animation, glb
+from capture.atomic_files import atomic_file
+from export.gltf import SkeletonAnimation, encode_glb
 from export.manifest import Manifest
-from export.mesh import SkinnedMesh, mesh_of
+from export.mesh import SkinnedMesh, extract_mesh
 from export.package import read_package
 from preprocess.pose import Motion
 
@@ -37,33 +37,33 @@ def write_mesh(
         poses: What the .glb does; without it, a turn.
         name: Of the avatar.
         person: Whose poses, where the file holds several people's.
-        replace: Whether a file that is there already may go, as of `whole_file`.
+        replace: Whether a file that is there already may go, as of `atomic_file`.
 
     Raises:
-        BadInput: If the package is not sound, or no pose is valid.
+        InputError: If the package is not sound, or no pose is valid.
         OSError: If the disk is full.
     """
     held = read_package(package)
-    motion = novel_motion()
+    motion = demo_motion()
     if poses is not None:
-        motion = driving_motion(poses, held.manifest.rest_joints, console, person=person)
+        motion = load_driving_motion(poses, held.manifest.rest_joints, console, person=person)
     suffix = out.suffix.lower()
-    write = _glb(held.manifest, motion, name) if suffix == ".glb" else _still(suffix)
-    with console.waiting("taking the surface"):
-        mesh = mesh_of(held.tables["hq"])
+    write = _glb_encoder(held.manifest, motion, name) if suffix == ".glb" else _static_mesh_encoder(suffix)
+    with console.status("taking the surface"):
+        mesh = extract_mesh(held.tables["hq"])
         content = write(mesh)
-    with whole_file(out, replace=replace) as part:
+    with atomic_file(out, replace=replace) as part:
         part.write_bytes(content)
-    console.say(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
+    console.info(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
 
 
-def _glb(manifest: Manifest, motion: Motion, name: str) -> Callable[[SkinnedMesh], bytes]:
+def _glb_encoder(manifest: Manifest, motion: Motion, name: str) -> Callable[[SkinnedMesh], bytes]:
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
-    animation = Animation.of(motion, rows, poses_a_second(motion), manifest.rest_joints[0])
-    return lambda mesh: glb(mesh, manifest, animation, name=name)
+    animation = SkeletonAnimation.of(motion, rows, pose_rate(motion), manifest.rest_joints[0])
+    return lambda mesh: encode_glb(mesh, manifest, animation, name=name)
 
 
-def _still(suffix: str) -> Callable[[SkinnedMesh], bytes]:
+def _static_mesh_encoder(suffix: str) -> Callable[[SkinnedMesh], bytes]:
     """Return what encodes the canonical pose; colors are sRGB, as programs take a PLY's to be."""
     import trimesh  # an installation of the player alone has none, and is told what to install
 

@@ -5,7 +5,7 @@ import numpy as np
 from preprocess.pose import Motion
 
 
-def poses_a_second(motion: Motion) -> float:
+def pose_rate(motion: Motion) -> float:
     """By the times of its poses; 30 if it has none that can be."""
     if motion.times_s is None or len(motion) < 2:
         return 30.0

@@ -6,23 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.playing.arguments import SIZE_PX, PlayArguments
-from apps.playing.driving import driving_motion
-from apps.playing.follow import FollowingCamera, standing_pose
-from apps.playing.novel import novel_motion
-from apps.playing.timeline import Timeline
+from apps.playing.arguments import DEFAULT_SIZE_PX, PlayArguments
+from apps.playing.driving import load_driving_motion
+from apps.playing.follow import FollowingCamera, canonical_pose_of
+from apps.playing.novel import demo_motion
+from apps.playing.timeline import ResampledMotion
 from apps.terminal.console import Console
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from export.player import Player
 from preprocess.pose import BodyPose, Motion
 
-STILL_FPS = 30.0
+TURNTABLE_FPS = 30.0
 """Pictures a second of a turntable about a still pose."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Shots:
+class RenderSequence:
     """Pictures that are still to be drawn.
 
     Attributes:
@@ -43,48 +43,48 @@ class Shots:
         return zip(self.poses, self.cameras, strict=True)
 
 
-def shots_of(
-    given: PlayArguments, player: Player, console: Console, *, most_fps: float = np.inf
-) -> Shots:
+def plan_render(
+    arguments: PlayArguments, player: Player, console: Console, *, max_fps: float = np.inf
+) -> RenderSequence:
     """The pictures that the arguments ask for.
 
     Args:
         given: The arguments.
         player: Of the avatar.
         console: Hears what the user should know about the poses.
-        most_fps: Pictures a second that can be written.
+        max_fps: Pictures a second that can be written.
 
     Raises:
-        BadInput: If a file cannot be used, or the arguments do not fit it.
+        InputError: If a file cannot be used, or the arguments do not fit it.
     """
-    if given.poses is None and given.turntable is not None:
-        motion = _held(standing_pose(player))
-    elif given.poses is None:
-        motion = novel_motion()
+    if arguments.poses is None and arguments.turntable is not None:
+        motion = _single_pose_motion(canonical_pose_of(player))
+    elif arguments.poses is None:
+        motion = demo_motion()
     else:
-        motion = driving_motion(
-            given.poses, player.manifest.rest_joints, console, person=given.person
+        motion = load_driving_motion(
+            arguments.poses, player.manifest.rest_joints, console, person=arguments.person
         )
-    one = given.still is not None or len(motion) == 1
-    if one or given.clip.suffix.lower() == ".png":
-        row = given.still or 0
+    one = arguments.still is not None or len(motion) == 1
+    if one or arguments.output_path.suffix.lower() == ".png":
+        row = arguments.still or 0
         if not (0 <= row < len(motion) and motion.valid[row]):
-            raise BadInput(
-                f"--still {row}: {given.poses} holds {len(motion)} poses, 0 to {len(motion) - 1}, "
+            raise InputError(
+                f"--still {row}: {arguments.poses} holds {len(motion)} poses, 0 to {len(motion) - 1}, "
                 f"{int(motion.valid.sum())} of them valid; this is none of them."
             )
-        return _of_one(given, player, motion, row, most_fps)
-    fps = given.fps and min(given.fps, most_fps)
-    line = Timeline.of(motion, fps=fps, speed=given.speed)
-    if line.fps > most_fps:
-        line = Timeline.of(motion, fps=most_fps, speed=given.speed)
+        return _plan_single_pose(arguments, player, motion, row, max_fps)
+    fps = arguments.fps and min(arguments.fps, max_fps)
+    line = ResampledMotion.of(motion, fps=fps, speed=arguments.speed)
+    if line.fps > max_fps:
+        line = ResampledMotion.of(motion, fps=max_fps, speed=arguments.speed)
     poses = tuple(line.pose(picture) for picture in range(len(line)))
-    rows = tuple(line.row(picture) for picture in range(len(line)))
-    return Shots(poses=poses, cameras=_cameras(given, player, motion, rows, poses, line.fps),
+    rows = tuple(line.nearest_row(picture) for picture in range(len(line)))
+    return RenderSequence(poses=poses, cameras=_plan_cameras(arguments, player, motion, rows, poses, line.fps),
                  fps=line.fps)  # fmt: skip
 
 
-def _held(pose: BodyPose) -> Motion:
+def _single_pose_motion(pose: BodyPose) -> Motion:
     """A motion of one pose."""
     return Motion(
         root_rotations=pose.root_rotation[None],
@@ -92,41 +92,41 @@ def _held(pose: BodyPose) -> Motion:
         joint_rotations=pose.joint_rotations[None],
         valid=np.ones(1, dtype=bool),
         betas=np.zeros(10),
-        model="body24",
+        body_model="body24",
     )
 
 
-def _of_one(
-    given: PlayArguments, player: Player, motion: Motion, row: int, most_fps: float
-) -> Shots:
+def _plan_single_pose(
+    arguments: PlayArguments, player: Player, motion: Motion, row: int, max_fps: float
+) -> RenderSequence:
     """One pose: a picture, or all round it."""
-    fps = min(given.fps or STILL_FPS, most_fps)
+    fps = min(arguments.fps or TURNTABLE_FPS, max_fps)
     count = 1
-    if given.turntable is not None and given.clip.suffix.lower() != ".png":
-        count = max(1, round(abs(given.turntable) * fps))
+    if arguments.turntable is not None and arguments.output_path.suffix.lower() != ".png":
+        count = max(1, round(abs(arguments.turntable) * fps))
     poses = (motion[row],) * count
     valid = np.arange(len(motion)) == row
     held = replace(motion, valid=valid)  # so that the camera stands before this pose
-    return Shots(
-        poses=poses, cameras=_cameras(given, player, held, (row,) * count, poses, fps), fps=fps
+    return RenderSequence(
+        poses=poses, cameras=_plan_cameras(arguments, player, held, (row,) * count, poses, fps), fps=fps
     )
 
 
-def _cameras(
-    given: PlayArguments,
+def _plan_cameras(
+    arguments: PlayArguments,
     player: Player,
     motion: Motion,
     rows: tuple[int, ...],
     poses: tuple[BodyPose, ...],
     fps: float,
 ) -> tuple[Camera, ...]:
-    if given.camera is not None:
-        return cameras_from(given.camera, len(motion), rows, given.size_px)
-    following = FollowingCamera.of(player, motion, given.size_px or SIZE_PX, given.viewpoint)
-    return tuple(following.at(pose, number / fps) for number, pose in enumerate(poses))
+    if arguments.camera is not None:
+        return load_cameras(arguments.camera, len(motion), rows, arguments.size_px)
+    following = FollowingCamera.of(player, motion, arguments.size_px or DEFAULT_SIZE_PX, arguments.viewpoint)
+    return tuple(following.camera_for(pose, number / fps) for number, pose in enumerate(poses))
 
 
-def cameras_from(
+def load_cameras(
     path: Path, poses: int, rows: tuple[int, ...], size: int | tuple[int, int] | None
 ) -> tuple[Camera, ...]:
     """Cameras of a file, one for each of some rows, as pinholes of a size.
@@ -138,31 +138,31 @@ def cameras_from(
         size: Longer side, or width and height, pixels; the file's own if None.
 
     Raises:
-        BadInput: If it cannot be read, or does not match poses or size.
+        InputError: If it cannot be read, or does not match poses or size.
     """
-    from preprocess.camera_file import cameras_in, read_cameras
+    from preprocess.camera_file import resolve_camera_path, read_cameras
 
-    path = cameras_in(path)
-    track = read_cameras(path, _picture_size(path))
-    if track.moves and len(track.cameras) != poses:
-        raise BadInput(
+    path = resolve_camera_path(path)
+    track = read_cameras(path, _camera_image_size(path))
+    if track.is_moving and len(track.cameras) != poses:
+        raise InputError(
             f"{path} holds {len(track.cameras)} cameras for {poses} poses; expected one, or one "
             "for each pose."
         )
-    return tuple(_fitted(track[row], size) for row in rows)
+    return tuple(_resize_camera(track[row], size) for row in rows)
 
 
-def _picture_size(path: Path) -> tuple[int, int]:
+def _camera_image_size(path: Path) -> tuple[int, int]:
     """Width and height that a camera file belongs to; twice its principal point if it is silent."""
-    from preprocess.cameras.door import read_named
-    from preprocess.cameras.rigs import find_rig, read_rig
+    from preprocess.cameras.door import read_named_cameras
+    from preprocess.cameras.rigs import find_multi_view_cameras, read_multi_view_camera
     from preprocess.npz import read_npz
 
-    rig = find_rig(path)
+    rig = find_multi_view_cameras(path)
     if rig is not None:
-        return read_rig(rig, None, None).size_px
+        return read_multi_view_camera(rig, None, None).size_px
     if path.suffix.lower() != ".npz":
-        return read_named(path)[0].camera.size_px
+        return read_named_cameras(path)[0].camera.size_px
 
     arrays = read_npz(path, ("width", "height", "intrinsic"))
     if {"width", "height"} <= arrays.keys():
@@ -170,21 +170,21 @@ def _picture_size(path: Path) -> tuple[int, int]:
     elif "intrinsic" in arrays and arrays["intrinsic"].shape[-2:] == (3, 3):
         width, height = (2.0 * float(c) for c in arrays["intrinsic"].reshape(-1, 3, 3)[0, :2, 2])
     else:
-        raise BadInput(f"{path} holds no camera: expected intrinsic (3, 3), height and width.")
+        raise InputError(f"{path} holds no camera: expected intrinsic (3, 3), height and width.")
     if not (1.0 <= width <= 16384.0 and 1.0 <= height <= 16384.0):
-        raise BadInput(f"{path} belongs to pictures of {width:.0f}x{height:.0f} px; up to 16384.")
+        raise InputError(f"{path} belongs to pictures of {width:.0f}x{height:.0f} px; up to 16384.")
     return round(width), round(height)
 
 
-def _fitted(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
+def _resize_camera(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
     """The camera as a pinhole of the size."""
     pinhole = replace(camera, distortion=())
     if not isinstance(size, tuple):
-        return pinhole.fitted(size or max(camera.size_px))
+        return pinhole.resize_longer_side(size or max(camera.size_px))
     (width, height), (wide, high) = size, camera.size_px
     if abs(width * high - height * wide) > max(wide, high):
-        raise BadInput(
+        raise InputError(
             f"--size is {width}x{height}, but --camera takes pictures of {wide}x{high}: another "
             "shape. Give the longer side alone."
         )
-    return pinhole.resized(size)
+    return pinhole.resize(size)

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from apps.playing.rate import poses_a_second
+from apps.playing.rate import pose_rate
 from preprocess.pose import BodyPose, Motion
-from preprocess.rotations import between
+from preprocess.rotations import slerp
 
-MOST_FPS = 60.0
+MAX_FPS = 60.0
 """Pictures a second if nobody says: motion capture of 120 poses a second shows every second one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Timeline:
+class ResampledMotion:
     """Pictures at an even pace, and where in the motion each of them lies.
 
     Attributes:
@@ -25,12 +25,12 @@ class Timeline:
     """
 
     motion: Motion
-    rows: Int[np.ndarray, "valid"]
+    valid_rows: Int[np.ndarray, "valid"]
     fps: float
-    places: Float[np.ndarray, "pictures"]
+    positions: Float[np.ndarray, "pictures"]
 
     @classmethod
-    def of(cls, motion: Motion, *, fps: float | None, speed: float = 1.0) -> "Timeline":
+    def of(cls, motion: Motion, *, fps: float | None, speed: float = 1.0) -> "ResampledMotion":
         """The pictures of a motion.
 
         A motion without times is as fast as its pictures: one for each pose.
@@ -41,8 +41,8 @@ class Timeline:
                 pose of it.
             speed: How many times faster than it was.
         """
-        rows, rate = np.flatnonzero(motion.valid), poses_a_second(motion)
-        pace = fps or rate / float(np.ceil(rate / MOST_FPS - 1e-6))
+        rows, rate = np.flatnonzero(motion.valid), pose_rate(motion)
+        pace = fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6))
         step = speed if motion.times_s is None else speed * rate / pace
         step = 1.0 if abs(step - 1.0) < 1e-3 else step
         count = int((len(rows) - 1) / step + 1e-6) + 1
@@ -50,16 +50,16 @@ class Timeline:
 
     def __len__(self) -> int:
         """How many pictures there are."""
-        return len(self.places)
+        return len(self.positions)
 
-    def pose(self, picture: int) -> BodyPose:
+    def pose(self, frame: int) -> BodyPose:
         """The pose of a picture: slerp between neighbours, straight lines for the root's place."""
-        before, share = self._before(picture)
-        first = self.motion[int(self.rows[before])]
+        before, share = self._split_position(frame)
+        first = self.motion[int(self.valid_rows[before])]
         if share < 1e-6:
             return first
-        last = self.motion[int(self.rows[before + 1])]
-        turned = between(_rotations(first), _rotations(last), np.array([share]))[0]
+        last = self.motion[int(self.valid_rows[before + 1])]
+        turned = slerp(_rotations(first), _rotations(last), np.array([share]))[0]
         way = last.root_translation - first.root_translation
         return BodyPose(
             root_rotation=turned[0],
@@ -67,13 +67,13 @@ class Timeline:
             joint_rotations=turned[1:],
         )
 
-    def row(self, picture: int) -> int:
+    def nearest_row(self, frame: int) -> int:
         """The row of the motion that is nearest to a picture."""
-        before, share = self._before(picture)
-        return int(self.rows[before + (share >= 0.5)])
+        before, share = self._split_position(frame)
+        return int(self.valid_rows[before + (share >= 0.5)])
 
-    def _before(self, picture: int) -> tuple[int, float]:
-        place = min(float(self.places[picture]), len(self.rows) - 1.0)
+    def _split_position(self, frame: int) -> tuple[int, float]:
+        place = min(float(self.positions[frame]), len(self.valid_rows) - 1.0)
         before = int(place + 1e-6)
         return before, max(0.0, place - before)
 

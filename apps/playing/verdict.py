@@ -7,11 +7,11 @@ from pathlib import Path
 import onnxruntime
 
 from export.manifest import Manifest
-from export.player import ALIKE, CLOSE, Likeness, provider_named, verify
+from export.player import MIN_CLOSE_FRACTION, MAX_CLOSE_DIFFERENCE, PictureDifference, find_provider, verify_package
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
+class VerificationResult:
     """What became of the golden frames.
 
     Attributes:
@@ -19,36 +19,36 @@ class Verdict:
         provider: onnxruntime's execution provider.
     """
 
-    frames: tuple[Likeness, ...]
+    frames: tuple[PictureDifference, ...]
     provider: str
 
     @property
-    def same(self) -> bool:
+    def matches(self) -> bool:
         """Whether all of them look the same; a package without any proves nothing."""
-        return bool(self.frames) and all(frame.alike for frame in self.frames)
+        return bool(self.frames) and all(frame.matches for frame in self.frames)
 
-    def lines(self) -> list[str]:
+    def to_lines(self) -> list[str]:
         """For the user."""
         said = [
-            f"golden frame {number}: {'same' if frame.alike else 'DIFFERENT'} "
-            f"({frame.close:.2%} within {CLOSE}/255, largest difference {frame.largest:.0f}/255)"
+            f"golden frame {number}: {'same' if frame.matches else 'DIFFERENT'} "
+            f"({frame.close_fraction:.2%} within {MAX_CLOSE_DIFFERENCE}/255, largest difference {frame.largest_difference:.0f}/255)"
             for number, frame in enumerate(self.frames)
         ]
         where = f"{self.provider}, onnxruntime {onnxruntime.__version__}"
         if not self.frames:
             return [f"verdict: none; the package holds no golden frames ({where})."]
-        worst = max(frame.largest for frame in self.frames)
-        if self.same:
+        worst = max(frame.largest_difference for frame in self.frames)
+        if self.matches:
             return [
                 *said,
                 f"verdict: same; {len(self.frames)} golden frames, worst difference "
                 f"{worst:.0f}/255 ({where})",
             ]
-        bad = sum(not frame.alike for frame in self.frames)
+        bad = sum(not frame.matches for frame in self.frames)
         return [
             *said,
             f"verdict: DIFFERENT; {bad} of {len(self.frames)} golden frames are not within "
-            f"{CLOSE}/255 on {ALIKE:.1%} of the pixels, worst difference {worst:.0f}/255 "
+            f"{MAX_CLOSE_DIFFERENCE}/255 on {MIN_CLOSE_FRACTION:.1%} of the pixels, worst difference {worst:.0f}/255 "
             f"({where}). Update onnxruntime, try --provider cpu, or report it with these lines.",
         ]
 
@@ -56,18 +56,18 @@ class Verdict:
         """For machines."""
         content = {
             "format": 1,
-            "verdict": "same" if self.same else "different",
+            "verdict": "same" if self.matches else "different",
             "provider": self.provider,
             "onnxruntime": onnxruntime.__version__,
             "frames": [
-                {"largest": round(frame.largest, 3), "close": round(frame.close, 6)}
+                {"largest": round(frame.largest_difference, 3), "close": round(frame.close_fraction, 6)}
                 for frame in self.frames
             ],
         }
         return json.dumps(content, indent=1) + "\n"
 
 
-def package_notes(manifest: Manifest) -> list[str]:
+def package_warnings(manifest: Manifest) -> list[str]:
     """What was found wrong with an avatar when its package was written, a sentence each."""
     notes = [str(warning) for warning in manifest.metrics.get("warnings") or ()]
     mark = manifest.metrics.get("held_out")
@@ -79,11 +79,11 @@ def package_notes(manifest: Manifest) -> list[str]:
     return notes
 
 
-def verdict_of(package: Path, *, provider: str) -> Verdict:
+def verify_package(package: Path, *, provider: str) -> VerificationResult:
     """Draws the golden frames of a package.
 
     Raises:
-        BadInput: If the file is no sound package, or there is no such provider.
+        InputError: If the file is no sound package, or there is no such provider.
     """
-    frames = tuple(verify(package, provider=provider))
-    return Verdict(frames=frames, provider=provider_named(provider))
+    frames = tuple(verify_package(package, provider=provider))
+    return VerificationResult(frames=frames, provider=find_provider(provider))

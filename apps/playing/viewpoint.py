@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.kinematics import rotation_matrices
 from preprocess.skeleton import JOINT_NAMES
 
-CLOSE_UP = 3.5
+CLOSE_UP_ZOOM = 3.5
 """How much larger than the whole person a joint and what is about it are shown."""
-NEAREST_M, FARTHEST_M = 0.3, 100.0
-LARGEST_ZOOM = 50.0
+MIN_DISTANCE_M, MAX_DISTANCE_M = 0.3, 100.0
+MAX_ZOOM = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class Viewpoint:
         distance_m: How far it stands from what it looks at; None: 3.5 heights of the person.
             The lens stays, so that a nearer camera shows the person larger.
         joint: What it looks at (see `JOINT_NAMES`); None: the person's middle.
-        turn_s: How long the camera takes for one turn about the person; negative: the other way;
+        turn_period_s: How long the camera takes for one turn about the person; negative: the other way;
             None: it does not turn.
     """
 
@@ -35,46 +35,46 @@ class Viewpoint:
     zoom: float = 1.0
     distance_m: float | None = None
     joint: str | None = None
-    turn_s: float | None = None
+    turn_period_s: float | None = None
 
     def __post_init__(self) -> None:
         """Checks it.
 
         Raises:
-            BadInput: If one of them cannot be.
+            InputError: If one of them cannot be.
         """
         if not np.isfinite(self.orbit_deg):
-            raise BadInput(f"--orbit is {self.orbit_deg}; an angle in degrees was expected.")
+            raise InputError(f"--orbit is {self.orbit_deg}; an angle in degrees was expected.")
         if not -90.0 <= self.elevation_deg <= 90.0:
-            raise BadInput(
+            raise InputError(
                 f"--elevation is {self.elevation_deg:g}; -90 (from below) to 90 degrees (from "
                 "above) were expected."
             )
-        if not 1.0 / LARGEST_ZOOM <= self.zoom <= LARGEST_ZOOM:
-            raise BadInput(f"--zoom is {self.zoom:g}; up to {LARGEST_ZOOM:g} times were expected.")
-        if self.distance_m is not None and not NEAREST_M <= self.distance_m <= FARTHEST_M:
-            raise BadInput(
-                f"--distance is {self.distance_m:g}; {NEAREST_M} to {FARTHEST_M:g} metres were "
+        if not 1.0 / MAX_ZOOM <= self.zoom <= MAX_ZOOM:
+            raise InputError(f"--zoom is {self.zoom:g}; up to {MAX_ZOOM:g} times were expected.")
+        if self.distance_m is not None and not MIN_DISTANCE_M <= self.distance_m <= MAX_DISTANCE_M:
+            raise InputError(
+                f"--distance is {self.distance_m:g}; {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g} metres were "
                 "expected. --zoom comes closer than that."
             )
         if self.joint is not None and self.joint not in JOINT_NAMES:
-            raise BadInput(
+            raise InputError(
                 f"--close-up {self.joint}: there is no such joint; there are "
                 f"{', '.join(JOINT_NAMES)}."
             )
-        if self.turn_s is not None and not 0.1 <= abs(self.turn_s) <= 3600.0:
-            raise BadInput(
-                f"--turntable is {self.turn_s:g}; a turn takes 0.1 to 3600 seconds (negative: the "
+        if self.turn_period_s is not None and not 0.1 <= abs(self.turn_period_s) <= 3600.0:
+            raise InputError(
+                f"--turntable is {self.turn_period_s:g}; a turn takes 0.1 to 3600 seconds (negative: the "
                 "other way)."
             )
 
-    def turned(self, seconds: float) -> Float[np.ndarray, "3 3"]:
+    def rotation_at(self, seconds: float) -> Float[np.ndarray, "3 3"]:
         """Camera from a camera that stands in front, level; its axes are right, down, forward.
 
         Args:
             seconds: Since the first picture.
         """
-        turns = 0.0 if self.turn_s is None else seconds / self.turn_s
+        turns = 0.0 if self.turn_period_s is None else seconds / self.turn_period_s
         round_it = np.array([0.0, np.deg2rad(self.orbit_deg) + 2.0 * np.pi * turns, 0.0])
         above = np.array([np.deg2rad(self.elevation_deg), 0.0, 0.0])
         return rotation_matrices(above) @ rotation_matrices(round_it)

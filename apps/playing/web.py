@@ -11,17 +11,17 @@ import numpy as np
 
 from apps.playing.follow import FollowingCamera
 from apps.terminal.console import Console
-from apps.terminal.interrupt import ended_by_ctrl_c
-from capture.atomic_files import whole_folder
-from capture.errors import BadInput
+from apps.terminal.interrupt import interrupt_event
+from capture.atomic_files import atomic_folder
+from capture.errors import InputError
 from export.player import Player
-from export.web.site import Clip, Look, pose_row
+from export.web.site import PageMotion, StartView, flatten_pose
 from preprocess.pose import Motion
 
 HOST = "127.0.0.1"
-PORTS = 20
+PORTS_TRIED = 20
 """So many ports are tried, one after the other."""
-KINDS = {
+MIME_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -31,13 +31,13 @@ KINDS = {
 }
 
 
-def clip_of(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -> Clip:
+def web_clip(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -> PageMotion:
     """The valid poses of a motion, and a camera before the first of them."""
     camera = FollowingCamera.of(player, motion, 540)
-    return Clip(
-        poses=np.stack([pose_row(motion[row]) for row in rows]),
+    return PageMotion(
+        poses=np.stack([flatten_pose(motion[row]) for row in rows]),
         fps=fps,
-        look=Look(axes=camera.axes, height_m=camera.height_m, middle_m=camera.middle_m),
+        start_view=StartView(axes=camera.level_axes, height_m=camera.height_m, middle_m=camera.center_above_pelvis_m),
     )
 
 
@@ -47,51 +47,51 @@ def write_site(files: Mapping[str, bytes], path: Path) -> None:
     Raises:
         OSError: If the disk is full; then nothing is written.
     """
-    with whole_folder(path) as part:
+    with atomic_folder(path) as part:
         for name, content in files.items():
             target = part / name
             target.parent.mkdir(exist_ok=True)
             target.write_bytes(content)
 
 
-def serve(files: Mapping[str, bytes], port: int, console: Console) -> None:
+def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
     """Serves the page to this machine's own browsers until Ctrl-C.
 
     Args:
         files: By relative path.
-        port: Tried first.
+        port: CorrectionCandidate first.
         console: Where the address is said; stdout hears it, too.
 
     Raises:
-        BadInput: If no port is free.
+        InputError: If no port is free.
     """
-    server = server_of(files, port)
+    server = make_server(files, port)
     address = f"http://{HOST}:{server.server_port}"
-    with ended_by_ctrl_c() as ended:
+    with interrupt_event() as ended:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        console.say("The avatar plays in a browser on this machine; Ctrl-C ends it:")
+        console.info("The avatar plays in a browser on this machine; Ctrl-C ends it:")
         print(address, flush=True)  # noqa: T201 - where it is goes to stdout, for scripts
         ended.wait()
     server.shutdown()
     server.server_close()
 
 
-def server_of(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
+def make_server(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
     """A server of these files on this machine's own address, not running yet.
 
     Raises:
-        BadInput: If neither this port nor one of the next ones is free.
+        InputError: If neither this port nor one of the next ones is free.
     """
-    for tried in range(port, min(port + PORTS, 1 << 16)):
+    for tried in range(port, min(port + PORTS_TRIED, 1 << 16)):
         try:
-            return _Server((HOST, tried), _handler(files))
+            return _QuietHttpServer((HOST, tried), _handler(files))
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
-    raise BadInput(f"Ports {port} to {port + PORTS - 1} are all taken. Give --web another one.")
+    raise InputError(f"Ports {port} to {port + PORTS_TRIED - 1} are all taken. Give --web another one.")
 
 
-class _Server(ThreadingHTTPServer):
+class _QuietHttpServer(ThreadingHTTPServer):
     def handle_error(self, *_: object) -> None:
         """A browser that goes away in the middle is no error."""
 
@@ -115,7 +115,7 @@ def _handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
 
         def _answer(self, status: HTTPStatus, content: bytes, suffix: str) -> None:
             self.send_response(status)
-            self.send_header("Content-Type", KINDS.get(suffix, "application/octet-stream"))
+            self.send_header("Content-Type", MIME_TYPES.get(suffix, "application/octet-stream"))
             self.send_header("Content-Length", str(len(content)))
             self.send_header("Cache-Control", "no-cache")
             self.send_header("X-Content-Type-Options", "nosniff")

@@ -5,19 +5,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from preprocess.camera_file import CameraTrack
-from preprocess.fit.body_fit import BodyFit
-from preprocess.masks.choice import MaskChoice
+from preprocess.fit.body_fit import BodyAlignment
+from preprocess.masks.choice import MaskOrigin
 from preprocess.masks.files import Masks
 
 
-def notes_of(
-    fit: BodyFit,
+def describe_capture(
+    fit: BodyAlignment,
     masks: Masks | None,
     cameras: CameraTrack,
-    choice: MaskChoice,
+    choice: MaskOrigin,
     *,
-    unread: Path | None = None,
-    looked_for: Path | None = None,
+    unread_alpha_video: Path | None = None,
+    expected_masks: Path | None = None,
 ) -> Iterator[str]:
     """Sentences, one after the other.
 
@@ -39,29 +39,29 @@ def notes_of(
             f"Masks are estimated from the pictures and the poses (segmenter:{choice.segmenter}); "
             "a segmenter's own masks (--masks) are sharper around hair and hands."
         )
-    if choice.fallback and looked_for is not None:
-        yield f"There was no folder of masks {looked_for} when the first pose came."
-    if choice.fallback and unread is not None:
-        folder = unread.with_name(f"{unread.stem}_frames")
+    if choice.is_fallback and expected_masks is not None:
+        yield f"There was no folder of masks {expected_masks} when the first pose came."
+    if choice.is_fallback and unread_alpha_video is not None:
+        folder = unread_alpha_video.with_name(f"{unread_alpha_video.stem}_frames")
         video, made, pictures = (
-            shlex.quote(str(path)) for path in (unread, folder, folder / "%06d.png")
+            shlex.quote(str(path)) for path in (unread_alpha_video, folder, folder / "%06d.png")
         )
         yield (
-            f"{unread.name} has an alpha channel, which is not read from videos. If it cuts the "
+            f"{unread_alpha_video.name} has an alpha channel, which is not read from videos. If it cuts the "
             "person out, write pictures, and learn from their folder: "
             f"mkdir {made} && ffmpeg -i {video} {pictures}"
         )
-    if choice.alpha:
+    if choice.uses_alpha_channel:
         yield "The pictures' own alpha channel is used as their masks."
     if masks is not None and masks.inverted:
         yield f"The masks in {masks.path} show the background (white); they were inverted."
-    if motion.model != family:
+    if motion.body_model != family:
         yield (
-            f"The poses were made for the body model {motion.model!r}, but {family!r} is used "
-            f"(--body), with joints where the mean shape has them. {fit.words}".strip()
+            f"The poses were made for the body model {motion.body_model!r}, but {family!r} is used "
+            f"(--body), with joints where the mean shape has them. {fit.description}".strip()
         )
-    elif fit.words:
-        yield fit.words
+    elif fit.description:
+        yield fit.description
     lost = len(motion) - int(motion.valid.sum())
     if lost:
         yield (

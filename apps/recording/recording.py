@@ -7,27 +7,27 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.pace import Pace
-from capture.playback import Playback
-from capture.source import Source
+from capture.pace import PacingClock
+from capture.playback import RealtimePlayback
+from capture.source import FrameSource
 from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
 from preprocess.capture_folder import CapturePaths
-from preprocess.doctor.claim import Claim
-from preprocess.fit.growing import GrowingFit
-from preprocess.fit.refit import Refit
-from preprocess.live import LiveParts
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.fit.growing import LiveAlignment
+from preprocess.fit.refit import BodyPlacement
+from preprocess.live import LiveInputs
 from preprocess.masks.files import Masks
 from preprocess.masks.segmenter import Segmenter
 from preprocess.observation import Observation
-from preprocess.observe import Dropped, observer
+from preprocess.observe import DroppedFrame, observation_builder
 from preprocess.pose import Motion
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recording:
+class Capture:
     """A video of one person, with everything that belongs to it.
 
     Attributes:
@@ -49,44 +49,44 @@ class Recording:
     """
 
     paths: CapturePaths
-    source: Source
+    source: FrameSource
     motion: Motion
     masks: Masks | None
     cameras: CameraTrack
     shaped: ShapedBody
     size_px: int | None
     notes: tuple[str, ...]
-    live: LiveParts | None = None
+    live: LiveInputs | None = None
     segment: Segmenter | None = None
-    solved: dict[str, Any] | None = None
-    refit: Refit | None = None
-    growing_fit: GrowingFit | None = None
+    camera_report: dict[str, Any] | None = None
+    refit: BodyPlacement | None = None
+    live_fit: LiveAlignment | None = None
 
     def check(self) -> None:
         """Whether the parts fit together; no frame is read.
 
         Raises:
-            BadInput: If they do not.
+            InputError: If they do not.
         """
-        self.observer()
-        self.footprint_m()
+        self.observation_builder()
+        self.pixel_footprint_m()
 
-    def observations(self) -> Iterator[Observation | Dropped]:
+    def observations(self) -> Iterator[Observation | DroppedFrame]:
         """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
-        return map(self.observer(), self.source.frames())
+        return map(self.observation_builder(), self.source.frames())
 
-    def observer(self) -> Callable[[Frame], Observation | Dropped]:
+    def observation_builder(self) -> Callable[[Frame], Observation | DroppedFrame]:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
-            return self.live.observer(
-                self.source, self.cameras, self.size_px, self.segment, self.growing_fit
+            return self.live.observation_builder(
+                self.source, self.cameras, self.size_px, self.segment, self.live_fit
             )
-        return observer(
+        return observation_builder(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
             segment=self.segment,
         )  # fmt: skip
 
-    def told_of_masks(self) -> dict[str, str | float | None]:
+    def mask_report(self) -> dict[str, str | float | None]:
         """Where the masks come from, and how well estimated ones agree with the posed body."""
         if self.segment is not None:
             agreement = getattr(self.segment, "agreement", None)
@@ -95,44 +95,44 @@ class Recording:
         source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
         return {"masks": source, "mask_agreement": None}
 
-    def told_at_the_end(self) -> Iterator[str]:
+    def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""
-        growing = self.growing_fit
-        if growing is not None and growing.refit is not None:
-            yield f"{growing.refit.in_words()} (By the first {growing.frames} frames.)"
+        growing = self.live_fit
+        if growing is not None and growing.placement is not None:
+            yield f"{growing.placement.describe()} (By the first {growing.frame_count} frames.)"
 
-    def told_of_body(self) -> dict[str, float | bool] | None:
+    def body_fit_report(self) -> dict[str, float | bool] | None:
         """How the poses were fitted to the body that is used; None if that was not needed."""
-        growing = self.growing_fit
-        refit = self.refit if growing is None else growing.refit
+        growing = self.live_fit
+        refit = self.refit if growing is None else growing.placement
         if refit is None:
             return None
         told = refit.as_json()
-        return told if growing is None else {**told, "frames": growing.frames}
+        return told if growing is None else {**told, "frames": growing.frame_count}
 
-    def camera_of_row(self, row: int) -> Camera:
+    def camera_of_pose(self, row: int) -> Camera:
         """The camera that sees one of the poses."""
-        claim = Claim.of(self.motion, self.cameras, self.source)
+        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
         return self.cameras[int(claim.camera_rows()[row])]
 
-    def played(self) -> "Recording":
+    def in_real_time(self) -> "Capture":
         """The same, its frames coming at their own times."""
-        return replace(self, source=Playback(self.source, Pace()))
+        return replace(self, source=RealtimePlayback(self.source, PacingClock()))
 
-    def footprint_m(self) -> float:
+    def pixel_footprint_m(self) -> float:
         """What one pixel covers on the body: the dial of the field's resolution.
 
         Raises:
-            BadInput: If the person is behind the camera.
+            InputError: If the person is behind the camera.
         """
-        claim = Claim.of(self.motion, self.cameras, self.source)
+        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
         valid = self.motion.valid
         pelves = self.shaped.joints[0] + self.motion.root_translations[valid]
         forward = claim.extrinsics[claim.camera_rows()[valid], 2]  # of the camera that sees each
         depth = float(np.median((pelves * forward[:, :3]).sum(axis=1) + forward[:, 3]))
         camera = self.cameras[0]
         if depth <= 0.0:
-            raise BadInput(
+            raise InputError(
                 f"The person is at the camera or behind it (depth {depth:.2f} m); poses were "
                 "expected in the camera's world, in metres, with OpenCV axes (x right, y down, "
                 "z forward). Do poses and cameras come from the same run? Poses in a world need "

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.camera_device import camera_address
-from capture.growing import IDLE_S
-from preprocess.capture_folder import parts_in
+from capture.growing import IDLE_TIMEOUT_S
+from preprocess.capture_folder import find_parts
 from preprocess.masks.segmenter import segmenter_name
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingPaths:
-    """What the user named; the rest is looked for (see `find_capture`).
+class CaptureInputs:
+    """What the user named; the rest is looked for (see `find_capture_paths`).
 
     Attributes:
         video: Video file, folder of pictures, or capture folder.
@@ -35,14 +35,14 @@ class RecordingPaths:
     cameras: str | None = None
     body: Path | None = None
     frames: slice | None = None
-    mask_invert: bool | None = None
+    invert_masks: bool | None = None
     live: bool = False
     person: str | None = None
-    idle_s: float = IDLE_S
+    idle_s: float = IDLE_TIMEOUT_S
     height_m: float | None = None
     transposed: bool = False
 
-    def inputs(self) -> list[Path]:
+    def input_paths(self) -> list[Path]:
         """What no output may touch: files and folders that were named, and that may be found."""
         named = [self.poses, self.body]
         if camera_address(self.video) is None:
@@ -53,4 +53,4 @@ class RecordingPaths:
             named.append(Path(self.cameras))
         given = [path for path in named if path is not None]
         near = {path if path.is_dir() else path.parent for path in (self.video, self.poses) if path}
-        return [*given, *parts_in(sorted(near))]
+        return [*given, *find_parts(sorted(near))]

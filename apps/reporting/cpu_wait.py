@@ -13,34 +13,34 @@ from typing import final
 
 from avatar.trainer import Trainer
 
-TASKS = Path("/proc/self/task")
-GROUP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
-LEAST_SHARE = 0.5
+THREADS_FOLDER = Path("/proc/self/task")
+CGROUP_FILE, CGROUP_ROOT = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+MIN_CPU_SHARE = 0.5
 """A run that gets less than this share of the CPU time that it could use is warned of."""
-LEAST_WAITED_S = 5.0
+MIN_CONTENTION_S = 5.0
 """Less waiting than this is not worth a word."""
 
 
 @final
-class CpuWait:
+class CpuContentionMeter:
     """Measures from its making on."""
 
-    def __init__(self, trainer: Trainer, tasks: Path = TASKS) -> None:
+    def __init__(self, trainer: Trainer, threads_folder: Path = THREADS_FOLDER) -> None:
         """Begins now.
 
         Args:
             trainer: Whose steps are looked at where the system does not say how long threads wait.
             tasks: A folder for each thread.
         """
-        self._trainer, self._tasks = trainer, tasks
-        self._waited = _waited(tasks)
+        self._trainer, self._tasks = trainer, threads_folder
+        self._waited = _thread_wait_s(threads_folder)
         self._throttled_s = _throttled_s()
         self._cpu_s, self._steps = trainer.cpu_seconds, trainer.steps
-        self._stepping = trainer.stepping_wall, trainer.stepping_cpu
+        self._stepping = trainer.step_wall_seconds, trainer.step_cpu_seconds
 
-    def read(self) -> "CpuTime":
+    def measure(self) -> "CpuTime":
         """What was got and what was waited for so far."""
-        trainer, now = self._trainer, _waited(self._tasks)
+        trainer, now = self._trainer, _thread_wait_s(self._tasks)
         steps = trainer.steps - self._steps
         got_s = trainer.cpu_seconds - self._cpu_s
         if now:
@@ -48,8 +48,8 @@ class CpuWait:
             waited_s += _throttled_s() - self._throttled_s
         else:
             wall, cpu = self._stepping
-            waited_s = (trainer.stepping_wall - wall) - (trainer.stepping_cpu - cpu)
-        return CpuTime(got_s=got_s, waited_s=max(0.0, waited_s), steps=steps)
+            waited_s = (trainer.step_wall_seconds - wall) - (trainer.step_cpu_seconds - cpu)
+        return CpuTime(used_s=got_s, waited_s=max(0.0, waited_s), steps=steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,23 +62,23 @@ class CpuTime:
         steps: Training steps made meanwhile.
     """
 
-    got_s: float
+    used_s: float
     waited_s: float
     steps: int
 
     @property
-    def share(self) -> float:
+    def granted_share(self) -> float:
         """What was got of what could have been used, in [0, 1]."""
-        wanted_s = self.got_s + self.waited_s
-        return self.got_s / wanted_s if wanted_s > 0.0 else 1.0
+        wanted_s = self.used_s + self.waited_s
+        return self.used_s / wanted_s if wanted_s > 0.0 else 1.0
 
     def warning(self) -> str | None:
         """What it means and what to do; None if the machine gave enough."""
-        if self.share >= LEAST_SHARE or self.waited_s < LEAST_WAITED_S:
+        if self.granted_share >= MIN_CPU_SHARE or self.waited_s < MIN_CONTENTION_S:
             return None
-        usual = self.steps / max(self.share, 1e-3)
+        usual = self.steps / max(self.granted_share, 1e-3)
         return (
-            f"This machine gave the run {self.got_s:.0f} of the {self.got_s + self.waited_s:.0f} "
+            f"This machine gave the run {self.used_s:.0f} of the {self.used_s + self.waited_s:.0f} "
             "core-seconds that it could have used, because other programs are running: it made "
             f"{self.steps} steps instead of about {usual:.0f}, so the avatar is less sharp than it "
             "can be. Close other programs and learn on (the same command with --resume and more "
@@ -86,7 +86,7 @@ class CpuTime:
         )
 
 
-def _waited(tasks: Path) -> dict[str, float]:
+def _thread_wait_s(tasks: Path) -> dict[str, float]:
     """For each thread, how long it was ready to run and did not, seconds; empty if unknown."""
     waited = {}
     for task in tasks.glob("*"):
@@ -98,8 +98,8 @@ def _waited(tasks: Path) -> dict[str, float]:
 def _throttled_s() -> float:
     """How long a quota has held this process's control group back, seconds; 0 if unknown."""
     with suppress(OSError, ValueError, IndexError):
-        group = GROUP.read_text().rsplit("::", 1)[1].strip().lstrip("/")
-        for line in (GROUPS / group / "cpu.stat").read_text().splitlines():
+        group = CGROUP_FILE.read_text().rsplit("::", 1)[1].strip().lstrip("/")
+        for line in (CGROUP_ROOT / group / "cpu.stat").read_text().splitlines():
             name, value = line.split()
             if name == "throttled_usec":
                 return int(value) / 1e6

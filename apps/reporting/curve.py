@@ -11,7 +11,7 @@ class CurvePoint:
 
     Attributes:
         wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: Frames trained on so far.
+        frames_seen: EvaluationFrames trained on so far.
         psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
         verdict: What the scores mean, in a word (`avatar.sharpness`).
         frames: Which those were, by their numbers in the video, each with its own PSNR of the whole
@@ -30,13 +30,13 @@ class CurvePoint:
     video: int = 1
 
     @classmethod
-    def again(cls, content: dict[str, Any]) -> "CurvePoint":
+    def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":
         """From what a checkpoint kept."""
         frames = content.get("frames", [])
         return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
 
 
-def largest_falls(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
+def largest_drops(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
     """How far each held-out frame fell below its own best by a later mark, dB; 0 if it did not.
 
     By video and number, of the frames that were scored more than once.
@@ -52,6 +52,6 @@ def largest_falls(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
     return falls
 
 
-def largest_fall(curve: Sequence[CurvePoint]) -> float | None:
-    """The largest of `largest_falls`, dB; None if no frame was scored twice."""
-    return max(largest_falls(curve).values(), default=None)
+def largest_drop(curve: Sequence[CurvePoint]) -> float | None:
+    """The largest of `largest_drops`, dB; None if no frame was scored twice."""
+    return max(largest_drops(curve).values(), default=None)

@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 
 from apps.reporting.curve import CurvePoint
 
-WIDTH, HEIGHT = 720, 320
+SVG_WIDTH, SVG_HEIGHT = 720, 320
 LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
 """Room around the plot for its labels."""
 
-Place = Callable[[float], float]
-Scored = list[tuple[CurvePoint, float]]
+AxisScale = Callable[[float], float]
+ScoredPoints = list[tuple[CurvePoint, float]]
 
 
 def curve_svg(curve: Sequence[CurvePoint]) -> str:
@@ -28,39 +28,39 @@ def curve_svg(curve: Sequence[CurvePoint]) -> str:
     end = max(point.wall_seconds for point, _ in whole)
 
     def x(seconds: float) -> float:
-        return LEFT + (WIDTH - LEFT - RIGHT) * seconds / max(end, 1e-6)
+        return LEFT + (SVG_WIDTH - LEFT - RIGHT) * seconds / max(end, 1e-6)
 
     def y(decibels: float) -> float:
-        return TOP + (HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low)
+        return TOP + (SVG_HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low)
 
     parts = [
-        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
+        f'<svg class="curve" viewBox="0 0 {SVG_WIDTH} {SVG_HEIGHT}" role="img" '
         'aria-label="PSNR of held-out frames over seconds of training">',
         *_axes(x, y, low, high, end),
-        *_videos(whole, x),
-        *_lines(masked, x, y, "masked", "inside the mask"),
-        *_lines(whole, x, y, "whole", "whole picture"),
+        *_video_labels(whole, x),
+        *_polylines(masked, x, y, "masked", "inside the mask"),
+        *_polylines(whole, x, y, "whole", "whole picture"),
         "</svg>",
     ]
     return "\n".join(parts)
 
 
-def _axes(x: Place, y: Place, low: float, high: float, end: float) -> list[str]:
+def _axes(x: AxisScale, y: AxisScale, low: float, high: float, end: float) -> list[str]:
     parts = [
-        f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y(decibels):.1f}" '
+        f'<line class="grid" x1="{LEFT}" x2="{SVG_WIDTH - RIGHT}" y1="{y(decibels):.1f}" '
         f'y2="{y(decibels):.1f}"/>'
         f'<text class="tick" x="{LEFT - 8}" y="{y(decibels) + 4.0:.1f}" text-anchor="end">'
         f"{decibels:g}</text>"
         for decibels in (float(n) for n in range(int(low), int(high) + 1, 5))
     ]
     parts += [
-        f'<text class="tick" x="{x(seconds):.1f}" y="{HEIGHT - 28}" text-anchor="middle">'
+        f'<text class="tick" x="{x(seconds):.1f}" y="{SVG_HEIGHT - 28}" text-anchor="middle">'
         f"{seconds:g}</text>"
         for seconds in _ticks(end)
     ]
     parts.append(f'<text class="unit" x="{LEFT - 8}" y="{TOP - 12}" text-anchor="end">dB</text>')
     parts.append(
-        f'<text class="unit" x="{WIDTH - RIGHT}" y="{HEIGHT - 8}" text-anchor="end">'
+        f'<text class="unit" x="{SVG_WIDTH - RIGHT}" y="{SVG_HEIGHT - 8}" text-anchor="end">'
         "seconds of training</text>"
     )
     return parts
@@ -71,7 +71,7 @@ def _ticks(end: float) -> list[float]:
     return [step * i for i in range(int(end / step) + 1)]
 
 
-def _videos(scored: Scored, x: Place) -> list[str]:
+def _video_labels(scored: ScoredPoints, x: AxisScale) -> list[str]:
     """Where each video's line begins, if there are several."""
     first = {point.video: point.wall_seconds for point, _ in reversed(scored)}
     return [
@@ -81,7 +81,7 @@ def _videos(scored: Scored, x: Place) -> list[str]:
     ]
 
 
-def _lines(scored: Scored, x: Place, y: Place, kind: str, label: str) -> list[str]:
+def _polylines(scored: ScoredPoints, x: AxisScale, y: AxisScale, kind: str, label: str) -> list[str]:
     parts = []
     for video in sorted({point.video for point, _ in scored}):
         points = [(p, value) for p, value in scored if p.video == video]

@@ -6,13 +6,13 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
-from apps.reporting.curve import CurvePoint, largest_falls
+from apps.reporting.curve import CurvePoint, largest_drops
 from apps.reporting.curve_svg import curve_svg
-from apps.reporting.report import Report, decibels, percent
+from apps.reporting.report import Report, format_psnr, format_percent
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pair:
+class ComparisonPair:
     """A held-out frame: what the video shows, and what the avatar shows.
 
     Attributes:
@@ -34,19 +34,19 @@ def report_page(
     *,
     name: str,
     body_map: str = "",
-    pairs: Sequence[Pair] = (),
-    novel: str | None = None,
+    pairs: Sequence[ComparisonPair] = (),
+    animation: str | None = None,
     warnings: Sequence[str] = (),
     failure: str | None = None,
-    present: Collection[str] = (),
-    play: str | None = None,
+    present_files: Collection[str] = (),
+    play_command: str | None = None,
 ) -> str:
     """The page.
 
     Args:
         report: The figures.
         name: Of the video, for the heading.
-        body_map: An SVG of what was seen (`BodyMap.svg`).
+        body_map: An SVG of what was seen (`CoverageMap.svg`).
         pairs: Held-out frames, to look at.
         novel: A moving picture of poses that the video does not show, as an address.
         warnings: What the user was told.
@@ -54,22 +54,22 @@ def report_page(
         present: Names of what lies beside the page; nothing else is named as being there.
         play: The command that plays the package, if there is one.
     """
-    playing = "" if play is None else f" Play the avatar: <code>{escape(play)}</code>"
+    playing = "" if play_command is None else f" Play the avatar: <code>{escape(play_command)}</code>"
     style = (files("apps") / "reporting" / "page.css").read_text(encoding="utf-8")
     body = "\n".join(
         [
             f"<h1>{escape(name)}</h1>",
-            f'<p class="lead">{escape(_lead(report))}</p>',
+            f'<p class="lead">{escape(_summary(report))}</p>',
             f'<p class="failure">{escape(failure)}</p>' if failure else "",
             _tiles(report),
             _section("How it learnt", _curve(report)),
-            _section("The video before", _extended(report)),
+            _section("The video before", _earlier_videos(report)),
             _section("What the camera has seen", _coverage(report, body_map)),
-            _section("Where the camera was", _cameras(report, present)),
+            _section("Where the camera was", _cameras(report, present_files)),
             _section("Frames it was never trained on", _pairs(pairs)),
-            _section("Poses that the video does not show", _novel(novel)),
+            _section("Poses that the video does not show", _animation(animation)),
             _section("Worth knowing", _warnings(report, warnings)),
-            _section("All figures", _figures(report)),
+            _section("All figures", _all_values(report)),
             "<footer>Written by ia-ingest of instant-avatar-stream. The same figures for machines: "
             f"report.json.{playing}</footer>",
         ]
@@ -82,36 +82,36 @@ def report_page(
     )
 
 
-def _lead(report: Report) -> str:
+def _summary(report: Report) -> str:
     training, machine = report.training, report.machine
     threads = "one thread" if machine.threads == 1 else f"{machine.threads} threads"
     where = f"a CPU, {threads}" if machine.device == "cpu" else "a GPU"
-    earlier, learnt = report.extended, f"{training.wall_seconds:.0f} seconds"
+    earlier, learnt = report.earlier_videos, f"{training.wall_seconds:.0f} seconds"
     frames = f"{report.frames.used} frames"
     if earlier is not None:
-        frames += f" of this video, and {earlier.used} of {_list(earlier.videos)} before"
+        frames += f" of this video, and {earlier.frames_trained} of {_join_names(earlier.videos)} before"
         now_s = training.wall_seconds - earlier.wall_seconds
         learnt += f" ({now_s:.0f} on this video)"
     return f"An avatar from {frames}, learnt in {learnt} on {where}."
 
 
-def _list(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return " and ".join(names) or "an earlier video"
 
 
-def _extended(report: Report) -> str:
+def _earlier_videos(report: Report) -> str:
     """Two sentences, if the video was added to an avatar."""
-    earlier = report.extended
+    earlier = report.earlier_videos
     if earlier is None:
         return ""
-    told = f"{earlier.recalled} frames of {_list(earlier.videos)} were learnt from again. "
-    if earlier.psnr_before is None or earlier.psnr_after is None or earlier.largest_fall is None:
+    told = f"{earlier.replayed_key_frames} frames of {_join_names(earlier.videos)} were learnt from again. "
+    if earlier.psnr_before is None or earlier.psnr_after is None or earlier.largest_drop is None:
         told += "None of its frames had been held out, so what it lost cannot be said."
     else:
         told += (
             f"Held-out frames there ({len(earlier.frames)}): {earlier.psnr_before:.2f} dB before "
             f"this video, {earlier.psnr_after:.2f} dB now; none of them lost more than "
-            f"{earlier.largest_fall:.2f} dB."
+            f"{earlier.largest_drop:.2f} dB."
         )
     return f'<p class="legend">{escape(told)}</p>'
 
@@ -120,9 +120,9 @@ def _tiles(report: Report) -> str:
     held, package = report.held_out, report.package
     tiles = [
         (report.verdict or "not scored", "how it looks"),
-        (_number(held.psnr, "dB"), _meaning("held-out PSNR, on white", held.verdict)),
-        (_number(held.psnr_mask, "dB"), "inside the mask"),
-        (_number(held.ssim, "", digits=3), "SSIM"),
+        (_format_value(held.psnr, "dB"), _with_verdict("held-out PSNR, on white", held.verdict)),
+        (_format_value(held.psnr_mask, "dB"), "inside the mask"),
+        (_format_value(held.ssim, "", digits=3), "SSIM"),
         (f"{report.training.steps:,}", "steps"),
         (f"{report.training.rays_per_second / 1000.0:,.0f} k", "rays a second"),
         (f"{package.bytes / 1e6:.1f} MB" if package else "none", "package"),
@@ -133,11 +133,11 @@ def _tiles(report: Report) -> str:
     return f'<div class="tiles">{"".join(cells)}</div>'
 
 
-def _meaning(label: str, verdict: str | None) -> str:
+def _with_verdict(label: str, verdict: str | None) -> str:
     return f"{label}: {verdict}" if verdict else label
 
 
-def _number(value: float | None, unit: str, *, digits: int = 2) -> str:
+def _format_value(value: float | None, unit: str, *, digits: int = 2) -> str:
     return "n/a" if value is None else f"{value:.{digits}f} {unit}".strip()
 
 
@@ -153,14 +153,14 @@ def _curve(report: Report) -> str:
         f'<div class="card">{svg}<p class="legend">Mean PSNR of the held-out frames so far'
         '<i style="background:var(--whole)"></i>whole picture'
         '<i style="background:var(--masked)"></i>inside the mask. '
-        f"{_own_falls(report.curve)}</p></div>"
+        f"{_curve_caption(report.curve)}</p></div>"
     )
 
 
-def _own_falls(curve: Sequence[CurvePoint]) -> str:
+def _curve_caption(curve: Sequence[CurvePoint]) -> str:
     """How the frames themselves fared, where marks are means over different frames."""
     scored = [len(point.frames) for point in curve if point.frames]
-    falls = largest_falls(curve)
+    falls = largest_drops(curve)
     told = ""
     sets = {(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}
     if len(sets) > len({video for video, _ in sets}):
@@ -208,12 +208,12 @@ def _coverage(report: Report, body_map: str) -> str:
     if note is None:
         return ""
     rows = "".join(
-        f"<tr><td>{escape(part)}</td><td>{percent(shares['seen'])}</td><td>{_by_side(shares)}</td></tr>"
+        f"<tr><td>{escape(part)}</td><td>{format_percent(shares['seen'])}</td><td>{_by_side(shares)}</td></tr>"
         for part, shares in note.parts.items()
     )
     return (
         f'<div class="card"><p class="advice">{escape(note.advice)}</p>{body_map}'
-        f'<p class="legend">{percent(note.seen)} of the skin seen'
+        f'<p class="legend">{format_percent(note.seen)} of the skin seen'
         '<i style="background:var(--whole)"></i>well'
         '<i style="background:var(--whole);opacity:0.4"></i>at a slant'
         '<i style="background:var(--masked)"></i>never. Left and right are the person\'s.</p>'
@@ -222,22 +222,22 @@ def _coverage(report: Report, body_map: str) -> str:
 
 
 def _by_side(shares: Mapping[str, float]) -> str:
-    sides = (f"{side} {percent(share)}" for side, share in shares.items() if side != "seen")
+    sides = (f"{side} {format_percent(share)}" for side, share in shares.items() if side != "seen")
     return ", ".join(sides)
 
 
-def _pairs(pairs: Sequence[Pair]) -> str:
+def _pairs(pairs: Sequence[ComparisonPair]) -> str:
     figures = (
         f'<figure><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
         f'<img src="{pair.render}" alt="frame {pair.frame} rendered"></div>'
         f"<figcaption>frame {pair.frame}: video | avatar, "
-        f"{escape(decibels(pair.psnr, pair.verdict))}</figcaption></figure>"
+        f"{escape(format_psnr(pair.psnr, pair.verdict))}</figcaption></figure>"
         for pair in pairs
     )
     return f'<div class="pairs">{"".join(figures)}</div>' if pairs else ""
 
 
-def _novel(novel: str | None) -> str:
+def _animation(novel: str | None) -> str:
     if novel is None:
         return ""
     return (
@@ -258,7 +258,7 @@ def _warnings(report: Report, warnings: Sequence[str]) -> str:
     return f'<ul class="warnings">{items}</ul>' if items else ""
 
 
-def _figures(report: Report) -> str:
+def _all_values(report: Report) -> str:
     content = asdict(report)
     shown = ("frames", "training", "held_out", "stream", "package", "machine")
     tables = [f'<div class="card"><table>{_rows({key: content[key] for key in shown})}</table>']
@@ -271,16 +271,16 @@ def _figures(report: Report) -> str:
 def _rows(content: Mapping[str, Any]) -> str:
     return "".join(
         f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
-        for name, value in _flat(content)
+        for name, value in _flatten(content)
     )
 
 
-def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
     """Names with dots and what they hold, in words; lists of records are left out."""
     for key, value in content.items():
         name = f"{before}{key}".replace("_", " ")
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{before}{key}.")
+            yield from _flatten(value, f"{before}{key}.")
         elif isinstance(value, list | tuple):
             if not (value and isinstance(value[0], Mapping)):
                 yield name, ", ".join(str(item) for item in value) or "none"

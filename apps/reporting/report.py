@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from apps.reporting.curve import CurvePoint
-from avatar.advice import advice
+from avatar.advice import coverage_advice
 from avatar.coverage import Coverage
-from avatar.events import Score
-from avatar.sharpness import Verdict, better, typical_blur, typical_overlap, verdict_of
-from capture.reservoir import Reservoir
+from avatar.events import HeldOutScore
+from avatar.sharpness import SharpnessVerdict, better_verdict, median_blur, median_overlap, overall_verdict
+from capture.reservoir import ReservoirSample
 
-FORMAT = 1
+REPORT_FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class MachineNote:
+class MachineInfo:
     """What it ran on: device ("cpu", "cuda"), backend of the kernels, threads."""
 
     device: str
@@ -27,7 +27,7 @@ class MachineNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DroppedNote:
+class DroppedFrameEntry:
     """A frame that was left out, and why."""
 
     index: int
@@ -35,11 +35,11 @@ class DroppedNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FramesNote:
+class FrameStats:
     """What became of the frames.
 
     Attributes:
-        read: Frames that came out of the video.
+        read: EvaluationFrames that came out of the video.
         used: Trained on.
         held_out: Scored, and never trained on.
         dropped: Left out.
@@ -50,19 +50,19 @@ class FramesNote:
     read: int
     used: int
     held_out: int
-    dropped: tuple[DroppedNote, ...]
-    alike: int
+    dropped: tuple[DroppedFrameEntry, ...]
+    near_duplicates: int
     not_replayed: int
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingNote:
+class TrainingStats:
     """What training cost.
 
     Attributes:
         wall_seconds: From the first frame handed to the trainer to the last step.
         cpu_seconds: CPU time of the whole process in that time.
-        cpu_waited_seconds: For how long threads of this run were ready and had no core, because
+        cpu_contention_seconds: For how long threads of this run were ready and had no core, because
             other programs held them, summed; a resumed run counts only its own.
         startup_seconds: Before it: imports, reading and checking, kernels.
         steps, rays: How much was done.
@@ -73,7 +73,7 @@ class TrainingNote:
 
     wall_seconds: float
     cpu_seconds: float
-    cpu_waited_seconds: float
+    cpu_contention_seconds: float
     startup_seconds: float
     steps: int
     rays: int
@@ -83,7 +83,7 @@ class TrainingNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldOutNote:
+class HeldOutStats:
     """How well frames are rendered that were never trained on, on white.
 
     Attributes:
@@ -107,7 +107,7 @@ class HeldOutNote:
     psnr: float | None
     psnr_mask: float | None
     ssim: float | None
-    verdict: Verdict | None
+    verdict: SharpnessVerdict | None
     blur: float | None
     overlap: float | None
     lpips: float | None = None
@@ -115,61 +115,61 @@ class HeldOutNote:
     poses: str = "given"
 
     @classmethod
-    def of(cls, scores: tuple[Score, ...], size: tuple[int, int] | None) -> "HeldOutNote":
+    def of(cls, scores: tuple[HeldOutScore, ...], size: tuple[int, int] | None) -> "HeldOutStats":
         """From the scores of the single frames."""
         return cls(
             frames=tuple(score.frame for score in scores),
             size=size,
-            psnr=mean([score.psnr for score in scores]),
-            psnr_mask=mean([score.psnr_mask for score in scores]),
-            ssim=mean([score.ssim for score in scores]),
-            verdict=verdict_of(scores),
-            blur=typical_blur(score.blur for score in scores),
-            overlap=typical_overlap(score.overlap for score in scores),
+            psnr=finite_mean([score.psnr for score in scores]),
+            psnr_mask=finite_mean([score.psnr_mask for score in scores]),
+            ssim=finite_mean([score.ssim for score in scores]),
+            verdict=overall_verdict(scores),
+            blur=median_blur(score.blur for score in scores),
+            overlap=median_overlap(score.overlap for score in scores),
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spread:
+class Percentiles:
     """A spread of numbers: half of them are below p50, and 95 % below p95."""
 
     p50: float
     p95: float
 
     @classmethod
-    def of(cls, numbers: Reservoir, *, scale: float = 1.0) -> "Spread":
+    def of(cls, numbers: ReservoirSample, *, scale: float = 1.0) -> "Percentiles":
         """Of what a reservoir has seen, times `scale`."""
         p50, p95 = (scale * numbers.percentile(percent) for percent in (50.0, 95.0))
         return cls(p50=p50, p95=p95)
 
 
 @dataclass(frozen=True, kw_only=True)
-class StreamNote:
+class StreamStats:
     """How the video kept pace.
 
     Attributes:
         realtime: Whether frames came at times of their own: played so, or live.
         ingest_ms: From decoding to ready for training, per frame.
-        inbox_dropped: Frames of a live source that gave way, because nobody took them in time.
+        inbox_dropped: EvaluationFrames of a live source that gave way, because nobody took them in time.
         ready_after_last_frame_seconds: From the end of the video, had it been filmed from the
             first frame on, to the finished package; null without a package.
         latency_ms: From the moment when a frame was there (due, filmed, or decoded) until the
             trainer had it.
         lateness_ms: How long after that moment its preparation began.
-        inbox_depth: Frames that waited in the inbox.
+        inbox_depth: EvaluationFrames that waited in the inbox.
     """
 
     realtime: bool
-    ingest_ms: Spread
+    ingest_ms: Percentiles
     inbox_dropped: int
     ready_after_last_frame_seconds: float | None
-    latency_ms: Spread
-    lateness_ms: Spread
-    inbox_depth: Spread
+    latency_ms: Percentiles
+    lateness_ms: Percentiles
+    inbox_depth: Percentiles
 
 
 @dataclass(frozen=True, kw_only=True)
-class PackageNote:
+class PackageStats:
     """The package, beside the report, and how close its player is to the volume renderer."""
 
     path: str
@@ -179,7 +179,7 @@ class PackageNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageNote:
+class CoverageStats:
     """What of the person's skin the frames show that were trained on.
 
     Attributes:
@@ -196,14 +196,14 @@ class CoverageNote:
     parts: dict[str, dict[str, float]]
 
     @classmethod
-    def of(cls, coverage: Coverage) -> "CoverageNote":
+    def of(cls, coverage: Coverage) -> "CoverageStats":
         """As things stand."""
-        parts = {name: {"seen": part.seen, **part.sides} for name, part in coverage.parts().items()}
-        return cls(seen=coverage.seen, well=coverage.well, advice=advice(coverage), parts=parts)
+        parts = {name: {"seen": part.seen_share, **part.sides} for name, part in coverage.by_part().items()}
+        return cls(seen=coverage.seen_share, well=coverage.well_seen_share, advice=coverage_advice(coverage), parts=parts)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtendedNote:
+class ForgettingStats:
     """What became of earlier videos when this one was added.
 
     Attributes:
@@ -214,42 +214,42 @@ class ExtendedNote:
         frames: Their held-out frames that were scored, by their numbers in their own video.
         video_of_frame: Of which of `videos` each of those is, counted from 1.
         psnr_before, psnr_after: Means over them before this video, and at the end, dB.
-        largest_fall: Of any of them, dB; 0 if none fell.
+        largest_drop: Of any of them, dB; 0 if none fell.
     """
 
     videos: tuple[str, ...]
-    used: int
+    frames_trained: int
     wall_seconds: float
-    recalled: int
+    replayed_key_frames: int
     frames: tuple[int, ...]
     video_of_frame: tuple[int, ...]
     psnr_before: float | None
     psnr_after: float | None
-    largest_fall: float | None
+    largest_drop: float | None
 
     @classmethod
     def of(
         cls,
-        before: tuple[Score, ...],
-        after: tuple[Score, ...],
+        before: tuple[HeldOutScore, ...],
+        after: tuple[HeldOutScore, ...],
         *,
         videos: tuple[str, ...],
         video_of_frame: Sequence[int],
-        used: int,
+        frames_trained: int,
         wall_seconds: float,
-        recalled: int,
-    ) -> "ExtendedNote":
+        replayed_key_frames: int,
+    ) -> "ForgettingStats":
         """From the scores of the same frames before and after."""
         falls = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
         return cls(
             videos=videos,
-            used=used,
+            used=frames_trained,
             wall_seconds=wall_seconds,
-            recalled=recalled,
+            recalled=replayed_key_frames,
             frames=tuple(score.frame for score in before),
             video_of_frame=tuple(video_of_frame),
-            psnr_before=mean([score.psnr for score in before]),
-            psnr_after=mean([score.psnr for score in after]),
+            psnr_before=finite_mean([score.psnr for score in before]),
+            psnr_after=finite_mean([score.psnr for score in after]),
             largest_fall=max(0.0, *falls) if falls else None,
         )
 
@@ -260,41 +260,41 @@ class Report:
 
     command: dict[str, Any]
     recipe: dict[str, Any]
-    machine: MachineNote
-    frames: FramesNote
-    training: TrainingNote
-    held_out: HeldOutNote
+    machine: MachineInfo
+    frames: FrameStats
+    training: TrainingStats
+    held_out: HeldOutStats
     curve: tuple[CurvePoint, ...]
-    stream: StreamNote
-    package: PackageNote | None
-    held_out_refined: HeldOutNote | None = None
-    coverage: CoverageNote | None = None
-    extended: ExtendedNote | None = None
+    stream: StreamStats
+    package: PackageStats | None
+    held_out_refined: HeldOutStats | None = None
+    coverage: CoverageStats | None = None
+    earlier_videos: ForgettingStats | None = None
     cameras: dict[str, Any] | None = None
-    format: int = FORMAT
+    format: int = REPORT_FORMAT
 
     @property
-    def verdict(self) -> Verdict | None:
+    def verdict(self) -> SharpnessVerdict | None:
         """What the avatar is, in a word: in fitted poses where it looks better in them."""
         fitted = self.held_out_refined
-        return better(self.held_out.verdict, None if fitted is None else fitted.verdict)
+        return better_verdict(self.held_out.verdict, None if fitted is None else fitted.verdict)
 
     def to_json(self) -> str:
         """The text of report.json; what is not a number is null."""
-        content = _plain(dataclasses.asdict(self) | {"verdict": self.verdict})
+        content = _to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
         order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
         order += ("held_out", "held_out_refined", "curve", "stream", "package", "coverage")
-        order += ("extended", "cameras")
+        order += ("earlier_videos", "cameras")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 
-def so_far(verdict: str | None) -> str | None:
+def provisional_verdict(verdict: str | None) -> str | None:
     """The word for an avatar that is still learnt: nothing has failed then."""
     return "no person to be seen yet" if verdict == "failed" else verdict
 
 
-def decibels(
-    psnr: float | None, verdict: str | None, *, digits: int = 2, learning: bool = False
+def format_psnr(
+    psnr: float | None, verdict: str | None, *, digits: int = 2, provisional: bool = False
 ) -> str:
     """A PSNR as people read it, with what it means: "22.78 dB (blurred)".
 
@@ -306,29 +306,29 @@ def decibels(
     """
     if psnr is None:
         return "n/a"
-    word = so_far(verdict) if learning else verdict
+    word = provisional_verdict(verdict) if provisional else verdict
     return f"{psnr:.{digits}f} dB" + (f" ({word})" if word else "")
 
 
-def percent(share: float) -> str:
+def format_percent(share: float) -> str:
     """A share as people read it; only all of it is 100 %, and only nothing of it 0 %."""
     if 0.0 < share < 1.0:
         return f"{min(max(round(100.0 * share), 1), 99)} %"
     return f"{100.0 * share:.0f} %"
 
 
-def mean(values: list[float]) -> float | None:
+def finite_mean(values: list[float]) -> float | None:
     """The mean of the finite ones; None if there are none."""
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
-def _plain(value: Any) -> Any:
+def _to_json_value(value: Any) -> Any:
     """Numbers of a sensible length, and null for NaN and infinity."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_to_json_value(item) for item in value]
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value

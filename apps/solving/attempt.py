@@ -12,19 +12,19 @@ from dataclasses import replace
 from typing import final
 
 from apps.learning.run_folder import RunFolder
-from apps.recording.recording import Recording
+from apps.recording.recording import Capture
 from apps.solving.job import SolveJob
-from apps.solving.joining import joined, write_solved
-from apps.solving.solving import Solving
+from apps.solving.joining import apply_camera_solution, write_solved_capture
+from apps.solving.solving import SolverProcess
 from apps.terminal.console import Console
-from capture.errors import BadInput
+from capture.errors import InputError
 
-MOST_OFF = 0.02
+MAX_FOCAL_DIFFERENCE = 0.02
 """Of a stated focal length, before it is said that the pictures tell another one."""
 
 
 @final
-class Attempt:
+class CameraSolving:
     """The cameras of one run, sooner or later.
 
     Attributes:
@@ -32,34 +32,34 @@ class Attempt:
         refused: Why there are none, if a run has learnt without them.
     """
 
-    def __init__(self, solving: Solving, *, beside: bool) -> None:
+    def __init__(self, solving: SolverProcess, *, beside: bool) -> None:
         """Takes over a process that has begun."""
         self._solving, self.beside = solving, beside
         self.refused: str | None = None
         self._asked = False
 
-    def before(self, recording: Recording, console: Console) -> Recording:
+    def wait_before_training(self, recording: Capture, console: Console) -> Capture:
         """What the run learns from: the recording in its solved world, if it had to be waited for.
 
         Raises:
-            BadInput: If the cameras cannot be solved with certainty.
+            InputError: If the cameras cannot be solved with certainty.
         """
         if self.beside:
             return recording
         try:
             solved = self._solving.wait(console)
             assert solved is not None  # nobody can stop it here
-            found = joined(recording, solved)
+            found = apply_camera_solution(recording, solved)
         except KeyboardInterrupt as error:
             error.add_note("Stages of the cameras that were finished are kept: the same command "
                            "goes on from there.")  # fmt: skip
             raise
-        _say_new(recording, found, console)
+        _print_new_notes(recording, found, console)
         return found
 
-    def after(
-        self, recording: Recording, run: RunFolder, console: Console, stop: threading.Event
-    ) -> Recording:
+    def wait_after_training(
+        self, recording: Capture, run: RunFolder, console: Console, stop: threading.Event
+    ) -> Capture:
         """What the report is about, once the run has learnt beside the solving; it is written.
 
         Cameras that are refused now cost nobody the avatar.
@@ -73,16 +73,16 @@ class Attempt:
         try:
             solved = self._solving.wait(console, stop)
             if solved is None:
-                return replace(recording, solved={"verdict": "stopped"})
-            found = joined(recording, solved)
-        except BadInput as refusal:
+                return replace(recording, camera_report={"verdict": "stopped"})
+            found = apply_camera_solution(recording, solved)
+        except InputError as refusal:
             self.refused = str(refusal)
-            return replace(recording, solved={"verdict": "refused", "reason": str(refusal)})
-        _say_new(recording, found, console)
+            return replace(recording, camera_report={"verdict": "refused", "reason": str(refusal)})
+        _print_new_notes(recording, found, console)
         self._write(found, run, console)
         stated, true = recording.cameras[0].focal_px[0], found.cameras[0].focal_px[0]
-        if found.solved is not None and abs(true / stated - 1.0) > MOST_OFF:
-            console.warn(
+        if found.camera_report is not None and abs(true / stated - 1.0) > MAX_FOCAL_DIFFERENCE:
+            console.warning(
                 f"The poses state a focal length of {stated:.0f} px, the pictures one of "
                 f"{true:.0f} px; the avatar was learnt with the former. Leave K out of the poses, "
                 "and it is learnt with the latter."
@@ -90,7 +90,7 @@ class Attempt:
         return found
 
     @contextmanager
-    def kept(self, recording: Recording, run: RunFolder, console: Console) -> Iterator[None]:
+    def save_on_exit(self, recording: Capture, run: RunFolder, console: Console) -> Iterator[None]:
         """Writes the cameras that are solved already, and, if the block fails, those since then.
 
         Solving takes minutes: whatever becomes of the avatar, its result is not lost.
@@ -108,24 +108,24 @@ class Attempt:
             yield
         except BaseException:
             if self.beside and not self._asked:
-                with suppress(BadInput, OSError):  # what ended the block is what is said
+                with suppress(InputError, OSError):  # what ended the block is what is said
                     at_once = threading.Event()
                     at_once.set()
-                    self.after(recording, run, console, at_once)
+                    self.wait_after_training(recording, run, console, at_once)
             raise
 
-    def _write(self, recording: Recording, run: RunFolder, console: Console) -> None:
-        if recording.solved is None or recording.solved["verdict"] != "solved":
+    def _write(self, recording: Capture, run: RunFolder, console: Console) -> None:
+        if recording.camera_report is None or recording.camera_report["verdict"] != "solved":
             return
-        write_solved(recording, run)
-        console.made("cameras", run.cameras)
-        console.made("poses there", run.poses)
+        write_solved_capture(recording, run)
+        console.print_artifact("cameras", run.cameras)
+        console.print_artifact("poses there", run.poses)
 
 
 @contextmanager
-def attempted(
-    job: SolveJob | None, recording: Recording, run: RunFolder
-) -> Iterator[Attempt | None]:
+def start_camera_solving(
+    job: SolveJob | None, recording: Capture, run: RunFolder
+) -> Iterator[CameraSolving | None]:
     """Solving that begins now, if there is a job, and does not outlive the block.
 
     Args:
@@ -134,16 +134,16 @@ def attempted(
         run: Where stages are kept.
 
     Raises:
-        BadInput: If pycolmap is missing.
+        InputError: If pycolmap is missing.
     """
     if job is None:
         yield None
         return
     beside = recording.motion.intrinsic is not None and recording.segment is None
-    with Solving(job, run.path, gently=beside) as solving:
-        yield Attempt(solving, beside=beside)
+    with SolverProcess(job, run.path, gently=beside) as solving:
+        yield CameraSolving(solving, beside=beside)
 
 
-def _say_new(before: Recording, after: Recording, console: Console) -> None:
+def _print_new_notes(before: Capture, after: Capture, console: Console) -> None:
     for note in after.notes[len(before.notes) :]:
-        console.say(note)
+        console.info(note)

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apps.recording.wanted import RecordingPaths
+from apps.recording.wanted import CaptureInputs
 
-VERSION = 3
+METHOD_VERSION = 3
 """Of the method: other numbers would come out of the same pictures."""
 
 
@@ -22,7 +22,7 @@ class SolveJob:
         threads: Of features and matches; the result does not depend on it.
     """
 
-    paths: RecordingPaths
+    paths: CaptureInputs
     seed: int
     threads: int
 
@@ -32,14 +32,14 @@ class SolveJob:
 
     def key(self) -> str:
         """A hash of the options, and of the files' names, sizes and times."""
-        content = self.content()
+        content = self.as_json()
         content.pop("threads")
         files = [self.paths.video, self.paths.poses, self.paths.masks, self.paths.body]
-        state = [_state(path) for path in files if path is not None]
-        text = json.dumps([VERSION, content, state], sort_keys=True)
+        state = [_file_state(path) for path in files if path is not None]
+        text = json.dumps([METHOD_VERSION, content, state], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
-    def content(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """As JSON."""
         paths = asdict(self.paths)
         frames = self.paths.frames
@@ -58,7 +58,7 @@ class SolveJob:
         for name in ("video", "poses", "masks", "body"):
             if paths[name] is not None:
                 paths[name] = Path(paths[name])
-        return cls(paths=RecordingPaths(**paths), seed=content["seed"], threads=content["threads"])
+        return cls(paths=CaptureInputs(**paths), seed=content["seed"], threads=content["threads"])
 
     def absolute(self) -> "SolveJob":
         """The same for a process that runs in another folder."""
@@ -78,7 +78,7 @@ class SolveJob:
         )
 
 
-def _state(path: Path) -> list[Any]:
+def _file_state(path: Path) -> list[Any]:
     """By which a changed file or folder is known."""
     if not path.exists():
         return [str(path)]

@@ -13,24 +13,24 @@ from pathlib import Path
 from typing import final
 
 from apps.solving.job import SolveJob
-from apps.solving.worker import KEPT, REFUSED, RESULT
+from apps.solving.worker import KEPT_FILES, EXIT_REFUSED, SOLUTION_FILE
 from apps.terminal.console import Console
-from capture.errors import BadInput
-from preprocess.solve.mapping import check_installed
-from preprocess.solve.solved import Solved
-from preprocess.solve.stages import NOTES
+from capture.errors import InputError
+from preprocess.solve.mapping import require_pycolmap
+from preprocess.solve.solved import CameraSolution
+from preprocess.solve.stages import STAGES_FILE
 
-SHARES = {
+STAGE_TIME_FRACTIONS = {
     "key frames": 0.05, "features": 0.4, "matches": 0.1, "global mapping": 0.25,
     "incremental mapping": 0.15, "frames between": 0.05,
 }  # fmt: skip
 """Of the whole time, as a rule."""
-END_WITHIN_S = 5.0
-LOOK_EVERY_S = 0.2
+TERMINATE_TIMEOUT_S = 5.0
+POLL_INTERVAL_S = 0.2
 
 
 @final
-class Solving:
+class SolverProcess:
     """A solution in the making, or one that was made before."""
 
     def __init__(self, job: SolveJob, run: Path, *, gently: bool = False) -> None:
@@ -42,18 +42,18 @@ class Solving:
             gently: Whether somebody else needs the machine more.
 
         Raises:
-            BadInput: If pycolmap is missing.
+            InputError: If pycolmap is missing.
         """
         job = job.absolute()
         self.folder = job.folder(run)
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.Queue[str | None] = queue.Queue()
-        if (self.folder / RESULT).exists():
+        if (self.folder / SOLUTION_FILE).exists():
             return
-        check_installed()
+        require_pycolmap()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "refused.txt").unlink(missing_ok=True)
-        (self.folder / "job.json").write_text(json.dumps(job.content()), encoding="utf-8")
+        (self.folder / "job.json").write_text_atomically(json.dumps(job.as_json()), encoding="utf-8")
         threads = str(job.threads)
         environment = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
         nice = ["nice", "-n", "10"] if gently and shutil.which("nice") else []
@@ -70,7 +70,7 @@ class Solving:
         """Whether it still works."""
         return self._process is not None and self._process.poll() is None
 
-    def wait(self, console: Console, stop: threading.Event | None = None) -> Solved | None:
+    def wait(self, console: Console, stop: threading.Event | None = None) -> CameraSolution | None:
         """The solution, with a bar until it is there; None if it was stopped before.
 
         Args:
@@ -79,22 +79,22 @@ class Solving:
                 the same, and stages that are finished stay.
 
         Raises:
-            BadInput: If the cameras cannot be solved with certainty.
+            InputError: If the cameras cannot be solved with certainty.
         """
         if self._process is not None:
-            began, done = time.perf_counter(), dict.fromkeys(SHARES, 0.0)
-            with console.bar("solving cameras", 1.0) as bar:
+            began, done = time.perf_counter(), dict.fromkeys(STAGE_TIME_FRACTIONS, 0.0)
+            with console.progress("solving cameras", 1.0) as bar:
                 while (line := self._next_line(stop)) is not None:
                     if not line:
                         self.stop()
                         return None
                     told = json.loads(line)
-                    _count(done, told["stage"], told["share"])
-                    share = sum(SHARES[name] * part for name, part in done.items())
-                    bar.move(share, _note(told["stage"], share, time.perf_counter() - began))
+                    _advance_stages(done, told["stage"], told["share"])
+                    share = sum(STAGE_TIME_FRACTIONS[name] * part for name, part in done.items())
+                    bar.update(share, _progress_note(told["stage"], share, time.perf_counter() - began))
             self._check(self._process.wait())
             self._tidy()
-        return Solved.load(self.folder)
+        return CameraSolution.load(self.folder)
 
     def _next_line(self, stop: threading.Event | None) -> str | None:
         """What the process says; None at its end, and nothing if it is to be stopped."""
@@ -102,7 +102,7 @@ class Solving:
             if stop is not None and stop.is_set() and self.running:
                 return ""
             try:
-                return self._lines.get(timeout=LOOK_EVERY_S)
+                return self._lines.get(timeout=POLL_INTERVAL_S)
             except queue.Empty:
                 continue
 
@@ -114,7 +114,7 @@ class Solving:
         if process.poll() is None:
             process.terminate()
             try:
-                process.wait(END_WITHIN_S)
+                process.wait(TERMINATE_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -123,7 +123,7 @@ class Solving:
                 with suppress(OSError):
                     pipe.close()
 
-    def __enter__(self) -> "Solving":
+    def __enter__(self) -> "SolverProcess":
         """Stopped at the end of the block, however it ends."""
         return self
 
@@ -144,10 +144,10 @@ class Solving:
         if code == 0:
             return
         refused = self.folder / "refused.txt"
-        if code == REFUSED and refused.exists():
-            raise BadInput(refused.read_text(encoding="utf-8"))
+        if code == EXIT_REFUSED and refused.exists():
+            raise InputError(refused.read_text(encoding="utf-8"))
         said = (self.folder / "log.txt").read_text(encoding="utf-8").strip().splitlines()
-        raise BadInput(
+        raise InputError(
             f"The solving of cameras ended with {code}{': ' + said[-1] if said else ''}. Its log: "
             f"{self.folder / 'log.txt'}. What was finished is kept: try again, or give --cameras "
             "FILE (docs/formats.md)."
@@ -155,16 +155,16 @@ class Solving:
 
     def _tidy(self) -> None:
         """Removes the results of stages, which only the way there needed."""
-        notes = self.folder / NOTES
+        notes = self.folder / STAGES_FILE
         stages = json.loads(notes.read_text(encoding="utf-8")) if notes.exists() else {}
         for path in (self.folder / name for name in stages):
-            if path.name not in KEPT:
+            if path.name not in KEPT_FILES:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _count(done: dict[str, float], stage: str, share: float) -> None:
+def _advance_stages(done: dict[str, float], stage: str, share: float) -> None:
     """What is done of each stage; a later one says that those before are done, too."""
-    names = list(SHARES)
+    names = list(STAGE_TIME_FRACTIONS)
     name = next((n for n in names if stage.startswith(n)), None)
     if name is None:
         return
@@ -173,6 +173,6 @@ def _count(done: dict[str, float], stage: str, share: float) -> None:
     done[name] = max(done[name], share)
 
 
-def _note(stage: str, share: float, seconds: float) -> str:
+def _progress_note(stage: str, share: float, seconds: float) -> str:
     left = "" if share < 0.08 else f" · about {seconds * (1.0 - share) / share:.0f} s left"
     return f"{stage.rstrip(' 0123456789')} · {100.0 * share:.0f} %{left}"

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from apps.studio.cut import SHOE
-from apps.studio.light import bake
+from apps.studio.light import bake_light
 from apps.studio.outfit import OUTFITS, Outfit
-from apps.studio.raster import rasterise
-from apps.studio.shade import over, shade
-from apps.studio.wardrobe import dressed, places32, vertex_normals
+from apps.studio.raster import rasterize
+from apps.studio.shade import composite_over, shade_pixels
+from apps.studio.wardrobe import build_layers, all_template_points, vertex_normals
 from capture.camera import Camera
 from preprocess.body import ShapedBody
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 from preprocess.pose import BodyPose
 
 A_POSE = np.zeros(69)
@@ -42,55 +42,55 @@ class Actor:
     betas: Float[np.ndarray, "10"]
     shaped: ShapedBody
     outfit: Outfit
-    rest: Float[np.ndarray, "vertices 3"]
-    place: Float32[np.ndarray, "vertices 3"]
-    source: Int32[np.ndarray, "vertices"]
+    rest_vertices: Float[np.ndarray, "vertices 3"]
+    template_points: Float32[np.ndarray, "vertices 3"]
+    body_vertices: Int32[np.ndarray, "vertices"]
     faces: Int32[np.ndarray, "faces 3"]
-    kinds: Int32[np.ndarray, "faces"]
-    light: Float32[np.ndarray, "vertices 3"]
+    materials: Int32[np.ndarray, "faces"]
+    baked_light: Float32[np.ndarray, "vertices 3"]
     palette: Float32[np.ndarray, "colours 3"]
 
     @classmethod
     def of(cls, subject: int = 1, seed: int = 0) -> "Actor":
-        """Subject 1 or 2; the seed varies shape and colours a little (0: as designed)."""
-        body, outfit = load_body(), OUTFITS[subject]
+        """DatasetSubject 1 or 2; the seed varies shape and colours a little (0: as designed)."""
+        body, outfit = load_body_model(), OUTFITS[subject]
         generator = np.random.default_rng([seed, subject])
         spread = 0.0 if seed == 0 else 1.0
         betas = np.zeros(10)
         betas[:4] = np.array(outfit.betas) + 0.15 * spread * generator.standard_normal(4)
         tint = 1.0 + 0.05 * spread * generator.standard_normal((len(outfit.palette), 3))
-        layers = dressed(body, outfit)
-        starts = np.cumsum([0] + [len(layer.rest) for layer in layers])
-        source = np.concatenate([layer.source for layer in layers])
+        layers = build_layers(body, outfit)
+        starts = np.cumsum([0] + [len(layer.rest_vertices) for layer in layers])
+        source = np.concatenate([layer.body_vertices for layer in layers])
         shape = body.shape_directions[source] @ betas
-        rest = np.concatenate([layer.rest for layer in layers]) + shape
+        rest = np.concatenate([layer.rest_vertices for layer in layers]) + shape
         faces = np.concatenate(
             [layer.faces + start for layer, start in zip(layers, starts, strict=False)]
         )
-        kinds = np.concatenate([np.full(len(layer.faces), layer.kind) for layer in layers])
+        kinds = np.concatenate([np.full(len(layer.faces), layer.material) for layer in layers])
         undone = cls(
             betas=betas,
             shaped=body.with_shape(betas),
             outfit=outfit,
             rest=rest,
-            place=places32(layers),
+            place=all_template_points(layers),
             source=source,
             faces=faces.astype(np.int32),
             kinds=kinds.astype(np.int32),
             light=np.ones((len(rest), 3), dtype=np.float32),
             palette=np.clip(np.array(outfit.palette) * tint, 0.0, 1.0).astype(np.float32),
         )
-        return undone._lit()
+        return undone._with_baked_light()
 
     @cached_property
     def _weights(self) -> Float[np.ndarray, "vertices 24"]:
         """Skinning weights of all layers: those of the body vertices they hang from."""
-        return self.shaped.body.weights[self.source].astype(np.float64)
+        return self.shaped.body.weights[self.body_vertices].astype(np.float64)
 
     @cached_property
-    def soles(self) -> Int[np.ndarray, "chosen"]:
+    def sole_vertices(self) -> Int[np.ndarray, "chosen"]:
         """The vertices of the shoes."""
-        return np.unique(self.faces[self.kinds == SHOE])
+        return np.unique(self.faces[self.materials == SHOE])
 
     def vertices(
         self, pose: BodyPose, chosen: Int[np.ndarray, "chosen"] | slice = slice(None)
@@ -99,48 +99,48 @@ class Actor:
         weights = self._weights[chosen]
         transforms = self.shaped.with_pose(pose).world_from_rest()[:, :3, :].reshape(24, 12)
         blended = (weights @ transforms).reshape(-1, 3, 4)
-        return np.einsum("vab,vb->va", blended[..., :3], self.rest[chosen]) + blended[..., 3]
+        return np.einsum("vab,vb->va", blended[..., :3], self.rest_vertices[chosen]) + blended[..., 3]
 
-    def lowest(self, pose: BodyPose) -> float:
+    def sole_height_m(self, pose: BodyPose) -> float:
         """Height of the lowest shoe in a pose, metres: where the floor is."""
-        return float(self.vertices(pose, self.soles)[:, 1].min())
+        return float(self.vertices(pose, self.sole_vertices)[:, 1].min())
 
-    def layers_of(
-        self, pose: BodyPose, camera: Camera, fine: int = 4
+    def render_rgb_alpha(
+        self, pose: BodyPose, camera: Camera, supersampling: int = 4
     ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-        """Colour of the covered part of each pixel, and how much of it is covered, in [0, 1]."""
-        cut = self.outfit.cut
-        seen = rasterise(
+        """SrgbColor of the covered part of each pixel, and how much of it is covered, in [0, 1]."""
+        cut = self.outfit.measures
+        seen = rasterize(
             self.vertices(pose),
             self.faces,
             camera,
-            fine=fine,
-            texture=self.place,
-            kinds=self.kinds,
-            cut=cut,
+            supersampling=supersampling,
+            template_points=self.template_points,
+            materials=self.materials,
+            measures=cut,
         )
-        return shade(
+        return shade_pixels(
             seen,
             faces=self.faces,
-            kinds=self.kinds,
-            place=self.place,
-            light=self.light,
+            materials=self.materials,
+            template_points=self.template_points,
+            light=self.baked_light,
             palette=self.palette,
-            cut=cut,
+            measures=cut,
             checked=self.outfit.checked,
         )
 
-    def picture(
+    def render_over(
         self,
         pose: BodyPose,
         camera: Camera,
         background: UInt8[np.ndarray, "height width 3"] | None = None,
     ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
         """The person in front of a background (white if None), and the soft mask."""
-        rgb, alpha = self.layers_of(pose, camera)
-        return over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
+        rgb, alpha = self.render_rgb_alpha(pose, camera)
+        return composite_over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
 
-    def _lit(self) -> "Actor":
+    def _with_baked_light(self) -> "Actor":
         """The same actor with the light of the A-pose painted on."""
         pose = BodyPose(
             root_rotation=np.zeros(3),
@@ -148,12 +148,12 @@ class Actor:
             joint_rotations=A_POSE.reshape(23, 3),
         )
         points = self.vertices(pose)
-        light = bake(
+        light = bake_light(
             points,
             vertex_normals(points, self.faces),
             self.faces,
-            place=self.place,
-            kinds=self.kinds,
-            cut=self.outfit.cut,
+            template_points=self.template_points,
+            materials=self.materials,
+            measures=self.outfit.measures,
         )
-        return replace(self, light=light)
+        return replace(self, baked_light=light)

@@ -10,18 +10,18 @@ from capture.camera import Camera
 
 Backdrop = Literal["plain", "clutter"]
 
-FINE = 3
+SUPERSAMPLING = 3
 """The backdrop is painted this many times larger, and reduced."""
 
 
-def paint(
+def paint_backdrop(
     kind: Backdrop, camera: Camera, generator: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The empty studio, as the camera sees it: wall and floor, cluttered or plain."""
     width, height = camera.size_px
     floor = _floor_row(camera)
-    large = np.zeros((height * FINE, width * FINE, 3), dtype=np.uint8)
-    horizon = int(np.clip(floor * FINE, 0, height * FINE))
+    large = np.zeros((height * SUPERSAMPLING, width * SUPERSAMPLING, 3), dtype=np.uint8)
+    horizon = int(np.clip(floor * SUPERSAMPLING, 0, height * SUPERSAMPLING))
     large[:horizon] = (214, 207, 196) if kind == "plain" else (176, 187, 178)
     large[horizon:] = (188, 178, 164) if kind == "plain" else (150, 116, 84)
     if kind == "clutter":
@@ -33,7 +33,7 @@ def paint(
     return np.clip(small + grain, 0.0, 255.0).astype(np.uint8)
 
 
-def shadowed(
+def add_foot_shadows(
     background: UInt8[np.ndarray, "height width 3"],
     feet_world: Float[np.ndarray, "feet 3"],
     camera: Camera,

@@ -2,14 +2,14 @@
 
 from apps.studio.gesture import Arm, Gesture, Leg
 
-STEP = Leg(out=13.0, forward=9.0, knee=16.0)
-LIFTED = Leg(out=6.0, forward=38.0, knee=62.0, heel=12.0)
+SMALL_STEP = Leg(out=13.0, forward=9.0, knee=16.0)
+RAISED_LEG = Leg(out=6.0, forward=38.0, knee=62.0, heel=12.0)
 TIPTOE = Leg(out=7.0, forward=14.0, knee=38.0, heel=26.0)
 
 GROOVE = Gesture(
     left=Arm(lift=-52, forward=30, twist=10, elbow=75),
     right=Arm(lift=-40, forward=-18, elbow=50),
-    left_leg=STEP,
+    left_leg=SMALL_STEP,
     right_leg=TIPTOE,
     lean=6,
     turn=14,
@@ -19,8 +19,8 @@ GROOVE = Gesture(
 WAVE = Gesture(
     left=Arm(lift=14, forward=12, twist=62, elbow=66),
     right=Arm(lift=-30, forward=10, elbow=20),
-    left_leg=STEP,
-    right_leg=STEP,
+    left_leg=SMALL_STEP,
+    right_leg=SMALL_STEP,
     lean=-8,
     tilt=-8,
     shift=(-0.06, 0.0),
@@ -29,7 +29,7 @@ CROSS = Gesture(
     left=Arm(lift=-22, forward=62, elbow=88),
     right=Arm(lift=-14, forward=62, elbow=80),
     left_leg=TIPTOE,
-    right_leg=STEP,
+    right_leg=SMALL_STEP,
     bow=8,
     nod=8,
 )
@@ -43,7 +43,7 @@ OPEN = Gesture(
 POINT = Gesture(
     left=Arm(lift=38, forward=10, elbow=6),
     right=Arm(lift=-46, forward=12, twist=-40, elbow=80),
-    left_leg=STEP,
+    left_leg=SMALL_STEP,
     right_leg=Leg(out=18, forward=4, knee=8),
     lean=-9,
     turn=10,
@@ -53,7 +53,7 @@ POINT = Gesture(
 KICK = Gesture(
     left=Arm(lift=-18, forward=40, elbow=50),
     right=Arm(lift=-10, forward=-20, elbow=40),
-    left_leg=LIFTED,
+    left_leg=RAISED_LEG,
     right_leg=Leg(out=4, forward=8, knee=14),
     bow=-3,
     turn=-10,
@@ -61,8 +61,8 @@ KICK = Gesture(
 ROBOT = Gesture(
     left=Arm(lift=-4, forward=10, twist=85, elbow=88),
     right=Arm(lift=-4, forward=10, twist=-75, elbow=88),
-    left_leg=STEP,
-    right_leg=STEP,
+    left_leg=SMALL_STEP,
+    right_leg=SMALL_STEP,
     look=-18,
 )
 SHUFFLE = Gesture(
@@ -73,17 +73,17 @@ SHUFFLE = Gesture(
     turn=-12,
 )
 
-CLIP = (
-    GROOVE, GROOVE.mirrored(), WAVE, WAVE.mirrored(), OPEN, CROSS, SHUFFLE, SHUFFLE.mirrored(),
-    POINT, POINT.mirrored(), KICK, KICK.mirrored(), ROBOT, ROBOT.mirrored(), OPEN, GROOVE,
+UNFILMED_DANCE = (
+    GROOVE, GROOVE.mirror(), WAVE, WAVE.mirror(), OPEN, CROSS, SHUFFLE, SHUFFLE.mirror(),
+    POINT, POINT.mirror(), KICK, KICK.mirror(), ROBOT, ROBOT.mirror(), OPEN, GROOVE,
 )  # fmt: skip
 FILMED_DANCE = (
-    GROOVE.mirrored(), OPEN, KICK, WAVE, SHUFFLE.mirrored(), POINT.mirrored(), CROSS, ROBOT,
-    GROOVE, KICK.mirrored(),
+    GROOVE.mirror(), OPEN, KICK, WAVE, SHUFFLE.mirror(), POINT.mirror(), CROSS, ROBOT,
+    GROOVE, KICK.mirror(),
 )  # fmt: skip
 
-NOVEL = (
-    Gesture(left=Arm(lift=38, elbow=10), right=Arm(lift=38, elbow=10), nod=-10, left_leg=STEP),
+NOVEL_POSES = (
+    Gesture(left=Arm(lift=38, elbow=10), right=Arm(lift=38, elbow=10), nod=-10, left_leg=SMALL_STEP),
     Gesture(
         left=Arm(lift=-74, forward=6, elbow=4),
         right=Arm(lift=-74, forward=6, elbow=4),
@@ -117,14 +117,14 @@ NOVEL = (
         left=Arm(lift=44, forward=20, twist=60, elbow=100),
         right=Arm(lift=-40, forward=30, elbow=60),
         left_leg=TIPTOE,
-        right_leg=STEP,
+        right_leg=SMALL_STEP,
         turn=18,
         yaw=-20,
     ),
     Gesture(
         left=Arm(lift=0, elbow=4),
         right=Arm(lift=0, elbow=4),
-        left_leg=LIFTED,
+        left_leg=RAISED_LEG,
         right_leg=Leg(out=3, forward=3, knee=6),
         look=-20,
         yaw=15,
@@ -132,7 +132,7 @@ NOVEL = (
     Gesture(
         left=Arm(lift=-30, forward=75, elbow=110),
         right=Arm(lift=-40, forward=55, elbow=30),
-        left_leg=STEP,
+        left_leg=SMALL_STEP,
         right_leg=TIPTOE,
         bow=14,
         nod=14,
@@ -167,7 +167,7 @@ NOVEL = (
         left=Arm(lift=-8, forward=-20, elbow=12),
         right=Arm(lift=45, forward=14, elbow=14),
         left_leg=Leg(out=19, forward=6, knee=10),
-        right_leg=STEP,
+        right_leg=SMALL_STEP,
         lean=14,
         tilt=10,
         yaw=-30,

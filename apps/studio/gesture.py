@@ -84,7 +84,7 @@ class Gesture:
     shift: tuple[float, float] = (0.0, 0.0)
     hop: float = 0.0
 
-    def mirrored(self) -> "Gesture":
+    def mirror(self) -> "Gesture":
         """The same with left and right exchanged."""
         return replace(
             self,
@@ -100,7 +100,7 @@ class Gesture:
             shift=(-self.shift[0], self.shift[1]),
         )
 
-    def rotations(self) -> Rotation:
+    def joint_rotations(self) -> Rotation:
         """Local rotations of joints 1 … 23."""
         vectors = np.zeros((23, 3))
         for side, sign in ((0, 1.0), (1, -1.0)):

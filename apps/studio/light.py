@@ -7,7 +7,7 @@ nor view. Visibility comes from the z-buffer, seen from each direction far away.
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from apps.studio.raster import rasterise
+from apps.studio.raster import rasterize
 from capture.camera import Camera
 
 LAMP_FROM = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
@@ -15,30 +15,30 @@ LAMP_RGB = np.array([1.00, 0.96, 0.88])
 SKY_RGB = np.array([0.92, 0.97, 1.00])
 FLOOR_RGB = np.array([0.62, 0.56, 0.50])
 
-BIAS_M = 0.02
+SHADOW_BIAS_M = 0.02
 """A surface does not shade itself nearer than this."""
 
 
-def bake(
+def bake_light(
     points: Float[np.ndarray, "vertices 3"],
     normals: Float[np.ndarray, "vertices 3"],
     faces: Int32[np.ndarray, "faces 3"],
     *,
-    place: Float32[np.ndarray, "vertices 3"],
-    kinds: Int32[np.ndarray, "faces"],
-    cut: Float32[np.ndarray, "cuts"],
+    template_points: Float32[np.ndarray, "vertices 3"],
+    materials: Int32[np.ndarray, "faces"],
+    measures: Float32[np.ndarray, "cuts"],
     directions: int = 32,
 ) -> Float32[np.ndarray, "vertices 3"]:
     """Light on each vertex as a factor of its colour, about 0.45 in folds to 1.15 in the lamp."""
     sky = np.zeros((len(points), 3))
     lamp = np.zeros(len(points))
     weight = lamp_weight = 0.0
-    for toward in _sphere(directions):
-        camera = _far_camera(points, toward)
-        depth_seen = rasterise(
-            points, faces, camera, fine=1, texture=place, kinds=kinds, cut=cut
+    for toward in _fibonacci_directions(directions):
+        camera = _directional_camera(points, toward)
+        depth_seen = rasterize(
+            points, faces, camera, supersampling=1, template_points=template_points, materials=materials, measures=measures
         ).depth
-        free = _free(points, camera, depth_seen)
+        free = _visibility(points, camera, depth_seen)
         facing = np.maximum(normals @ toward, 0.0) * free
         up = 0.5 + 0.5 * toward[1]
         sky += facing[:, None] * (up * SKY_RGB + (1.0 - up) * FLOOR_RGB)
@@ -50,7 +50,7 @@ def bake(
     return light.astype(np.float32)
 
 
-def _sphere(count: int) -> Float[np.ndarray, "directions 3"]:
+def _fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:
     """Directions spread evenly over the sphere (Fibonacci's lattice)."""
     height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
@@ -58,7 +58,7 @@ def _sphere(count: int) -> Float[np.ndarray, "directions 3"]:
     return np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
 
 
-def _far_camera(points: Float[np.ndarray, "vertices 3"], toward: Float[np.ndarray, "3"]) -> Camera:
+def _directional_camera(points: Float[np.ndarray, "vertices 3"], toward: Float[np.ndarray, "3"]) -> Camera:
     """A camera 40 m away in the direction `toward` that sees all points in 256 pixels."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     reach = float(np.linalg.norm(points - middle, axis=1).max())
@@ -77,7 +77,7 @@ def _far_camera(points: Float[np.ndarray, "vertices 3"], toward: Float[np.ndarra
     )
 
 
-def _free(
+def _visibility(
     points: Float[np.ndarray, "vertices 3"],
     camera: Camera,
     depth_seen: Float32[np.ndarray, "height width"],
@@ -90,5 +90,5 @@ def _free(
     for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
         column = np.clip((pixel[:, 0] + dx).astype(int), 0, 255)
         row = np.clip((pixel[:, 1] + dy).astype(int), 0, 255)
-        free += 0.25 * np.clip(1.5 - (depth - depth_seen[row, column]) / BIAS_M, 0.0, 1.0)
+        free += 0.25 * np.clip(1.5 - (depth - depth_seen[row, column]) / SHADOW_BIAS_M, 0.0, 1.0)
     return free

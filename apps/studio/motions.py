@@ -8,18 +8,18 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from apps.studio.actor import Actor
-from apps.studio.choreography import CLIP, FILMED_DANCE, KICK, NOVEL
+from apps.studio.choreography import UNFILMED_DANCE, FILMED_DANCE, KICK, NOVEL_POSES
 from apps.studio.gesture import Arm, Gesture, Leg
 from preprocess.pose import BodyPose, Motion
 
 
-def turn(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+def turning_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
     """Turning round on the spot, arms off the body, swaying a little (PeopleSnapshot's way)."""
     phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, 8)
-    return _acted(actor, [_turning(i / frames, turns, phases) for i in range(frames)], fps)
+    return _motion_from_gestures(actor, [_turning_gesture(i / frames, turns, phases) for i in range(frames)], fps)
 
 
-def _turning(share: float, turns: float, phases: Float[np.ndarray, "8"]) -> Gesture:
+def _turning_gesture(share: float, turns: float, phases: Float[np.ndarray, "8"]) -> Gesture:
     """The turn after `share` of its length."""
     wave = np.sin(2.0 * np.pi * share * np.array([3, 2, 5, 3, 4, 2, 3, 5]) + phases)
     knee = 7.0 + 6.0 * wave[4]
@@ -37,13 +37,13 @@ def _turning(share: float, turns: float, phases: Float[np.ndarray, "8"]) -> Gest
     )
 
 
-def in_place(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+def gesturing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
     """Gestures on the spot while somebody walks around: arms, knees, a slow turn, small shifts."""
     phases = np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * np.pi, 12)
-    return _acted(actor, [_gesturing(i / frames, turns, phases) for i in range(frames)], fps)
+    return _motion_from_gestures(actor, [_waving_gesture(i / frames, turns, phases) for i in range(frames)], fps)
 
 
-def _gesturing(share: float, turns: float, phases: Float[np.ndarray, "12"]) -> Gesture:
+def _waving_gesture(share: float, turns: float, phases: Float[np.ndarray, "12"]) -> Gesture:
     """The gestures after `share` of their length."""
     wave = np.sin(2.0 * np.pi * share * np.array([3, 2, 4, 3, 2, 4, 3, 2, 3, 4, 1, 1]) + phases)
     knees = 9.0 + 8.0 * wave[8], 9.0 + 8.0 * wave[9]
@@ -69,28 +69,28 @@ def _gesturing(share: float, turns: float, phases: Float[np.ndarray, "12"]) -> G
     )
 
 
-def dance(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+def dancing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
     """A dance that turns round while it goes, for filming."""
     keys = list(FILMED_DANCE)
     np.random.default_rng([seed, 2]).shuffle(keys)
-    return _acted(actor, _danced(keys, frames, turns), fps)
+    return _motion_from_gestures(actor, _interpolate_gestures(keys, frames, turns), fps)
 
 
-def clip(actor: Actor, *, frames: int = 150, fps: float = 30.0) -> Motion:
+def unfilmed_dance(actor: Actor, *, frames: int = 150, fps: float = 30.0) -> Motion:
     """The driving motion: a dance with one turn that no camera has seen."""
-    keys = [replace(key, hop=0.03 if key is KICK else 0.0) for key in CLIP]
-    return _acted(actor, _danced(keys, frames, 1.0), fps)
+    keys = [replace(key, hop=0.03 if key is KICK else 0.0) for key in UNFILMED_DANCE]
+    return _motion_from_gestures(actor, _interpolate_gestures(keys, frames, 1.0), fps)
 
 
-def novel(actor: Actor, *, fps: float = 30.0) -> Motion:
+def novel_poses(actor: Actor, *, fps: float = 30.0) -> Motion:
     """Twelve poses that neither film holds: arms up and down, bent knees, steps, from all sides."""
-    return _acted(actor, list(NOVEL), fps)
+    return _motion_from_gestures(actor, list(NOVEL_POSES), fps)
 
 
-def _danced(keys: list[Gesture], frames: int, turns: float) -> list[tuple[Gesture, Rotation]]:
+def _interpolate_gestures(keys: list[Gesture], frames: int, turns: float) -> list[tuple[Gesture, Rotation]]:
     """Gestures on the way through the keys, smooth to the second derivative, with rotations."""
     at = np.linspace(0.0, frames - 1.0 if frames > 1 else 1.0, len(keys))
-    stacked = np.stack([key.rotations().as_rotvec() for key in keys])
+    stacked = np.stack([key.joint_rotations().as_rotvec() for key in keys])
     times = np.arange(frames, dtype=np.float64)
     joints = [RotationSpline(at, Rotation.from_rotvec(stacked[:, j]))(times) for j in range(23)]
     vectors = np.stack([joint.as_rotvec() for joint in joints], axis=1)
@@ -106,11 +106,11 @@ def _danced(keys: list[Gesture], frames: int, turns: float) -> list[tuple[Gestur
     ]
 
 
-def _acted(
+def _motion_from_gestures(
     actor: Actor, gestures: list[Gesture] | list[tuple[Gesture, Rotation]], fps: float
 ) -> Motion:
     """Gestures as poses of the actor, the lowest point of each on the floor (y = 0)."""
-    poses = [_posed(actor, *(g if isinstance(g, tuple) else (g, g.rotations()))) for g in gestures]
+    poses = [_pose_on_floor(actor, *(g if isinstance(g, tuple) else (g, g.joint_rotations()))) for g in gestures]
     count = len(poses)
     return Motion(
         root_rotations=np.stack([pose.root_rotation for pose in poses]),
@@ -118,24 +118,24 @@ def _acted(
         joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
         valid=np.ones(count, dtype=bool),
         betas=actor.betas,
-        model="body24",
+        body_model="body24",
         frames=np.arange(count),
         times_s=np.arange(count) / fps,
     )
 
 
-def _posed(actor: Actor, gesture: Gesture, rotations: Rotation) -> BodyPose:
+def _pose_on_floor(actor: Actor, gesture: Gesture, rotations: Rotation) -> BodyPose:
     pelvis = actor.shaped.joints[0]
     pose = BodyPose(
         root_rotation=np.array([0.0, np.deg2rad(gesture.yaw), 0.0]),
         root_translation=np.array([gesture.shift[0], 0.0, gesture.shift[1]]) - pelvis,
         joint_rotations=rotations.as_rotvec(),
     )
-    lifted = np.array([0.0, gesture.hop - actor.lowest(pose), 0.0])
+    lifted = np.array([0.0, gesture.hop - actor.sole_height_m(pose), 0.0])
     return replace(pose, root_translation=pose.root_translation + lifted)
 
 
-def held_apart(novel: Motion, filmed: Motion) -> Float[np.ndarray, "poses"]:
+def nearest_pose_angles(novel: Motion, filmed: Motion) -> Float[np.ndarray, "poses"]:
     """How far each pose is from the nearest filmed one: the largest joint angle, radians."""
     gaps = []
     for pose in novel.joint_rotations:

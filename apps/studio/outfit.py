@@ -39,7 +39,7 @@ class Outfit:
     palette: tuple[tuple[float, float, float], ...]
 
     @property
-    def cut(self) -> Float32[np.ndarray, "cuts"]:
+    def measures(self) -> Float32[np.ndarray, "cuts"]:
         """The measures in the order that `cut` reads them."""
         ears = float(self.ears_covered)
         measures = (self.sleeve, self.hem, self.cuff, self.neck_depth, self.nape, ears, self.fringe)
@@ -51,11 +51,11 @@ class Outfit:
         """How far the shirt stands off: close at the shoulders, 3-4 cm at hem and sleeve end."""
         x, y, z = place.T
         side = np.abs(x)
-        torso = 0.010 + 0.024 * _ramp(-y, -0.22, 0.20)
-        sleeve = 0.009 + 0.020 * _ramp(side, 0.18, self.sleeve)
-        on_sleeve = _ramp(side, 0.15, 0.22) * _ramp(y, 0.06, 0.12)
+        torso = 0.010 + 0.024 * _smoothstep_array(-y, -0.22, 0.20)
+        sleeve = 0.009 + 0.020 * _smoothstep_array(side, 0.18, self.sleeve)
+        on_sleeve = _smoothstep_array(side, 0.15, 0.22) * _smoothstep_array(y, 0.06, 0.12)
         folds = 0.0055 * np.sin(np.arctan2(z - 0.03, x) * 7.0 + 3.0 * np.sin(y * 9.0))
-        folds = folds * _ramp(-y, -0.12, 0.25) * (1.0 - on_sleeve)
+        folds = folds * _smoothstep_array(-y, -0.12, 0.25) * (1.0 - on_sleeve)
         creases = 0.003 * np.sin(side * 110.0 + 9.0 * z) * on_sleeve
         return (1.0 - on_sleeve) * torso + on_sleeve * sleeve + folds + creases
 
@@ -64,7 +64,7 @@ class Outfit:
     ) -> Float[np.ndarray, "vertices"]:
         """How far the trousers stand off: 7 mm at the hip, 2 cm at the cuff."""
         x, y, z = place.T
-        down = _ramp(-y, -BELT_Y, 1.1)
+        down = _smoothstep_array(-y, -BELT_Y, 1.1)
         knee = np.exp(-(((y + 0.70) / 0.10) ** 2)) + np.exp(-(((y + 1.08) / 0.07) ** 2))
         creases = 0.0035 * np.sin(y * 95.0 + 14.0 * np.abs(x) + 20.0 * z) * knee
         return 0.007 + 0.014 * down + creases
@@ -74,13 +74,13 @@ class Outfit:
     ) -> Float[np.ndarray, "vertices"]:
         """How far the hair stands off: fullest on the crown, thin at the nape."""
         _, y, z = place.T
-        crown = _ramp(y, 0.45, 0.60)
-        tuft = 0.010 * _ramp(z, 0.05, 0.14) * _ramp(y, 0.55, 0.60)
+        crown = _smoothstep_array(y, 0.45, 0.60)
+        tuft = 0.010 * _smoothstep_array(z, 0.05, 0.14) * _smoothstep_array(y, 0.55, 0.60)
         full = 0.006 + (0.008 if self.bun else 0.014) * crown
         return full + (0.0 if self.bun else tuft)
 
 
-def _ramp(
+def _smoothstep_array(
     value: Float[np.ndarray, "vertices"], low: float, high: float
 ) -> Float[np.ndarray, "vertices"]:
     """0 below `low`, 1 above `high`, smooth between."""
@@ -88,8 +88,8 @@ def _ramp(
     return share * share * (3.0 - 2.0 * share)
 
 
-def _srgb(*codes: str) -> tuple[tuple[float, float, float], ...]:
-    """Colours from hexadecimal codes."""
+def _srgb_palette(*codes: str) -> tuple[tuple[float, float, float], ...]:
+    """AppearanceModel from hexadecimal codes."""
     return tuple(
         (int(c[0:2], 16) / 255, int(c[2:4], 16) / 255, int(c[4:6], 16) / 255) for c in codes
     )
@@ -107,7 +107,7 @@ OUTFITS = {
         ears_covered=False,
         bun=False,
         checked=False,
-        palette=_srgb(
+        palette=_srgb_palette(
             *("e0ac8b", "b4605a", "4a2d1c", "4f7f86"),  # skin, lips, hair, iris
             *("f2ead8", "2f6f7e", "e2a23b"),  # shirt, its stripes, its trim
             *("35466e", "465a86", "c98a45"),  # trousers, their stripes, their thread
@@ -125,7 +125,7 @@ OUTFITS = {
         ears_covered=False,
         bun=True,
         checked=True,
-        palette=_srgb(
+        palette=_srgb_palette(
             *("8d5a3c", "7a3b36", "1d1512", "3a2416"),
             *("e46f51", "f3c9a0", "5b2a4d"),
             *("5f6b45", "717f54", "d9cf9a"),

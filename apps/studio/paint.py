@@ -18,7 +18,7 @@ from apps.studio.cut import (
     SLEEVE,
     TROUSERS,
     neckline,
-    ramp,
+    smoothstep,
 )
 from avatar.kernels.jit import compile_kernel
 
@@ -27,10 +27,10 @@ TONE, LIPS, HAIR_TONE, IRIS, CLOTH, STRIPE, TRIM, DENIM, DENIM_STRIPE, THREAD, U
     12
 )
 
-Colour = tuple[float, float, float]
+SrgbColor = tuple[float, float, float]
 """sRGB in [0, 1]."""
 
-MIDDLE_X = -0.002
+SYMMETRY_PLANE_X = -0.002
 """The template's plane of symmetry."""
 
 STRIPE_M = 0.04
@@ -50,11 +50,11 @@ def _hash(i: int, j: int, k: int, seed: int) -> np.float32:
 
 
 @compile_kernel(nogil=True)
-def noise(x: float, y: float, z: float, cell: float, seed: int) -> float:
+def value_noise(x: float, y: float, z: float, cell: float, seed: int) -> float:
     """Smooth noise in [-1, 1] with a grain of `cell` metres."""
     x, y, z = x / cell + 500.0, y / cell + 500.0, z / cell + 500.0
     i, j, k = int(x), int(y), int(z)
-    u, v, w = ramp(x - i, 0.0, 1.0), ramp(y - j, 0.0, 1.0), ramp(z - k, 0.0, 1.0)
+    u, v, w = smoothstep(x - i, 0.0, 1.0), smoothstep(y - j, 0.0, 1.0), smoothstep(z - k, 0.0, 1.0)
     total = 0.0
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
@@ -64,7 +64,7 @@ def noise(x: float, y: float, z: float, cell: float, seed: int) -> float:
 
 
 @compile_kernel(nogil=True, inline="always")
-def _mix(a: Colour, b: Colour, share: float) -> Colour:
+def _lerp(a: SrgbColor, b: SrgbColor, share: float) -> SrgbColor:
     return (
         a[0] + (b[0] - a[0]) * share,
         a[1] + (b[1] - a[1]) * share,
@@ -73,21 +73,21 @@ def _mix(a: Colour, b: Colour, share: float) -> Colour:
 
 
 @compile_kernel(nogil=True, inline="always")
-def _times(a: Colour, factor: float) -> Colour:
+def _scale(a: SrgbColor, factor: float) -> SrgbColor:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
 @compile_kernel(nogil=True, inline="always")
-def _swatch(palette: Float32[np.ndarray, "colours 3"], row: int) -> Colour:
+def _swatch(palette: Float32[np.ndarray, "colours 3"], row: int) -> SrgbColor:
     return palette[row, 0], palette[row, 1], palette[row, 2]
 
 
 @compile_kernel(nogil=True, inline="always")
-def _band(value: float, width: float, blur: float) -> float:
+def _stripe_wave(value: float, width: float, blur: float) -> float:
     """Square wave in [0, 1]: stripes of one width, edges `blur` metres soft."""
     phase = value / (2.0 * width)
     fold = abs(phase - np.floor(phase) - 0.5) * 2.0 * width  # 0 … width, one period = 2 widths
-    return ramp(fold, 0.5 * width - blur, 0.5 * width + blur)
+    return smoothstep(fold, 0.5 * width - blur, 0.5 * width + blur)
 
 
 @compile_kernel(nogil=True)
@@ -98,34 +98,34 @@ def _shirt(
     palette: Float32[np.ndarray, "colours 3"],
     cut: Float32[np.ndarray, "cuts"],
     checked: bool,
-) -> Colour:
-    side = abs(x - MIDDLE_X)
+) -> SrgbColor:
+    side = abs(x - SYMMETRY_PLANE_X)
     on_sleeve = side > 0.172 and y > 0.08
     along = side if on_sleeve else y
     if on_sleeve:
         around = np.arctan2(z - 0.012, y - 0.255) * 0.055
     else:
-        around = np.arctan2(x - MIDDLE_X, z - 0.03) * 0.14
-    first = _band(along + 0.004, STRIPE_M, 0.0015)
+        around = np.arctan2(x - SYMMETRY_PLANE_X, z - 0.03) * 0.14
+    first = _stripe_wave(along + 0.004, STRIPE_M, 0.0015)
     cloth, stripe = _swatch(palette, CLOTH), _swatch(palette, STRIPE)
     if checked:
-        second = _band(around, STRIPE_M, 0.0015)
-        thin = _band(along + 0.02, 0.5 * STRIPE_M, 0.001) * _band(around + 0.02, 0.02, 0.001)
-        colour = _mix(cloth, stripe, 0.42 * first + 0.42 * second)
-        colour = _mix(colour, _swatch(palette, TRIM), 0.30 * thin)
+        second = _stripe_wave(around, STRIPE_M, 0.0015)
+        thin = _stripe_wave(along + 0.02, 0.5 * STRIPE_M, 0.001) * _stripe_wave(around + 0.02, 0.02, 0.001)
+        colour = _lerp(cloth, stripe, 0.42 * first + 0.42 * second)
+        colour = _lerp(colour, _swatch(palette, TRIM), 0.30 * thin)
     else:
-        colour = _mix(cloth, stripe, first)
+        colour = _lerp(cloth, stripe, first)
     edge = min(cut[SLEEVE] - side, y - cut[HEM], 0.9 * (neckline(x, z, cut) - y))
-    colour = _mix(_swatch(palette, TRIM), colour, ramp(edge, 0.019, 0.021))
+    colour = _lerp(_swatch(palette, TRIM), colour, smoothstep(edge, 0.019, 0.021))
     seam = min(abs(side - 0.172) if y > 0.08 else 1.0, abs(edge - 0.020))
-    colour = _times(colour, 0.80 + 0.20 * ramp(seam, 0.0008, 0.0035))
+    colour = _scale(colour, 0.80 + 0.20 * smoothstep(seam, 0.0008, 0.0035))
     pocket = max(abs(x - 0.075) - 0.042, abs(y - 0.150) - 0.048)
     if z > 0.06:
-        colour = _times(colour, 0.72 + 0.28 * ramp(abs(pocket), 0.0008, 0.0030))
+        colour = _scale(colour, 0.72 + 0.28 * smoothstep(abs(pocket), 0.0008, 0.0030))
         if pocket < 0.0 and y > 0.180:
-            colour = _mix(_swatch(palette, TRIM), colour, 0.25)
-    grain = 0.060 * noise(x, y, z, 0.018, 1) + 0.040 * noise(x, y, z, 0.010, 2)
-    return _times(colour, 1.0 + grain)
+            colour = _lerp(_swatch(palette, TRIM), colour, 0.25)
+    grain = 0.060 * value_noise(x, y, z, 0.018, 1) + 0.040 * value_noise(x, y, z, 0.010, 2)
+    return _scale(colour, 1.0 + grain)
 
 
 @compile_kernel(nogil=True)
@@ -135,46 +135,46 @@ def _trousers(
     z: float,
     palette: Float32[np.ndarray, "colours 3"],
     cut: Float32[np.ndarray, "cuts"],
-) -> Colour:
-    side = abs(x - MIDDLE_X)
-    axis_x = 0.118 + 0.040 * ramp(-y, 0.25, 1.1)
-    axis_z = 0.020 - 0.055 * ramp(-y, 0.3, 1.1)
+) -> SrgbColor:
+    side = abs(x - SYMMETRY_PLANE_X)
+    axis_x = 0.118 + 0.040 * smoothstep(-y, 0.25, 1.1)
+    axis_z = 0.020 - 0.055 * smoothstep(-y, 0.3, 1.1)
     angle = np.arctan2(z - axis_z, side - axis_x)
-    colour = _mix(
+    colour = _lerp(
         _swatch(palette, DENIM),
         _swatch(palette, DENIM_STRIPE),
-        _band(angle * 0.0764, STRIPE_M, 0.0015),
+        _stripe_wave(angle * 0.0764, STRIPE_M, 0.0015),
     )
-    worn = np.exp(-(((y + 0.52) / 0.16) ** 2)) * ramp(z, 0.03, 0.10)
-    colour = _mix(colour, (0.78, 0.82, 0.88), 0.20 * worn)
+    worn = np.exp(-(((y + 0.52) / 0.16) ** 2)) * smoothstep(z, 0.03, 0.10)
+    colour = _lerp(colour, (0.78, 0.82, 0.88), 0.20 * worn)
     thread = min(abs(angle - 0.05) * 0.09, abs(y - cut[CUFF] - 0.028))
     if y > BELT_Y - 0.22 and z > 0.05:
         thread = min(thread, abs(np.hypot(side - 0.19, y + 0.15) - 0.11))
-    colour = _mix(_swatch(palette, THREAD), colour, 0.35 + 0.65 * ramp(thread, 0.0008, 0.0028))
-    grain = 0.075 * noise(x, y, z, 0.018, 3) + 0.060 * noise(x, y, z, 0.010, 4)
-    return _times(colour, 1.0 + grain)
+    colour = _lerp(_swatch(palette, THREAD), colour, 0.35 + 0.65 * smoothstep(thread, 0.0008, 0.0028))
+    grain = 0.075 * value_noise(x, y, z, 0.018, 3) + 0.060 * value_noise(x, y, z, 0.010, 4)
+    return _scale(colour, 1.0 + grain)
 
 
 @compile_kernel(nogil=True)
-def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
+def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> SrgbColor:
     tone = _swatch(palette, TONE)
-    side = abs(x - MIDDLE_X)
+    side = abs(x - SYMMETRY_PLANE_X)
     warm = 0.0
     if side > 0.78:
-        warm = 0.35 * ramp(side, 0.84, 0.91)
-    colour = _times(tone, 1.0 + 0.030 * noise(x, y, z, 0.020, 5) + 0.015 * noise(x, y, z, 0.009, 6))
+        warm = 0.35 * smoothstep(side, 0.84, 0.91)
+    colour = _scale(tone, 1.0 + 0.030 * value_noise(x, y, z, 0.020, 5) + 0.015 * value_noise(x, y, z, 0.009, 6))
     if y < 0.34 or z < 0.06:
-        ear = ramp(0.040 - np.hypot(z - 0.066, y - 0.478), 0.0, 0.02) * ramp(side, 0.07, 0.085)
-        return _mix(colour, _swatch(palette, LIPS), 0.5 * warm + 0.30 * ear)
+        ear = smoothstep(0.040 - np.hypot(z - 0.066, y - 0.478), 0.0, 0.02) * smoothstep(side, 0.07, 0.085)
+        return _lerp(colour, _swatch(palette, LIPS), 0.5 * warm + 0.30 * ear)
     cheek = np.exp(-(((side - 0.045) / 0.018) ** 2) - ((y - 0.458) / 0.018) ** 2)
-    nose = np.exp(-((side / 0.016) ** 2) - ((y - 0.462) / 0.012) ** 2) * ramp(z, 0.165, 0.185)
-    colour = _mix(colour, _swatch(palette, LIPS), 0.30 * cheek + 0.25 * nose)
+    nose = np.exp(-((side / 0.016) ** 2) - ((y - 0.462) / 0.012) ** 2) * smoothstep(z, 0.165, 0.185)
+    colour = _lerp(colour, _swatch(palette, LIPS), 0.30 * cheek + 0.25 * nose)
     # The socket is a little darker, and so is the side of the nose.
     socket = np.exp(-(((side - 0.030) / 0.020) ** 2) - ((y - 0.506) / 0.011) ** 2)
     flank = np.exp(-(((side - 0.013) / 0.006) ** 2) - ((y - 0.480) / 0.020) ** 2)
     nostril = np.exp(-(((side - 0.008) / 0.0045) ** 2) - ((y - 0.4525) / 0.0030) ** 2)
-    colour = _times(
-        colour, 1.0 - 0.16 * socket - 0.12 * flank - 0.45 * nostril * ramp(z, 0.165, 0.175)
+    colour = _scale(
+        colour, 1.0 - 0.16 * socket - 0.12 * flank - 0.45 * nostril * smoothstep(z, 0.165, 0.175)
     )
     if z > 0.12:
         colour = _mouth(colour, side, y, palette)
@@ -184,8 +184,8 @@ def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"
 
 @compile_kernel(nogil=True)
 def _mouth(
-    colour: Colour, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
-) -> Colour:
+    colour: SrgbColor, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
+) -> SrgbColor:
     share = side / 0.027
     if share >= 1.0:
         return colour
@@ -194,78 +194,78 @@ def _mouth(
         0.4290 + 0.0045 * share * share + 0.0100 * round_ - 0.0025 * np.exp(-((side / 0.004) ** 2))
     )
     lower = 0.4290 + 0.0045 * share * share - 0.0120 * np.sqrt(round_)
-    inside = ramp(upper - y, -0.0008, 0.0012) * ramp(y - lower, -0.0008, 0.0015)
-    colour = _mix(colour, _swatch(palette, LIPS), 0.80 * inside)
-    parting = ramp(0.0019 - abs(y - 0.4290 - 0.0045 * share * share), 0.0, 0.0012)
-    return _times(colour, 1.0 - 0.55 * parting)
+    inside = smoothstep(upper - y, -0.0008, 0.0012) * smoothstep(y - lower, -0.0008, 0.0015)
+    colour = _lerp(colour, _swatch(palette, LIPS), 0.80 * inside)
+    parting = smoothstep(0.0019 - abs(y - 0.4290 - 0.0045 * share * share), 0.0, 0.0012)
+    return _scale(colour, 1.0 - 0.55 * parting)
 
 
 @compile_kernel(nogil=True)
 def _brow_and_lashes(
-    colour: Colour, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
-) -> Colour:
-    dark = _times(_swatch(palette, HAIR_TONE), 0.75)
+    colour: SrgbColor, side: float, y: float, palette: Float32[np.ndarray, "colours 3"]
+) -> SrgbColor:
+    dark = _scale(_swatch(palette, HAIR_TONE), 0.75)
     along = (side - 0.012) / 0.042
     if 0.0 < along < 1.0:
         ridge = 0.5240 + 0.0055 * np.sin(2.6 * along) - 0.0040 * along
         thick = 0.0034 * (1.0 - 0.60 * along)
-        brow = ramp(thick - abs(y - ridge), -0.0008, 0.0014) * ramp(along, 0.0, 0.10)
-        colour = _mix(colour, dark, 0.85 * brow)
+        brow = smoothstep(thick - abs(y - ridge), -0.0008, 0.0014) * smoothstep(along, 0.0, 0.10)
+        colour = _lerp(colour, dark, 0.85 * brow)
     rim = np.hypot((side - 0.0305) / 0.0165, (y - 0.5022) / 0.0080)
-    lash = ramp(1.17 - rim, 0.0, 0.12) * ramp(y, 0.5020, 0.5060)
-    below = ramp(1.25 - rim, 0.0, 0.15) * (1.0 - ramp(y, 0.5000, 0.5020))
-    return _mix(colour, _times(dark, 0.6), 0.85 * lash + 0.22 * below)
+    lash = smoothstep(1.17 - rim, 0.0, 0.12) * smoothstep(y, 0.5020, 0.5060)
+    below = smoothstep(1.25 - rim, 0.0, 0.15) * (1.0 - smoothstep(y, 0.5000, 0.5020))
+    return _lerp(colour, _scale(dark, 0.6), 0.85 * lash + 0.22 * below)
 
 
 @compile_kernel(nogil=True)
-def _eye(x: float, y: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
-    from_iris = np.hypot(abs(x - MIDDLE_X) - 0.0300, y - 0.5035)
-    iris = _times(_swatch(palette, IRIS), 0.75 + 40.0 * from_iris)
-    colour = _mix(iris, (0.94, 0.93, 0.90), ramp(from_iris, 0.0058, 0.0068))
-    colour = _mix((0.04, 0.03, 0.03), colour, ramp(from_iris, 0.0026, 0.0034))
-    glint = np.hypot(x - MIDDLE_X - np.sign(x) * 0.0300 - 0.0020, y - 0.5055)
-    return _mix((1.0, 1.0, 1.0), colour, ramp(glint, 0.0010, 0.0018))
+def _eye(x: float, y: float, palette: Float32[np.ndarray, "colours 3"]) -> SrgbColor:
+    from_iris = np.hypot(abs(x - SYMMETRY_PLANE_X) - 0.0300, y - 0.5035)
+    iris = _scale(_swatch(palette, IRIS), 0.75 + 40.0 * from_iris)
+    colour = _lerp(iris, (0.94, 0.93, 0.90), smoothstep(from_iris, 0.0058, 0.0068))
+    colour = _lerp((0.04, 0.03, 0.03), colour, smoothstep(from_iris, 0.0026, 0.0034))
+    glint = np.hypot(x - SYMMETRY_PLANE_X - np.sign(x) * 0.0300 - 0.0020, y - 0.5055)
+    return _lerp((1.0, 1.0, 1.0), colour, smoothstep(glint, 0.0010, 0.0018))
 
 
 @compile_kernel(nogil=True)
-def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
-    along = np.arctan2(x - MIDDLE_X, z - 0.05)
-    strand = noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, 7)
-    strand += 0.6 * noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, 8)
-    return _times(_swatch(palette, HAIR_TONE), 1.0 + 0.30 * strand)
+def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> SrgbColor:
+    along = np.arctan2(x - SYMMETRY_PLANE_X, z - 0.05)
+    strand = value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, 7)
+    strand += 0.6 * value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, 8)
+    return _scale(_swatch(palette, HAIR_TONE), 1.0 + 0.30 * strand)
 
 
 @compile_kernel(nogil=True)
-def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> Colour:
-    side = abs(abs(x - MIDDLE_X) - 0.162)
+def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colours 3"]) -> SrgbColor:
+    side = abs(abs(x - SYMMETRY_PLANE_X) - 0.162)
     upper = _swatch(palette, UPPER)
-    lace = ramp(0.022 - side, 0.0, 0.002) * ramp(z, 0.035, 0.040) * ramp(0.105 - z, 0.0, 0.004)
-    upper = _mix(upper, _swatch(palette, SOLE), 0.8 * lace * _band(z, 0.007, 0.0015))
+    lace = smoothstep(0.022 - side, 0.0, 0.002) * smoothstep(z, 0.035, 0.040) * smoothstep(0.105 - z, 0.0, 0.004)
+    upper = _lerp(upper, _swatch(palette, SOLE), 0.8 * lace * _stripe_wave(z, 0.007, 0.0015))
     toe = abs(z - 0.125) if y > -1.20 else 1.0
-    upper = _times(upper, 0.82 + 0.18 * ramp(toe, 0.001, 0.004))
-    colour = _mix(_swatch(palette, SOLE), upper, ramp(y, -1.2085, -1.2065))
-    return _times(colour, 1.0 + 0.04 * noise(x, y, z, 0.015, 9))
+    upper = _scale(upper, 0.82 + 0.18 * smoothstep(toe, 0.001, 0.004))
+    colour = _lerp(_swatch(palette, SOLE), upper, smoothstep(y, -1.2085, -1.2065))
+    return _scale(colour, 1.0 + 0.04 * value_noise(x, y, z, 0.015, 9))
 
 
 @compile_kernel(nogil=True)
-def colour_of(
-    kind: int,
+def albedo_at(
+    material: int,
     x: float,
     y: float,
     z: float,
     palette: Float32[np.ndarray, "colours 3"],
-    cut: Float32[np.ndarray, "cuts"],
+    measures: Float32[np.ndarray, "cuts"],
     checked: bool,
-) -> Colour:
+) -> SrgbColor:
     """sRGB colour of a place before any light falls on it; may leave [0, 1] by a little."""
-    if kind == SHIRT:
-        return _shirt(x, y, z, palette, cut, checked)
-    if kind == TROUSERS:
-        return _trousers(x, y, z, palette, cut)
-    if kind == SHOE:
+    if material == SHIRT:
+        return _shirt(x, y, z, palette, measures, checked)
+    if material == TROUSERS:
+        return _trousers(x, y, z, palette, measures)
+    if material == SHOE:
         return _shoe(x, y, z, palette)
-    if kind == HAIR:
+    if material == HAIR:
         return _hair(x, y, z, palette)
-    if kind == EYE:
+    if material == EYE:
         return _eye(x, y, palette)
     return _skin(x, y, z, palette)

@@ -10,35 +10,35 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-Pattern = Callable[
+TexturePainter = Callable[
     [tuple[int, int], float, np.random.Generator], UInt8[np.ndarray, "rows columns 3"]
 ]
 """Paints a face of so many texels (columns, rows), each of so many metres."""
 
-LEAF_M = (0.012, 0.45)
+LEAF_SIZES_M = (0.012, 0.45)
 """The smallest and the largest leaf."""
-SHIFT = 4
+SUBPIXEL_BITS = 4
 """OpenCV draws at this many binary places behind the point."""
 
 
-def plaster(colour: tuple[int, int, int], contrast: float = 13.0) -> Pattern:
+def plaster(colour: tuple[int, int, int], contrast: float = 13.0) -> TexturePainter:
     """A wall: faint leaves of one colour, stains, and pictures that hang on it."""
 
     def paint(size, texel_m, generator):
-        picture = _leaves(size, texel_m, generator, np.array(colour, dtype=float), contrast)
-        picture = _stained(picture, texel_m, generator, 9.0)
+        picture = _paint_dead_leaves(size, texel_m, generator, np.array(colour, dtype=float), contrast)
+        picture = _add_stains(picture, texel_m, generator, 9.0)
         width, height = size[0] * texel_m, size[1] * texel_m
         for _ in range(int(width / 0.9)):
             wide, tall = generator.uniform(0.25, 0.8), generator.uniform(0.25, 0.7)
             left = generator.uniform(0.05, max(width - wide, 0.06))
             top = generator.uniform(0.25, max(height - tall - 0.5, 0.26))
-            _hang(picture, texel_m, (left, top), (wide, tall), generator)
+            _hang_print(picture, texel_m, (left, top), (wide, tall), generator)
         return picture
 
     return paint
 
 
-def planks(colour: tuple[int, int, int]) -> Pattern:
+def planks(colour: tuple[int, int, int]) -> TexturePainter:
     """A wooden floor: boards of all lengths and tones with grain and knots, and a rug."""
 
     def paint(size, texel_m, generator):
@@ -57,7 +57,7 @@ def planks(colour: tuple[int, int, int]) -> Pattern:
         fine = _noise((rows, columns), (0.20 / texel_m, 0.008 / texel_m), generator)
         wild = _noise((rows, columns), (0.03 / texel_m, 0.02 / texel_m), generator)
         tone *= 1.0 + 0.10 * fine + 0.07 * wild
-        picture = _clipped(tone[..., None] * np.array(colour, dtype=np.float32))
+        picture = _to_uint8(tone[..., None] * np.array(colour, dtype=np.float32))
         knots = int(columns * rows * texel_m**2 * 6)
         for x, y in generator.uniform(0.0, 1.0, (knots, 2)) * size:
             radius = generator.uniform(0.006, 0.022) / texel_m
@@ -66,23 +66,23 @@ def planks(colour: tuple[int, int, int]) -> Pattern:
             cv2.ellipse(picture, (int(x), int(y)), axes, 0.0, 0.0, 360.0, dark, -1, cv2.LINE_AA)
         left, right, top, below = 0.22 * columns, 0.80 * columns, 0.16 * rows, 0.62 * rows
         rug = picture[int(top) : int(below), int(left) : int(right)]
-        rug[:] = _leaves(rug.shape[1::-1], texel_m, generator, np.array((128.0, 84.0, 78.0)), 24.0)
-        return _stained(picture, texel_m, generator, 5.0)
+        rug[:] = _paint_dead_leaves(rug.shape[1::-1], texel_m, generator, np.array((128.0, 84.0, 78.0)), 24.0)
+        return _add_stains(picture, texel_m, generator, 5.0)
 
     return paint
 
 
-def leaves(colour: tuple[int, int, int], contrast: float = 30.0) -> Pattern:
+def dead_leaves(colour: tuple[int, int, int], contrast: float = 30.0) -> TexturePainter:
     """A face of leaves around one colour: a painted box, a cloth."""
 
     def paint(size, texel_m, generator):
-        picture = _leaves(size, texel_m, generator, np.array(colour, dtype=float), contrast)
-        return _stained(picture, texel_m, generator, 6.0)
+        picture = _paint_dead_leaves(size, texel_m, generator, np.array(colour, dtype=float), contrast)
+        return _add_stains(picture, texel_m, generator, 6.0)
 
     return paint
 
 
-def wood(colour: tuple[int, int, int]) -> Pattern:
+def wood(colour: tuple[int, int, int]) -> TexturePainter:
     """A board with grain, drawers and handles."""
 
     def paint(size, texel_m, generator):
@@ -90,7 +90,7 @@ def wood(colour: tuple[int, int, int]) -> Pattern:
         grain = _noise((rows, columns), (0.010 / texel_m, 0.25 / texel_m), generator)
         wild = _noise((rows, columns), (0.02 / texel_m, 0.03 / texel_m), generator)
         tone = 1.0 + 0.11 * grain + 0.08 * wild
-        picture = _clipped(tone[..., None] * np.array(colour, dtype=np.float32))
+        picture = _to_uint8(tone[..., None] * np.array(colour, dtype=np.float32))
         steps = max(round(rows * texel_m / generator.uniform(0.25, 0.4)), 1)
         dark = tuple(int(0.45 * c) for c in colour)
         thick = max(round(0.006 / texel_m), 1)
@@ -104,7 +104,7 @@ def wood(colour: tuple[int, int, int]) -> Pattern:
     return paint
 
 
-def books(colour: tuple[int, int, int]) -> Pattern:
+def books(colour: tuple[int, int, int]) -> TexturePainter:
     """Shelves full of books with printed backs."""
 
     def paint(size, texel_m, generator):
@@ -120,7 +120,7 @@ def books(colour: tuple[int, int, int]) -> Pattern:
                 top = below - int((below - above) * generator.uniform(0.55, 0.95))
                 back = picture[top:below, column : min(column + thick, columns - 1)]
                 ink = generator.uniform(50.0, 190.0) + generator.uniform(-45.0, 45.0, 3)
-                back[:] = _leaves(back.shape[1::-1], texel_m, generator, ink, 34.0)
+                back[:] = _paint_dead_leaves(back.shape[1::-1], texel_m, generator, ink, 34.0)
                 back[:, :1] = back[:, :1] // 2
                 column += thick
             picture[below : below + max(round(0.02 / texel_m), 1)] = colour
@@ -129,7 +129,7 @@ def books(colour: tuple[int, int, int]) -> Pattern:
     return paint
 
 
-def repeated(motif: Pattern, period_m: float, grout: tuple[int, int, int]) -> Pattern:
+def repeat_motif(motif: TexturePainter, period_m: float, grout: tuple[int, int, int]) -> TexturePainter:
     """One square motif over and over, every copy the same to the last bit."""
 
     def paint(size, texel_m, generator):
@@ -143,7 +143,7 @@ def repeated(motif: Pattern, period_m: float, grout: tuple[int, int, int]) -> Pa
     return paint
 
 
-def _leaves(
+def _paint_dead_leaves(
     size: tuple[int, int],
     texel_m: float,
     generator: np.random.Generator,
@@ -153,14 +153,14 @@ def _leaves(
     """Shapes that hide each other, sizes by a power law, colours around one."""
     columns, rows = size
     picture = np.full((rows, columns, 3), np.clip(colour, 0, 255), dtype=np.uint8)
-    low, high = LEAF_M[0], min(LEAF_M[1], 0.5 * max(size) * texel_m + LEAF_M[0])
+    low, high = LEAF_SIZES_M[0], min(LEAF_SIZES_M[1], 0.5 * max(size) * texel_m + LEAF_SIZES_M[0])
     area = columns * rows * texel_m**2
     count = int(min(area * 900.0, 60_000)) + 4
     # The number of leaves above a radius falls with its square, so that every scale covers alike.
     drawn = generator.uniform(high**-2.0, low**-2.0, count) ** -0.5
     drawn[: count // 8] = np.geomspace(high, 4.0 * low, count // 8)  # the ground is covered
-    radii = drawn / texel_m * 2**SHIFT
-    places = generator.uniform(0.0, 1.0, (count, 2)) * size * 2**SHIFT
+    radii = drawn / texel_m * 2**SUBPIXEL_BITS
+    places = generator.uniform(0.0, 1.0, (count, 2)) * size * 2**SUBPIXEL_BITS
     tones = colour + contrast * generator.standard_normal((count, 1))
     tones = np.clip(tones + 0.3 * contrast * generator.standard_normal((count, 3)), 4, 251)
     angles = np.sort(generator.uniform(0.0, 2.0 * np.pi, (count, 5)), axis=1)
@@ -170,14 +170,14 @@ def _leaves(
         ink = tuple(tones[i].tolist())
         if i % 3:
             corners = polygons[i, : 3 + i % 3]
-            cv2.fillConvexPoly(picture, corners, ink, cv2.LINE_AA, SHIFT)
+            cv2.fillConvexPoly(picture, corners, ink, cv2.LINE_AA, SUBPIXEL_BITS)
         else:
             middle = (int(places[i, 0]), int(places[i, 1]))
-            cv2.circle(picture, middle, int(0.7 * radii[i]), ink, -1, cv2.LINE_AA, SHIFT)
+            cv2.circle(picture, middle, int(0.7 * radii[i]), ink, -1, cv2.LINE_AA, SUBPIXEL_BITS)
     return picture
 
 
-def _hang(
+def _hang_print(
     picture: UInt8[np.ndarray, "rows columns 3"],
     texel_m: float,
     corner_m: tuple[float, float],
@@ -194,10 +194,10 @@ def _hang(
     part[:] = generator.integers(20, 90, 3)
     inner = part[edge:-edge, edge:-edge]
     ink = generator.uniform(70.0, 190.0, 3)
-    inner[:] = _leaves(inner.shape[1::-1], texel_m, generator, ink, 55.0)
+    inner[:] = _paint_dead_leaves(inner.shape[1::-1], texel_m, generator, ink, 55.0)
 
 
-def _stained(
+def _add_stains(
     picture: UInt8[np.ndarray, "rows columns 3"],
     texel_m: float,
     generator: np.random.Generator,
@@ -209,7 +209,7 @@ def _stained(
         each = scale / texel_m
         if each >= 1.0:
             stains += _noise(picture.shape[:2], (each, each), generator)
-    return _clipped(picture + strength * stains[..., None])
+    return _to_uint8(picture + strength * stains[..., None])
 
 
 def _noise(
@@ -221,5 +221,5 @@ def _noise(
     return cv2.resize(white, shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def _clipped(picture: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+def _to_uint8(picture: Float32[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return np.clip(picture, 0.0, 255.0).astype(np.uint8)

@@ -11,16 +11,16 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from apps.studio.cut import keeps
+from apps.studio.cut import is_visible
 from avatar.kernels.jit import compile_kernel
 from capture.camera import Camera
 
-NOTHING = -1
+NO_FACE = -1
 
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Visible:
+class ZBuffer:
     """What the subsamples see.
 
     Attributes:
@@ -31,21 +31,21 @@ class Visible:
     """
 
     face: Int32[np.ndarray, "rows columns"]
-    share: Float32[np.ndarray, "rows columns 2"]
+    barycentric: Float32[np.ndarray, "rows columns 2"]
     depth: Float32[np.ndarray, "rows columns"]
-    fine: int
+    supersampling: int
 
 
-def rasterise(
+def rasterize(
     points_world: Float[np.ndarray, "vertices 3"],
     faces: Int32[np.ndarray, "faces 3"],
     camera: Camera,
     *,
-    fine: int = 4,
-    texture: Float32[np.ndarray, "vertices 3"] | None = None,
-    kinds: Int32[np.ndarray, "faces"] | None = None,
-    cut: Float32[np.ndarray, "cuts"] | None = None,
-) -> Visible:
+    supersampling: int = 4,
+    template_points: Float32[np.ndarray, "vertices 3"] | None = None,
+    materials: Int32[np.ndarray, "faces"] | None = None,
+    measures: Float32[np.ndarray, "cuts"] | None = None,
+) -> ZBuffer:
     """Draws triangles into a z-buffer of `fine` × `fine` subsamples a pixel.
 
     Args:
@@ -60,25 +60,25 @@ def rasterise(
     rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     depth = points_world @ rotation[2] + translation[2]
     screen = np.empty((len(points_world), 3), dtype=np.float32)
-    screen[:, :2] = camera.project(points_world) * fine
+    screen[:, :2] = camera.project(points_world) * supersampling
     screen[:, 2] = depth
-    if texture is None or kinds is None or cut is None:
-        texture = np.zeros((1, 3), dtype=np.float32)
-        kinds = np.zeros(0, dtype=np.int32)
-        cut = np.zeros(0, dtype=np.float32)
-    rows, columns = camera.size_px[1] * fine, camera.size_px[0] * fine
-    seen = Visible(
-        face=np.full((rows, columns), NOTHING, dtype=np.int32),
-        share=np.zeros((rows, columns, 2), dtype=np.float32),
+    if template_points is None or materials is None or measures is None:
+        template_points = np.zeros((1, 3), dtype=np.float32)
+        materials = np.zeros(0, dtype=np.int32)
+        measures = np.zeros(0, dtype=np.float32)
+    rows, columns = camera.size_px[1] * supersampling, camera.size_px[0] * supersampling
+    seen = ZBuffer(
+        face=np.full((rows, columns), NO_FACE, dtype=np.int32),
+        barycentric=np.zeros((rows, columns, 2), dtype=np.float32),
         depth=np.full((rows, columns), np.inf, dtype=np.float32),
-        fine=fine,
+        supersampling=supersampling,
     )
-    _draw(screen, faces, texture, kinds, cut, seen.face, seen.share, seen.depth)
+    _rasterize_faces(screen, faces, template_points, materials, measures, seen.face, seen.barycentric, seen.depth)
     return seen
 
 
 @compile_kernel(nogil=True, error_model="numpy")
-def _draw(
+def _rasterize_faces(
     screen: Float32[np.ndarray, "vertices 3"],
     faces: Int32[np.ndarray, "faces 3"],
     texture: Float32[np.ndarray, "places 3"],
@@ -123,7 +123,7 @@ def _draw(
                         share_a * texture[a, 1] + share_b * texture[b, 1] + share_c * texture[c, 1],
                         share_a * texture[a, 2] + share_b * texture[b, 2] + share_c * texture[c, 2],
                     )
-                    if not keeps(kinds[face], u[0], u[1], u[2], cut):
+                    if not is_visible(kinds[face], u[0], u[1], u[2], cut):
                         continue
                 depth_out[row, column] = depth
                 face_out[row, column] = face

@@ -15,13 +15,13 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
-from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.jit import FAST_MATH, compile_kernel
 from capture.camera import Camera
 
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Solids:
+class TexturedBoxes:
     """Boxes and their textures.
 
     Attributes:
@@ -38,22 +38,22 @@ class Solids:
 
     low: Float[np.ndarray, "solids 3"]
     high: Float[np.ndarray, "solids 3"]
-    turns: Float[np.ndarray, "solids 2"]
-    middles: Float[np.ndarray, "solids 2"]
+    yaw_cos_sin: Float[np.ndarray, "solids 2"]
+    centers_xz: Float[np.ndarray, "solids 2"]
     textures: Int32[np.ndarray, "solids 6"]
     texels: UInt8[np.ndarray, "texels 3"]
-    pyramid: Int64[np.ndarray, "textures levels 3"]
+    mip_levels: Int64[np.ndarray, "textures levels 3"]
     texel_m: float
     light: Float32[np.ndarray, "6"]
 
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Seen:
+class RoomView:
     """What a camera sees of the solids.
 
     Attributes:
-        rgb: Colours, 0 to 255, not rounded.
+        rgb: AppearanceModel, 0 to 255, not rounded.
         depth: Along the camera's axis, at the middle of each pixel, metres.
         face: Six times the solid's number, plus its face's.
     """
@@ -63,10 +63,10 @@ class Seen:
     face: Int32[np.ndarray, "height width"]
 
 
-def cast(solids: Solids, camera: Camera) -> Seen:
+def raycast_boxes(solids: TexturedBoxes, camera: Camera) -> RoomView:
     """The solids as a camera within the first of them sees them."""
     width, height = camera.size_px
-    seen = Seen(
+    seen = RoomView(
         rgb=np.empty((height, width, 3), dtype=np.float32),
         depth=np.empty((height, width), dtype=np.float32),
         face=np.empty((height, width), dtype=np.int32),
@@ -79,18 +79,18 @@ def cast(solids: Solids, camera: Camera) -> Seen:
     view[1], view[2] = rotation[0] / fx, rotation[1] / fy
     view[3] = rotation[2] - cx * view[1] - cy * view[2]
     boxes = np.ascontiguousarray(
-        np.concatenate([solids.low, solids.high, solids.turns, solids.middles], axis=1)
+        np.concatenate([solids.low, solids.high, solids.yaw_cos_sin, solids.centers_xz], axis=1)
     )
-    _find(view, boxes, seen.depth, seen.face)
-    _colour(
-        view, boxes, solids.textures, solids.texels, solids.pyramid, 1.0 / solids.texel_m,
+    _find_hits(view, boxes, seen.depth, seen.face)
+    _sample_textures(
+        view, boxes, solids.textures, solids.texels, solids.mip_levels, 1.0 / solids.texel_m,
         solids.light, seen.face, seen.rgb,
     )  # fmt: skip
     return seen
 
 
-@compile_kernel(**FAST, inline="always")
-def _into(
+@compile_kernel(**FAST_MATH, inline="always")
+def _to_box_frame(
     box: Float[np.ndarray, "10"], x: float, y: float, z: float, point: bool
 ) -> tuple[float, float, float]:
     """A point or direction of the world in a box's own frame."""
@@ -103,7 +103,7 @@ def _into(
     return own_x, y, own_z
 
 
-@compile_kernel(**FAST)
+@compile_kernel(**FAST_MATH)
 def _hit(
     view: Float[np.ndarray, "4 3"], boxes: Float[np.ndarray, "solids 10"], x: float, y: float
 ) -> tuple[float, int]:
@@ -121,8 +121,8 @@ def _hit(
                 best, face = t, 2 * axis + side
     for solid in range(1, boxes.shape[0]):
         box = boxes[solid]
-        o = _into(box, view[0, 0], view[0, 1], view[0, 2], True)
-        d = _into(box, dx, dy, dz, False)
+        o = _to_box_frame(box, view[0, 0], view[0, 1], view[0, 2], True)
+        d = _to_box_frame(box, dx, dy, dz, False)
         into, out, entered = 1e-3, best, -1
         for axis in range(3):
             step = d[axis] if d[axis] != 0.0 else 1e-30
@@ -138,8 +138,8 @@ def _hit(
     return best, face
 
 
-@compile_kernel(**FAST)
-def _find(
+@compile_kernel(**FAST_MATH)
+def _find_hits(
     view: Float[np.ndarray, "4 3"],
     boxes: Float[np.ndarray, "solids 10"],
     depth: Float32[np.ndarray, "height width"],
@@ -150,8 +150,8 @@ def _find(
             depth[i, j], face[i, j] = _hit(view, boxes, j + 0.5, i + 0.5)
 
 
-@compile_kernel(**FAST)
-def _on_face(
+@compile_kernel(**FAST_MATH)
+def _face_coordinates(
     view: Float[np.ndarray, "4 3"],
     boxes: Float[np.ndarray, "solids 10"],
     face: int,
@@ -160,8 +160,8 @@ def _on_face(
 ) -> tuple[float, float]:
     """Where the ray through a point of the picture meets a face's plane: right, down, metres."""
     box, axis, side = boxes[face // 6], (face % 6) // 2, face % 2
-    o = _into(box, view[0, 0], view[0, 1], view[0, 2], True)
-    d = _into(
+    o = _to_box_frame(box, view[0, 0], view[0, 1], view[0, 2], True)
+    d = _to_box_frame(
         box,
         view[3, 0] + x * view[1, 0] + y * view[2, 0],
         view[3, 1] + x * view[1, 1] + y * view[2, 1],
@@ -176,7 +176,7 @@ def _on_face(
     return o[0] + t * d[0] - box[0], box[4] - o[1] - t * d[1]
 
 
-@compile_kernel(**FAST)
+@compile_kernel(**FAST_MATH)
 def _add_texel(
     texels: UInt8[np.ndarray, "texels 3"],
     level: Int64[np.ndarray, "3"],
@@ -199,7 +199,7 @@ def _add_texel(
         out[channel] += weight * ((1.0 - v) * upper + v * lower)
 
 
-@compile_kernel(**FAST)
+@compile_kernel(**FAST_MATH)
 def _add_lookup(
     texels: UInt8[np.ndarray, "texels 3"],
     levels: Int64[np.ndarray, "levels 3"],
@@ -221,8 +221,8 @@ def _add_lookup(
             _add_texel(texels, levels[at], u * across, v * down, share, out)
 
 
-@compile_kernel(**FAST)
-def _level(
+@compile_kernel(**FAST_MATH)
+def _mip_level(
     view: Float[np.ndarray, "4 3"],
     boxes: Float[np.ndarray, "solids 10"],
     face: int,
@@ -231,15 +231,15 @@ def _level(
     step: float,
 ) -> float:
     """The level of the pyramid for rays that are `step` apart, where steps are 1 texel at 0."""
-    u, v = _on_face(view, boxes, face, x, y)
-    u_x, v_x = _on_face(view, boxes, face, x + 1.0, y)
-    u_y, v_y = _on_face(view, boxes, face, x, y + 1.0)
+    u, v = _face_coordinates(view, boxes, face, x, y)
+    u_x, v_x = _face_coordinates(view, boxes, face, x + 1.0, y)
+    u_y, v_y = _face_coordinates(view, boxes, face, x, y + 1.0)
     squared = max((u_x - u) ** 2 + (v_x - v) ** 2, (u_y - u) ** 2 + (v_y - v) ** 2)
     return 0.5 * np.log2(max(squared, 1e-12)) + np.log2(step)
 
 
-@compile_kernel(**FAST)
-def _colour(
+@compile_kernel(**FAST_MATH)
+def _sample_textures(
     view: Float[np.ndarray, "4 3"],
     boxes: Float[np.ndarray, "solids 10"],
     textures: Int32[np.ndarray, "solids 6"],
@@ -260,15 +260,15 @@ def _colour(
                 column = min(max(j + k % 3 - 1, 0), width - 1)
                 inner = inner and faces[row, column] == face
             fine = 2 if inner else 4
-            level = _level(view, boxes, face, j + 0.5, i + 0.5, per_metre / fine)
+            level = _mip_level(view, boxes, face, j + 0.5, i + 0.5, per_metre / fine)
             out = rgb[i, j]
             out[:] = 0.0
             for k in range(fine * fine):
                 x, y = j + (k % fine + 0.5) / fine, i + (k // fine + 0.5) / fine
                 if not inner:
                     _, face = _hit(view, boxes, x, y)
-                    level = _level(view, boxes, face, x, y, per_metre / fine)
-                u, v = _on_face(view, boxes, face, x, y)
+                    level = _mip_level(view, boxes, face, x, y, per_metre / fine)
+                u, v = _face_coordinates(view, boxes, face, x, y)
                 _add_lookup(
                     texels, pyramid[textures[face // 6, face % 6]], u * per_metre, v * per_metre,
                     level, light[face % 6] / (fine * fine), out,

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-GRAIN_PX = 6.0
+BORDER_NOISE_SCALE_PX = 6.0
 """How smooth the wandering is along the border."""
 
 
-def roughened(
+def add_mask_noise(
     alpha: Float32[np.ndarray, "height width"], noise_px: float, generator: np.random.Generator
 ) -> Float32[np.ndarray, "height width"]:
     """The mask with its border moved in and out by smooth noise of `noise_px` (standard deviation).
@@ -23,6 +23,6 @@ def roughened(
     )
     away -= np.where(inside > 0, 0.5, -0.5)  # from pixel centres to the border between them
     white = generator.standard_normal(alpha.shape).astype(np.float32)
-    wander = cv2.GaussianBlur(white, (0, 0), GRAIN_PX, borderType=cv2.BORDER_REFLECT_101)
-    wander *= noise_px * 2.0 * np.sqrt(np.pi) * GRAIN_PX  # a blur leaves 1 / (2 √π σ)
+    wander = cv2.GaussianBlur(white, (0, 0), BORDER_NOISE_SCALE_PX, borderType=cv2.BORDER_REFLECT_101)
+    wander *= noise_px * 2.0 * np.sqrt(np.pi) * BORDER_NOISE_SCALE_PX  # a blur leaves 1 / (2 √π σ)
     return np.clip(away + wander + 0.5, 0.0, 1.0).astype(np.float32)

@@ -3,23 +3,23 @@
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
-from apps.studio.paint import colour_of
-from apps.studio.raster import Visible
+from apps.studio.paint import albedo_at
+from apps.studio.raster import ZBuffer
 from avatar.kernels.jit import compile_kernel
 
 
-def shade(
-    seen: Visible,
+def shade_pixels(
+    zbuffer: ZBuffer,
     *,
     faces: Int32[np.ndarray, "faces 3"],
-    kinds: Int32[np.ndarray, "faces"],
-    place: Float32[np.ndarray, "vertices 3"],
+    materials: Int32[np.ndarray, "faces"],
+    template_points: Float32[np.ndarray, "vertices 3"],
     light: Float32[np.ndarray, "vertices 3"],
     palette: Float32[np.ndarray, "colours 3"],
-    cut: Float32[np.ndarray, "cuts"],
+    measures: Float32[np.ndarray, "cuts"],
     checked: bool,
 ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-    """Colour of the covered part of each pixel (sRGB in [0, 1]) and how much of it is covered.
+    """SrgbColor of the covered part of each pixel (sRGB in [0, 1]) and how much of it is covered.
 
     Args:
         seen: The z-buffer.
@@ -27,17 +27,17 @@ def shade(
         place, light: Place on the undressed template and light falling on each vertex.
         palette, cut, checked: The outfit, as `paint` reads it.
     """
-    height, width = seen.face.shape[0] // seen.fine, seen.face.shape[1] // seen.fine
+    height, width = zbuffer.face.shape[0] // zbuffer.supersampling, zbuffer.face.shape[1] // zbuffer.supersampling
     rgb = np.zeros((height, width, 3), dtype=np.float32)
     alpha = np.zeros((height, width), dtype=np.float32)
     _shade(
-        seen.face, seen.share, seen.fine, faces, kinds, place, light, palette, cut, checked,
+        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, materials, template_points, light, palette, measures, checked,
         rgb, alpha,
     )  # fmt: skip
     return rgb, alpha
 
 
-def over(
+def composite_over(
     rgb: Float32[np.ndarray, "height width 3"],
     alpha: Float32[np.ndarray, "height width"],
     background: UInt8[np.ndarray, "height width 3"] | None = None,
@@ -75,7 +75,7 @@ def _shade(
                     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
                     on_b, on_c = share_of[row, column, 0], share_of[row, column, 1]
                     on_a = 1.0 - on_b - on_c
-                    colour = colour_of(
+                    colour = albedo_at(
                         kinds[face],
                         on_a * place[a, 0] + on_b * place[b, 0] + on_c * place[c, 0],
                         on_a * place[a, 1] + on_b * place[b, 1] + on_c * place[c, 1],

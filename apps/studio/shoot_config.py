@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -11,9 +11,9 @@ class ShootConfig:
     """What is filmed, and how well the poses and masks are known."""
 
     frames: int = 120
-    """Frames of the video."""
+    """EvaluationFrames of the video."""
     fps: float = 30.0
-    """Frames per second of the video."""
+    """EvaluationFrames per second of the video."""
     size: int = 270
     """Width and height of the pictures in pixels; a walkaround's are so wide, and 16:9."""
     turns: float | None = None
@@ -37,20 +37,20 @@ class ShootConfig:
     """Noise of the masks: standard deviation of their border, in pixels."""
 
     @property
-    def walks(self) -> bool:
+    def camera_moves(self) -> bool:
         """Whether the camera moves."""
         return self.motion == "walkaround"
 
     @property
-    def behind(self) -> Literal["plain", "clutter", "room", "tiles"]:
+    def effective_background(self) -> Literal["plain", "clutter", "room", "tiles"]:
         """What stands behind the actor, if nobody said it, too."""
-        return self.background or ("room" if self.walks else "clutter")
+        return self.background or ("room" if self.camera_moves else "clutter")
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Refuses what cannot be filmed.
 
         Raises:
-            BadInput: If a number is out of its range.
+            InputError: If a number is out of its range.
         """
         ranges = {
             "frames": (1, 100_000), "fps": (0.1, 1000.0), "size": (16, 4096),
@@ -61,9 +61,9 @@ class ShootConfig:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 option = "--" + name.replace("_", "-")
-                raise BadInput(f"{option} is {value}, but must lie between {low} and {high}.")
-        if self.walks and self.behind in ("plain", "clutter"):
-            raise BadInput(
-                f"--background {self.behind} is painted for a camera that stands still; with "
+                raise InputError(f"{option} is {value}, but must lie between {low} and {high}.")
+        if self.camera_moves and self.effective_background in ("plain", "clutter"):
+            raise InputError(
+                f"--background {self.effective_background} is painted for a camera that stands still; with "
                 "--motion walkaround give room or tiles."
             )

@@ -12,18 +12,18 @@ from jaxtyping import Float, Float32, UInt8
 
 from apps.studio import backdrop
 from apps.studio.actor import Actor
-from apps.studio.room import Room
-from apps.studio.shade import over
+from apps.studio.room import FurnishedRoom
+from apps.studio.shade import composite_over
 from capture.camera import Camera
 from preprocess.pose import BodyPose, Motion
 
-Picture = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
+RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
 """The actor on the stage, and the exact soft mask."""
 
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Stage:
+class StudioScene:
     """What a motion is filmed on.
 
     Attributes:
@@ -35,24 +35,24 @@ class Stage:
 
     actor: Actor
     cameras: tuple[Camera, ...]
-    behind: UInt8[np.ndarray, "height width 3"] | Room
-    first: int = 0
+    background: UInt8[np.ndarray, "height width 3"] | FurnishedRoom
+    first_frame_number: int = 0
 
-    def picture(self, pose: BodyPose, number: int) -> Picture:
+    def render(self, pose: BodyPose, number: int) -> RenderedFrame:
         """One picture."""
         camera = self.cameras[min(number, len(self.cameras) - 1)]
-        rgb, alpha = self.actor.layers_of(pose, camera)
+        rgb, alpha = self.actor.render_rgb_alpha(pose, camera)
         feet = self.actor.shaped.with_pose(pose).joints()[[10, 11]]
-        return over(rgb, alpha, self._background(camera, feet, number)), alpha
+        return composite_over(rgb, alpha, self._render_background(camera, feet, number)), alpha
 
-    def pictures(self, motion: Motion) -> Iterator[Picture]:
+    def render_all(self, motion: Motion) -> Iterator[RenderedFrame]:
         """All pictures of a motion in order, a few drawn ahead on other threads."""
         workers = max(1, min(4, cpu_count() or 1))
         with ThreadPoolExecutor(workers) as pool:
             ahead = deque()
             try:
                 for row in range(len(motion)):
-                    ahead.append(pool.submit(self.picture, motion[row], row))
+                    ahead.append(pool.submit(self.render, motion[row], row))
                     if len(ahead) > workers:
                         yield ahead.popleft().result()
                 while ahead:
@@ -61,9 +61,9 @@ class Stage:
                 for waiting in ahead:
                     waiting.cancel()
 
-    def _background(
+    def _render_background(
         self, camera: Camera, feet: Float[np.ndarray, "feet 3"], number: int
     ) -> UInt8[np.ndarray, "height width 3"]:
-        if isinstance(self.behind, Room):
-            return self.behind.picture(camera, feet, self.first + number)
-        return backdrop.shadowed(self.behind, feet, camera)
+        if isinstance(self.background, FurnishedRoom):
+            return self.background.render(camera, feet, self.first_frame_number + number)
+        return backdrop.add_foot_shadows(self.background, feet, camera)

@@ -8,13 +8,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from capture.camera import Camera
 from preprocess.pose import Motion
-from preprocess.poses.place import moved
+from preprocess.poses.place import transform_motion
 
 NOISE_FRAMES = 3.0
 """A tracker wanders rather than flickers: its error is smooth over about this many frames."""
 
 
-def tracked(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
+def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
     """What a tracker would have said: the motion with smooth noise on rotations and place.
 
     Args:
@@ -37,7 +37,7 @@ def tracked(motion: Motion, *, degrees: float, centimetres: float, seed: int) ->
     )
 
 
-def in_cameras(
+def to_camera_space(
     motion: Motion, cameras: tuple[Camera, ...], pelvis: Float[np.ndarray, "3"]
 ) -> Motion:
     """The motion as a tracker tells it that knows no world: each row in its frame's camera, with K.
@@ -48,7 +48,7 @@ def in_cameras(
         pelvis: Where the person's pelvis rests.
     """
     views = np.stack([camera.camera_from_world for camera in cameras])
-    return replace(moved(motion, views, pelvis), space="camera", intrinsic=cameras[0].intrinsic)
+    return replace(transform_motion(motion, views, pelvis), space="camera", intrinsic=cameras[0].intrinsic)
 
 
 def _smooth_noise(

@@ -12,26 +12,26 @@ from jaxtyping import Float32, UInt8
 from apps.playing.encoders import video_encoder
 from apps.studio import backdrop, motions, walk
 from apps.studio.actor import Actor
-from apps.studio.framing import framed
-from apps.studio.room import Room
-from apps.studio.roughen import roughened
+from apps.studio.framing import static_camera
+from apps.studio.room import FurnishedRoom
+from apps.studio.roughen import add_mask_noise
 from apps.studio.shoot_config import ShootConfig as ShootConfig
-from apps.studio.stage import Stage
-from apps.studio.tracker import in_cameras, tracked
-from apps.terminal.places import check_folder_place
-from capture.atomic_files import whole_folder
+from apps.studio.stage import StudioScene
+from apps.studio.tracker import to_camera_space, add_pose_noise
+from apps.terminal.places import check_output_folder
+from capture.atomic_files import atomic_folder
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.quiet import silence_opencv
 from preprocess.pose import Motion
 from preprocess.pose_file import write_motion
 
-Progress = Callable[[int, int], None]
+ShootProgress = Callable[[int, int], None]
 """Called after each picture with how many are done and how many there will be."""
 
 
-def shoot(
-    out: Path, config: ShootConfig, progress: Progress | None = None, *, overwrite: bool = False
+def film_capture(
+    out: Path, config: ShootConfig, progress: ShootProgress | None = None, *, overwrite: bool = False
 ) -> None:
     """Films the actor into the folder `out`, which appears whole or not at all.
 
@@ -43,42 +43,42 @@ def shoot(
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
 
     Raises:
-        BadInput: If `out` is in the way, or a number of `config` is out of its range.
+        InputError: If `out` is in the way, or a number of `config` is out of its range.
         OSError: If the disk is full.
     """
-    config.check()
-    _check_free(out, overwrite=overwrite)
-    with whole_folder(out) as unfinished:
-        _film(unfinished, config, progress or (lambda done, total: None))
+    config.validate()
+    _check_output(out, overwrite=overwrite)
+    with atomic_folder(out) as unfinished:
+        _write_capture(unfinished, config, progress or (lambda done, total: None))
 
 
-def _check_free(out: Path, *, overwrite: bool) -> None:
-    check_folder_place(out, "OUT")
+def _check_output(out: Path, *, overwrite: bool) -> None:
+    check_output_folder(out, "OUT")
     if not overwrite and out.exists() and any(out.iterdir()):
-        raise BadInput(f"{out} already exists. Choose another OUT, or give --overwrite.")
+        raise InputError(f"{out} already exists. Choose another OUT, or give --overwrite.")
 
 
-def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:
+def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:
     actor = Actor.of(config.subject, config.seed)
-    truth = _acted(actor, config)
-    stages = _stages(actor, truth, config)
-    novel = motions.novel(actor)
+    truth = _choose_motion(actor, config)
+    stages = _build_scenes(actor, truth, config)
+    novel = motions.novel_poses(actor)
     total = len(truth) + len(novel)
     _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
     _write_preview(folder, config.fps)
-    _write_novel(
+    _write_novel_poses(
         folder / "truth" / "novel", stages[1], novel,
         lambda done: progress(len(truth) + done, total),
     )  # fmt: skip
     cameras = stages[0].cameras
-    given = truth if not config.walks else in_cameras(truth, cameras, actor.shaped.joints[0])
-    given = tracked(
+    given = truth if not config.camera_moves else to_camera_space(truth, cameras, actor.shaped.joints[0])
+    given = add_pose_noise(
         given, degrees=config.pose_noise_deg, centimetres=config.pose_noise_cm, seed=config.seed
     )
     write_motion(folder / "poses.npz", given)
     write_motion(folder / "truth" / "poses.npz", truth)
-    write_motion(folder / "dance.npz", motions.clip(actor))
-    if config.walks:
+    write_motion(folder / "dance.npz", motions.unfilmed_dance(actor))
+    if config.camera_moves:
         # Nobody tells a phone where it is: the cameras are truth, and lie where no command looks.
         _write_cameras(folder / "truth" / "cameras.npz", cameras)
         _write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
@@ -86,33 +86,33 @@ def _film(folder: Path, config: ShootConfig, progress: Progress) -> None:
         _write_cameras(folder / "cameras.npz", cameras)
 
 
-def _acted(actor: Actor, config: ShootConfig) -> Motion:
-    acts = {"turn": motions.turn, "dance": motions.dance, "walkaround": motions.in_place}
+def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    acts = {"turn": motions.turning_motion, "dance": motions.dancing_motion, "walkaround": motions.gesturing_motion}
     turns = config.turns
     if turns is None:
-        turns = -0.75 if config.walks else 2.0
+        turns = -0.75 if config.camera_moves else 2.0
     return acts[config.motion](
         actor, frames=config.frames, fps=config.fps, turns=turns, seed=config.seed
     )
 
 
-def _stages(actor: Actor, truth: Motion, config: ShootConfig) -> tuple[Stage, Stage]:
+def _build_scenes(actor: Actor, truth: Motion, config: ShootConfig) -> tuple[StudioScene, StudioScene]:
     """Where the film is made, and where the poses that no film holds are pictured."""
-    kind = config.behind
-    if config.walks:
-        tall = walk.height_of(actor)
+    kind = config.effective_background
+    if config.camera_moves:
+        tall = walk.actor_height_m(actor)
         at = (truth.root_translations + actor.shaped.joints[0])[:, [0, 2]]
-        cameras = walk.carried(at, tall, config.size, config.seed)
-        apart = walk.standing(tall, config.size)
+        cameras = walk.handheld_cameras(at, tall, config.size, config.seed)
+        apart = walk.standing_camera(tall, config.size)
     else:
-        apart = framed(actor, config.size)
+        apart = static_camera(actor, config.size)
         cameras = (apart,)
     if kind == "room" or kind == "tiles":
-        behind = Room.furnished(kind, config.size, config.seed)
+        behind = FurnishedRoom.furnished(kind, config.size, config.seed)
     else:
-        behind = backdrop.paint(kind, apart, np.random.default_rng([config.seed, 4]))
-    filmed = Stage(actor=actor, cameras=cameras, behind=behind)
-    return filmed, replace(filmed, cameras=(apart,), first=len(truth))
+        behind = backdrop.paint_backdrop(kind, apart, np.random.default_rng([config.seed, 4]))
+    filmed = StudioScene(actor=actor, cameras=cameras, background=behind)
+    return filmed, replace(filmed, cameras=(apart,), first_frame_number=len(truth))
 
 
 def _write_cameras(path: Path, cameras: tuple[Camera, ...]) -> None:
@@ -129,7 +129,7 @@ def _write_cameras(path: Path, cameras: tuple[Camera, ...]) -> None:
 
 
 def _write_video(
-    folder: Path, stage: Stage, motion: Motion, config: ShootConfig, done: Callable[[int], None]
+    folder: Path, stage: StudioScene, motion: Motion, config: ShootConfig, done: Callable[[int], None]
 ) -> None:
     """video.mp4, lossless (FFV1), and masks/."""
     (folder / "masks").mkdir()
@@ -140,16 +140,16 @@ def _write_video(
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, stage.cameras[0].size_px)
     if not writer.isOpened():
         path.write_bytes(bytes(1 << 16))  # says so if there is no room
-        raise BadInput(
+        raise InputError(
             f"OpenCV {cv2.__version__} cannot write a lossless video (FFV1 in .mp4); 4.13 or newer "
             "can: pip install --upgrade opencv-contrib-python-headless."
         )
     generator = np.random.default_rng([config.seed, 5])
     try:
-        for index, (rgb, alpha) in enumerate(stage.pictures(motion)):
+        for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
             writer.write(np.ascontiguousarray(rgb[..., ::-1]))
-            mask = roughened(alpha, config.mask_noise_px, generator)
-            _write_png(folder / "masks" / f"{index:04d}.png", _eight_bit(mask))
+            mask = add_mask_noise(alpha, config.mask_noise_px, generator)
+            _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
             done(index + 1)
     finally:
         writer.release()
@@ -177,18 +177,18 @@ def _write_preview(folder: Path, fps: float) -> None:
     video_encoder(".webm", transparent=False).write(folder / "preview.webm", frames(), fps)
 
 
-def _write_novel(folder: Path, stage: Stage, motion: Motion, done: Callable[[int], None]) -> None:
+def _write_novel_poses(folder: Path, stage: StudioScene, motion: Motion, done: Callable[[int], None]) -> None:
     """Never-seen poses with their true images and masks."""
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
-    for index, (rgb, alpha) in enumerate(stage.pictures(motion)):
+    for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
         _write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
-        _write_png(folder / "masks" / f"{index:04d}.png", _eight_bit(alpha))
+        _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(alpha))
         done(index + 1)
     write_motion(folder / "poses.npz", motion)
 
 
-def _eight_bit(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+def _to_uint8(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
     return (alpha * 255.0 + 0.5).astype(np.uint8)
 
 

@@ -15,7 +15,7 @@ import tyro
 
 DISTRIBUTION = "instant-avatar-stream"
 
-HELP = frozenset({"-h", "--help"})
+HELP_FLAGS = frozenset({"-h", "--help"})
 
 Arguments = TypeVar("Arguments")
 Flag = Annotated[
@@ -25,7 +25,7 @@ Flag = Annotated[
 ]
 
 
-def parsed(kind: type[Arguments], program: str, words: Sequence[str] | None = None) -> Arguments:
+def parse_arguments(arguments_type: type[Arguments], program: str, argv: Sequence[str] | None = None) -> Arguments:
     """The arguments of a command; --help and --version are answered, and end it.
 
     Args:
@@ -36,33 +36,33 @@ def parsed(kind: type[Arguments], program: str, words: Sequence[str] | None = No
     Raises:
         SystemExit: With 0 once --help or --version was answered, 2 if the words make no sense.
     """
-    words = sys.argv[1:] if words is None else list(words)
-    if "--version" in words:
-        print(f"{program} ({DISTRIBUTION}) {_version()}")  # noqa: T201 - what was asked for
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if "--version" in argv:
+        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - what was asked for
         raise SystemExit(0)
     own: list[tuple[str, Any, Any]] = [("version", Flag, field(default=False))]
-    both: Any = make_dataclass(kind.__name__, own, bases=(kind,), frozen=True, kw_only=True)
-    both.__doc__ = kind.__doc__
-    if HELP.isdisjoint(words):
-        told = tyro.cli(both, prog=program, args=words)
+    both: Any = make_dataclass(arguments_type.__name__, own, bases=(arguments_type,), frozen=True, kw_only=True)
+    both.__doc__ = arguments_type.__doc__
+    if HELP_FLAGS.isdisjoint(argv):
+        told = tyro.cli(both, prog=program, args=argv)
     else:
-        told = _told_or_helped(both, program, words)
+        told = _parse_with_wrapped_help(both, program, argv)
     given = {each.name: getattr(told, each.name) for each in fields(both)}
     del given["version"]
-    return kind(**given)
+    return arguments_type(**given)
 
 
-def _told_or_helped(kind: Any, program: str, words: Sequence[str]) -> Any:
+def _parse_with_wrapped_help(arguments_type: Any, program: str, argv: Sequence[str]) -> Any:
     """As tyro does it, but paragraphs are lines that fit the terminal."""
-    held = _Held()
+    held = _CapturedStdout()
     try:
         with redirect_stdout(held):
-            return tyro.cli(kind, prog=program, args=words)
+            return tyro.cli(arguments_type, prog=program, args=argv)
     finally:
-        print(_in_lines(held.getvalue()), end="")  # noqa: T201 - what was asked for
+        print(_wrap_paragraphs(held.getvalue()), end="")  # noqa: T201 - what was asked for
 
 
-def _version() -> str:
+def _installed_version() -> str:
     """Of the installed distribution."""
     try:
         return version(DISTRIBUTION)
@@ -70,7 +70,7 @@ def _version() -> str:
         return "(a checkout that is not installed)"
 
 
-class _Held(io.StringIO):
+class _CapturedStdout(io.StringIO):
     """What is printed, held back; with the colours and the letters that stdout can show."""
 
     encoding = property(lambda self: getattr(sys.__stdout__, "encoding", "utf-8"))  # type: ignore[assignment]
@@ -79,7 +79,7 @@ class _Held(io.StringIO):
         return sys.__stdout__ is not None and sys.__stdout__.isatty()
 
 
-def _in_lines(text: str) -> str:
+def _wrap_paragraphs(text: str) -> str:
     """Paragraphs, which tyro makes one line each, in lines of the terminal's width."""
     width = shutil.get_terminal_size().columns
     lines = [

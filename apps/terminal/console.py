@@ -12,19 +12,19 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
-MOST_WARNINGS = 5
+MAX_PRINTED_WARNINGS = 5
 """Warnings that are printed; the rest are counted, and all stand in the report."""
-MOST_KEPT = 500
+MAX_KEPT_WARNINGS = 500
 """Warnings that are kept, so that memory stays bounded however long a video lasts."""
-LOG_EVERY_S = 10.0
-NARROWEST_BAR = 8
+LOG_INTERVAL_S = 10.0
+MIN_BAR_WIDTH = 8
 """Characters of a bar beside a long note."""
-ESTIMATED_AFTER_S, ESTIMATED_FROM = 2.0, 0.15
+MIN_ELAPSED_FOR_ESTIMATE_S, MIN_SHARE_FOR_ESTIMATE = 2.0, 0.15
 """Before that time, and before that share is done, too little is known to say how long the rest
 takes."""
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A duration as people say it: "5 s", "40 s", "2 min"; above ten seconds in steps of five."""
     if seconds > 90.0:
         return f"{seconds / 60.0:.0f} min"
@@ -32,7 +32,7 @@ def duration(seconds: float) -> str:
 
 
 @final
-class Stderr(RichConsole):
+class StderrConsole(RichConsole):
     """What people read; once nobody does (`… 2>&1 | head`), the work goes on in silence."""
 
     def __init__(self) -> None:
@@ -54,72 +54,72 @@ class Console:
 
     def __init__(self, console: RichConsole | None = None) -> None:
         """A console on stderr, unless another is given."""
-        self._rich = console or Stderr()
+        self._rich = console or StderrConsole()
         self.warnings: list[str] = []
-        self._beyond = 0
+        self._discarded_warnings = 0
 
     @property
-    def live(self) -> bool:
+    def is_terminal(self) -> bool:
         """Whether somebody watches."""
         return self._rich.is_terminal
 
-    def say(self, message: str) -> None:
+    def info(self, message: str) -> None:
         """A line."""
         self._rich.print(escape(message), highlight=False)
 
-    def say_last(self, message: str) -> None:
+    def info_before_exit(self, message: str) -> None:
         """A line, from wherever the command is; the terminal gets its cursor back."""
         self._rich.show_cursor(True)
         with suppress(BrokenPipeError):
-            os.write(2, f"\n{message}\n".encode() if self.live else f"{message}\n".encode())
+            os.write(2, f"\n{message}\n".encode() if self.is_terminal else f"{message}\n".encode())
 
-    def made(self, what: str, path: object) -> None:
+    def print_artifact(self, what: str, path: object) -> None:
         """A line that names a file that is there now."""
         self._rich.print(f"  [green]{escape(what):<12}[/] {escape(str(path))}", highlight=False)
 
-    def warn(self, message: str) -> None:
+    def warning(self, message: str) -> None:
         """Something the user should know; the same is never said twice."""
         if message in self.warnings:
             return
-        if len(self.warnings) == MOST_KEPT:
-            self._beyond += 1
+        if len(self.warnings) == MAX_KEPT_WARNINGS:
+            self._discarded_warnings += 1
             return
         self.warnings.append(message)
-        if len(self.warnings) <= MOST_WARNINGS:
+        if len(self.warnings) <= MAX_PRINTED_WARNINGS:
             self._rich.print(f"[yellow]warning:[/] {escape(message)}", highlight=False)
 
-    def count_the_rest(self) -> None:
+    def summarize_warnings(self) -> None:
         """Says how many warnings were kept back."""
-        rest = len(self.warnings) - MOST_WARNINGS
+        rest = len(self.warnings) - MAX_PRINTED_WARNINGS
         if rest > 0:
-            beyond = f", and {self._beyond} that are not" if self._beyond else ""
+            beyond = f", and {self._discarded_warnings} that are not" if self._discarded_warnings else ""
             self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report{beyond}")
 
     @contextmanager
-    def waiting(self, message: str) -> Iterator[Callable[[str], None]]:
+    def status(self, message: str) -> Iterator[Callable[[str], None]]:
         """Something that takes a moment: a spinner on a terminal, a line in a log.
 
         What is yielded says beside the spinner how far it is.
         """
-        if not self.live:
-            self.say(message)
+        if not self.is_terminal:
+            self.info(message)
             yield lambda _: None
             return
         with self._rich.status(escape(message)) as status:
             yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
 
-    def bar(self, label: str, total: float) -> "Bar":
+    def progress(self, label: str, total: float) -> "ProgressBar":
         """A progress bar; use it in a `with` block. A log gets a line at its beginning."""
-        return Bar(self._rich, label, total)
+        return ProgressBar(self._rich, label, total)
 
 
-def _kept(width: int) -> Column:
+def _min_width_column(width: int) -> Column:
     """A column that keeps this many characters in a narrow terminal."""
     return Column(min_width=width, no_wrap=True)
 
 
 @final
-class Bar:
+class ProgressBar:
     """How far something has come: a bar on a terminal, now and then a line in a log."""
 
     def __init__(self, console: RichConsole, label: str, total: float) -> None:
@@ -127,15 +127,15 @@ class Bar:
         self._console, self._label, self._total = console, label, total
         self._progress: Progress | None = None
         self._task = TaskID(0)
-        self._began_at = self._said_at = time.perf_counter()
+        self._started_at = self._logged_at = time.perf_counter()
         self._drawn_at = 0.0
 
-    def __enter__(self) -> "Bar":
+    def __enter__(self) -> "ProgressBar":
         """Shows it."""
         if self._console.is_terminal:
             self._progress = Progress(
-                TextColumn("[bold]{task.description}", table_column=_kept(len(self._label))),
-                BarColumn(bar_width=28, table_column=_kept(NARROWEST_BAR)),
+                TextColumn("[bold]{task.description}", table_column=_min_width_column(len(self._label))),
+                BarColumn(bar_width=28, table_column=_min_width_column(MIN_BAR_WIDTH)),
                 TextColumn("{task.fields[note]}"),
                 console=self._console,
                 transient=True,
@@ -156,28 +156,28 @@ class Bar:
         if self._progress is not None:
             self._progress.stop()
 
-    def count(self, done: int) -> None:
+    def set_count(self, done: int) -> None:
         """This number of the total is done; says how long the rest takes."""
-        self.move(float(done), f"{done} of {self._total:.0f}{self._rest(float(done))}")
+        self.update(float(done), f"{done} of {self._total:.0f}{self._remaining_text(float(done))}")
 
-    def share(self, done: float) -> None:
+    def set_share(self, done: float) -> None:
         """This share of the total is done; says how long the rest takes."""
-        self.move(done, f"{done / self._total:.0%}{self._rest(done)}")
+        self.update(done, f"{done / self._total:.0%}{self._remaining_text(done)}")
 
-    def _rest(self, done: float) -> str:
-        took = time.perf_counter() - self._began_at
-        early = done < ESTIMATED_FROM * self._total or took < ESTIMATED_AFTER_S
+    def _remaining_text(self, done: float) -> str:
+        took = time.perf_counter() - self._started_at
+        early = done < MIN_SHARE_FOR_ESTIMATE * self._total or took < MIN_ELAPSED_FOR_ESTIMATE_S
         if early or done >= self._total:
             return ""
-        return f", about {duration(took * (self._total - done) / done)} left"
+        return f", about {format_duration(took * (self._total - done) / done)} left"
 
-    def move(self, done: float, note: str) -> None:
+    def update(self, done: float, note: str) -> None:
         """So far, and a few words; cheap enough to call at every step."""
         now = time.perf_counter()
         if self._progress is not None:
             if now - self._drawn_at > 0.1:
                 self._drawn_at = now
                 self._progress.update(self._task, completed=done, note=escape(note))
-        elif now - self._said_at >= LOG_EVERY_S:
-            self._said_at = now
+        elif now - self._logged_at >= LOG_INTERVAL_S:
+            self._logged_at = now
             self._console.print(f"{self._label}: {escape(note)}", highlight=False)

@@ -2,15 +2,15 @@
 
 import torch
 
-from capture.errors import BadInput
+from capture.errors import InputError
 
-SLOW_ON_CUDA = (
+CUDA_SLOW_WARNING = (
     "--device cuda runs the plain-torch reference, which is slower than the CPU: there are no CUDA "
     "kernels yet. Leave --device out to train on the CPU."
 )
 
 
-def device_for(name: str) -> torch.device:
+def resolve_device(name: str) -> torch.device:
     """Returns the device for --device.
 
     Args:
@@ -18,10 +18,10 @@ def device_for(name: str) -> torch.device:
             kernels.
 
     Raises:
-        BadInput: If CUDA was asked for, and torch sees no GPU.
+        InputError: If CUDA was asked for, and torch sees no GPU.
     """
     if name == "cuda" and not torch.cuda.is_available():
-        raise BadInput(
+        raise InputError(
             "--device cuda was asked for, but torch sees no GPU here. Leave --device out, or "
             "install torch with CUDA and check nvidia-smi."
         )

@@ -5,27 +5,27 @@ from collections.abc import Callable
 
 from rich.markup import escape
 
-from apps.terminal.console import Stderr
+from apps.terminal.console import StderrConsole
 from apps.terminal.interrupt import INTERRUPTED as INTERRUPTED
-from apps.terminal.interrupt import noted
-from apps.terminal.packages import advice
-from capture.errors import BadInput
+from apps.terminal.interrupt import record_interrupt
+from apps.terminal.packages import install_advice
+from capture.errors import InputError
 
-DONE, NO_AVATAR, BAD_INPUT, NO_ROOM = 0, 1, 2, 3
+DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE = 0, 1, 2, 3
 """1: learnt, and the result is no usable avatar (verdict "failed", or nothing to draw)."""
 
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """The disk, the quota, or the largest size that a file may have."""
-FORBIDDEN = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-NO_PLACE = frozenset(
+PERMISSION_ERRNOS = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+PATH_ERRNOS = frozenset(
     {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
 )
 """Names that nothing can be read from or written to."""
-BUSY = ("out of memory", "busy or unavailable", "not enough memory")
+DEVICE_BUSY_PHRASES = ("out of memory", "busy or unavailable", "not enough memory")
 """What torch says of a device that cannot be used now."""
 
 
-class Stop(Exception):  # noqa: N818 - an end, not always an error
+class CommandExit(Exception):  # noqa: N818 - an end, not always an error
     """Ends the command with a message and an exit code."""
 
     def __init__(self, message: str, code: int) -> None:
@@ -34,7 +34,7 @@ class Stop(Exception):  # noqa: N818 - an end, not always an error
         self.code = code
 
 
-def exit_code(program: str, work: Callable[[], int]) -> int:
+def run_command(program: str, work: Callable[[], int]) -> int:
     """Runs a command's work; what a user or a machine can cause becomes one message and a number.
 
     No usable avatar is 1, bad input or a package that is not installed 2, a full disk or a busy
@@ -44,64 +44,64 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
         program: The command's name, in front of the message.
         work: Returns its own exit code.
     """
-    with noted() as interrupted:
+    with record_interrupt() as interrupted:
         try:
-            return _exit_code(program, work)
+            return _run_translating_errors(program, work)
         except Exception:
             if not interrupted.is_set():
                 raise
-    complain(program, "stopped by Ctrl-C.")
+    print_error(program, "stopped by Ctrl-C.")
     return INTERRUPTED
 
 
-def _exit_code(program: str, work: Callable[[], int]) -> int:
+def _run_translating_errors(program: str, work: Callable[[], int]) -> int:
     try:
         return work()
-    except Stop as end:
+    except CommandExit as end:
         code, message = end.code, str(end)
-    except BadInput as error:
+    except InputError as error:
         code, message = BAD_INPUT, str(error)
     except ModuleNotFoundError as error:
-        missing = advice(error)
+        missing = install_advice(error)
         if missing is None:
             raise
         code, message = BAD_INPUT, missing
     except KeyboardInterrupt as error:
         code, message = INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
     except (OSError, RuntimeError, MemoryError) as error:
-        failure = _of_the_machine(error)
+        failure = _machine_failure(error)
         if failure is None:
             raise
         code, message = failure[0], _with_notes(failure[1], error)
-    complain(program, message)
+    print_error(program, message)
     return code
 
 
-def complain(program: str, message: str) -> None:
+def print_error(program: str, message: str) -> None:
     """One message on stderr."""
-    Stderr().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
+    StderrConsole().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
 
 
-def is_full(error: OSError) -> bool:
+def is_disk_full(error: OSError) -> bool:
     """Whether a write failed for want of room."""
-    return error.errno in FULL
+    return error.errno in DISK_FULL_ERRNOS
 
 
-def _of_the_machine(error: OSError | RuntimeError | MemoryError) -> tuple[int, str] | None:
+def _machine_failure(error: OSError | RuntimeError | MemoryError) -> tuple[int, str] | None:
     """Exit code and message of what the machine could not do; None for everything else."""
     if isinstance(error, OSError):
         why = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-        if is_full(error):
-            return NO_ROOM, f"the disk is full ({why}). Make room, or write elsewhere."
+        if is_disk_full(error):
+            return RESOURCE_UNAVAILABLE, f"the disk is full ({why}). Make room, or write elsewhere."
         if error.errno == errno.EBUSY:
-            return NO_ROOM, f"a device is busy ({why})."
-        if error.errno in FORBIDDEN | NO_PLACE:
+            return RESOURCE_UNAVAILABLE, f"a device is busy ({why})."
+        if error.errno in PERMISSION_ERRNOS | PATH_ERRNOS:
             return BAD_INPUT, f"cannot read or write there ({why}). Name another place."
         return None
     said = str(error).strip() or "out of memory"
-    if isinstance(error, MemoryError) or any(words in said.lower() for words in BUSY):
+    if isinstance(error, MemoryError) or any(words in said.lower() for words in DEVICE_BUSY_PHRASES):
         first = said.splitlines()[0]
-        return NO_ROOM, f"the device has no room or is busy ({first}). Try a smaller --size."
+        return RESOURCE_UNAVAILABLE, f"the device has no room or is busy ({first}). Try a smaller --size."
     return None
 
 

@@ -13,8 +13,8 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def asked_to_stop(
-    console: Console, kept: str = "what was learnt is being saved"
+def stop_on_interrupt(
+    console: Console, saving_message: str = "what was learnt is being saved"
 ) -> Iterator[threading.Event]:
     """An event that the first Ctrl-C sets; the second raises KeyboardInterrupt as always.
 
@@ -32,7 +32,7 @@ def asked_to_stop(
     def first(signal_number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop.set()
-        console.say(f"Stopping; {kept}. Ctrl-C again quits at once.")
+        console.info(f"Stopping; {saving_message}. Ctrl-C again quits at once.")
 
     before = signal.signal(signal.SIGINT, first)
     try:
@@ -42,8 +42,8 @@ def asked_to_stop(
 
 
 @contextmanager
-def nothing_to_save(
-    console: Console, program: str, tidy: Callable[[], None] = lambda: None
+def exit_on_interrupt(
+    console: Console, program: str, cleanup: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
     """Ctrl-C ends the process where it stands.
 
@@ -57,8 +57,8 @@ def nothing_to_save(
     """
 
     def leave(signal_number: int, frame: object) -> None:
-        tidy()
-        console.say_last(f"{program}: stopped by Ctrl-C.")
+        cleanup()
+        console.info_before_exit(f"{program}: stopped by Ctrl-C.")
         os._exit(INTERRUPTED)
 
     if threading.current_thread() is not threading.main_thread():
@@ -72,7 +72,7 @@ def nothing_to_save(
 
 
 @contextmanager
-def noted() -> Iterator[threading.Event]:
+def record_interrupt() -> Iterator[threading.Event]:
     """An event that is set by Ctrl-C, which raises KeyboardInterrupt as always.
 
     What is being imported may turn that into an error of its own; the event still knows. Off the
@@ -97,7 +97,7 @@ def noted() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def ended_by_ctrl_c() -> Iterator[threading.Event]:
+def interrupt_event() -> Iterator[threading.Event]:
     """An event that every Ctrl-C sets, and that none of them can miss.
 
     A KeyboardInterrupt may be raised in a callback that swallows it, and then nothing ends. Off the

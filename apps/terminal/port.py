@@ -3,14 +3,14 @@
 from collections.abc import Callable, Sequence
 
 
-def with_port(words: Sequence[str], flag: str, port: int) -> list[str]:
+def fill_optional_port(argv: Sequence[str], flag: str, port: int) -> list[str]:
     """The command line with the port that may be left out after a flag."""
-    return _filled(words, flag, str(port), lambda word: word.isdecimal())
+    return _fill_optional(argv, flag, str(port), lambda word: word.isdecimal())
 
 
-def with_value(words: Sequence[str], flag: str, value: float) -> list[str]:
+def fill_optional_number(argv: Sequence[str], flag: str, value: float) -> list[str]:
     """The command line with the number that may be left out after a flag."""
-    return _filled(words, flag, f"{value:g}", _is_number)
+    return _fill_optional(argv, flag, f"{value:g}", _is_number)
 
 
 def _is_number(word: str) -> bool:
@@ -21,12 +21,12 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _filled(words: Sequence[str], flag: str, value: str, fits: Callable[[str], bool]) -> list[str]:
+def _fill_optional(argv: Sequence[str], flag: str, value: str, is_value: Callable[[str], bool]) -> list[str]:
     """argparse would take the next word for the value, whatever that is."""
     filled: list[str] = []
-    for place, word in enumerate(words):
+    for place, word in enumerate(argv):
         filled.append(word)
-        after = words[place + 1] if place + 1 < len(words) else ""
-        if word == flag and not fits(after):
+        after = argv[place + 1] if place + 1 < len(argv) else ""
+        if word == flag and not is_value(after):
             filled.append(value)
     return filled

@@ -6,14 +6,14 @@ import numba
 import torch
 
 
-def use_threads(wish: int | None) -> int:
+def set_threads(requested: int | None) -> int:
     """Sets torch's and numba's threads: what was asked for, else one for each core we may use.
 
     Returns:
         How many there are now; numba cannot have more than it started with.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    threads = max(1, min(wish or cores or 1, numba.get_num_threads()))
+    threads = max(1, min(requested or cores or 1, numba.get_num_threads()))
     torch.set_num_threads(threads)
     numba.set_num_threads(threads)
     return threads

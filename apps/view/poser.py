@@ -8,68 +8,68 @@ from typing import final
 
 import numpy as np
 
-from apps.playing.novel import novel_motion
-from apps.recording.recording import Recording
+from apps.playing.novel import demo_motion
+from apps.recording.recording import Capture
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
 from preprocess.kinematics import rotation_matrices
 from preprocess.observation import Observation
 from preprocess.pose import BodyPose, Motion
 
-NEWEST, STANDING, FILMED, DANCE = "Newest", "Standing", "Filmed", "Dance"
-CHOICES = (NEWEST, STANDING, FILMED, DANCE)
-FPS = 30.0
+NEWEST, STANDING, FILMED, DANCE = "Newest", "PersonInCameras", "Filmed", "Dance"
+POSE_CHOICES = (NEWEST, STANDING, FILMED, DANCE)
+DEFAULT_FPS = 30.0
 """Of a motion that does not say how fast it is."""
 
 
 @final
-class Poser:
+class PreviewPoses:
     """Poses for the page, by choice and time."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Capture) -> None:
         """For one person and the motion that was filmed."""
         self._pelvis = recording.shaped.joints[0]
         self._cameras = recording.cameras
-        self._filmed, self._dance = recording.motion, novel_motion()
+        self._filmed, self._dance = recording.motion, demo_motion()
         self._valid = np.flatnonzero(recording.motion.valid)
 
-    def pose(self, choice: str, seconds: float, newest: Observation | None) -> BodyPose:
+    def pose_at(self, choice: str, seconds: float, newest: Observation | None) -> BodyPose:
         """The pose to show.
 
         Args:
-            choice: One of `CHOICES`.
+            choice: One of `POSE_CHOICES`.
             seconds: Since the motion began; motions start again at their end.
             newest: The frame that came last.
         """
         if choice == FILMED:
-            place = np.searchsorted(self._valid, _row(self._filmed, seconds))
+            place = np.searchsorted(self._valid, _row_at(self._filmed, seconds))
             row = int(self._valid[min(place, len(self._valid) - 1)])
-            return self._as_seen(self._filmed[row], self._camera(row))
+            return self._align_to_camera(self._filmed[row], self._camera_of_row(row))
         if choice == DANCE:
-            pose = self._dance[_row(self._dance, seconds)]
-            return self._placed(pose.root_rotation, pose)
+            pose = self._dance[_row_at(self._dance, seconds)]
+            return self._center_on_pelvis(pose.root_rotation, pose)
         if choice == NEWEST and newest is not None:
-            return self._as_seen(newest.pose, newest.camera)
+            return self._align_to_camera(newest.pose, newest.camera)
         standing = BodyPose(
             root_rotation=np.zeros(3),
             root_translation=np.zeros(3),
             joint_rotations=canonical_rotations(),
         )
-        return self._placed(standing.root_rotation, standing)
+        return self._center_on_pelvis(standing.root_rotation, standing)
 
-    def _camera(self, row: int) -> Camera:
+    def _camera_of_row(self, row: int) -> Camera:
         """The camera that filmed a row of the motion."""
         frames, track = self._filmed.frames, self._cameras
         frame = row if frames is None else int(frames[row])
         return track[min(frame, len(track.cameras) - 1)]
 
-    def _as_seen(self, pose: BodyPose, camera: Camera) -> BodyPose:
+    def _align_to_camera(self, pose: BodyPose, camera: Camera) -> BodyPose:
         """Turned so that the page's camera sees what this camera saw."""
         page_from_camera = np.diag([1.0, -1.0, -1.0])
         turned = page_from_camera @ camera.camera_from_world[:3, :3]
-        return self._placed(_axis_angle(turned @ rotation_matrices(pose.root_rotation)), pose)
+        return self._center_on_pelvis(_axis_angle(turned @ rotation_matrices(pose.root_rotation)), pose)
 
-    def _placed(self, root_rotation: np.ndarray, pose: BodyPose) -> BodyPose:
+    def _center_on_pelvis(self, root_rotation: np.ndarray, pose: BodyPose) -> BodyPose:
         """The pelvis at the origin: the root turns about its rest place J0."""
         return BodyPose(
             root_rotation=root_rotation,
@@ -78,11 +78,11 @@ class Poser:
         )
 
 
-def _row(motion: Motion, seconds: float) -> int:
+def _row_at(motion: Motion, seconds: float) -> int:
     """The row of a motion that is shown after so many seconds."""
     times = motion.times_s
     if times is None or len(times) < 2 or not np.isfinite(times).all() or times[-1] <= times[0]:
-        return int(seconds * FPS) % len(motion)
+        return int(seconds * DEFAULT_FPS) % len(motion)
     length = (times[-1] - times[0]) * len(times) / (len(times) - 1)
     return int(np.searchsorted(times - times[0], seconds % length, side="right")) - 1
 

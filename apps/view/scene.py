@@ -5,18 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.model import Avatar
 from avatar.render import render
 from capture.camera import Camera
 from preprocess.pose import BodyPose
 
-PAPER = (251, 250, 247)
+BACKGROUND_RGB = (251, 250, 247)
 """The colour that everything stands on; report.html's."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Look:
+class BrowserCamera:
     """Where a browser's camera is, as viser says it (OpenCV axes).
 
     Attributes:
@@ -33,7 +33,7 @@ class Look:
     aspect: float
     moved_at: float
 
-    def camera(self, height_px: int) -> Camera:
+    def to_camera(self, height_px: int) -> Camera:
         """The same as a camera whose picture is so high."""
         width_px = max(1, round(height_px * self.aspect))
         focal = 0.5 * height_px / np.tan(0.5 * self.fov)
@@ -48,8 +48,8 @@ class Look:
         )
 
 
-def drawn(
-    avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: WarpCells
+def render_preview(
+    avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The avatar, as learnt so far, on paper.
 
@@ -60,5 +60,5 @@ def drawn(
         cells: The pose's warp.
     """
     rgba = render(avatar, pose, camera, cells=cells)
-    mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(PAPER, dtype=np.float32)
+    mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(BACKGROUND_RGB, dtype=np.float32)
     return np.clip(mixed + 0.5, 0.0, 255.0).astype(np.uint8)

@@ -14,15 +14,15 @@ Points = Float32[Tensor, "points 3"]
 """Canonical positions, metres."""
 Features = Float32[Tensor, "points width"]
 """What the hash grid holds at points."""
-Table = Float32[Tensor, "entries 4"]
+HashTable = Float32[Tensor, "entries 4"]
 """The hash grid's entries, level after level."""
-Raw = Float32[Tensor, "samples 4"]
+RawOutputs = Float32[Tensor, "samples 4"]
 """The network's outputs: colour logits and log density (log 1/m)."""
-Pixels = Float32[Tensor, "rays 4"]
+PremultipliedPixels = Float32[Tensor, "rays 4"]
 """Premultiplied colour and alpha."""
 
 
-class Samples(NamedTuple):
+class RaySamples(NamedTuple):
     """Canonical samples of a batch of rays, packed ray by ray.
 
     Attributes:
@@ -33,12 +33,12 @@ class Samples(NamedTuple):
     """
 
     points: Float32[Tensor, "samples 3"]
-    first: Int64[Tensor, "rays"]
-    count: Int32[Tensor, "rays"]
-    rows: Int32[Tensor, "samples"]
+    offsets: Int64[Tensor, "rays"]
+    counts: Int32[Tensor, "rays"]
+    root_rows: Int32[Tensor, "samples"]
 
 
-class Rays(NamedTuple):
+class RayBatch(NamedTuple):
     """Rays in the body frame of the frame that each belongs to.
 
     Attributes:
@@ -55,7 +55,7 @@ class Rays(NamedTuple):
     jitter: Float32[Tensor, "rays"]
 
 
-class CellTables(NamedTuple):
+class CorrespondenceTables(NamedTuple):
     """Warp cells of many frames, one slot each (`avatar.cells.WarpCells`, padded).
 
     Attributes:
@@ -63,18 +63,18 @@ class CellTables(NamedTuple):
             to say that all cells less than n away hold nothing either.
         roots: Roots and how the warp moves about them.
         low: Corner of each slot's grid, body frame, metres.
-        shape: Cells along each axis of each slot's grid.
+        shape: SolvedCorrespondences along each axis of each slot's grid.
         cell_m: Edge of a cell, metres.
     """
 
-    index: Int32[Tensor, "slots cells"]
+    packed_cells: Int32[Tensor, "slots cells"]
     roots: Float32[Tensor, "slots roots 12"]
     low: Float32[Tensor, "slots 3"]
     shape: Int32[Tensor, "slots 3"]
     cell_m: float
 
 
-class Cells(NamedTuple):
+class SolvedCorrespondences(NamedTuple):
     """The warp cells of one frame (`avatar.cells.WarpCells`).
 
     Attributes:
@@ -84,11 +84,11 @@ class Cells(NamedTuple):
     """
 
     low: Float32[np.ndarray, "3"]
-    index: Int32[np.ndarray, "gx gy gz"]
+    packed_cells: Int32[np.ndarray, "gx gy gz"]
     roots: Float32[np.ndarray, "rows 12"]
 
 
-class Grid(NamedTuple):
+class DensityGrid(NamedTuple):
     """Canonical occupancy: which cells may hold anything, and the density last seen there.
 
     Attributes:
@@ -104,7 +104,7 @@ class Grid(NamedTuple):
     cells_per_m: Float32[Tensor, "3"]
 
 
-class Skin(NamedTuple):
+class SkinningVolume(NamedTuple):
     """The skinning volume (`avatar.rig.Rig`).
 
     Attributes:
@@ -118,14 +118,14 @@ class Skin(NamedTuple):
     nodes_per_m: Float32[Tensor, "3"]
 
 
-class PosedGrid(NamedTuple):
+class PosedOccupancy(NamedTuple):
     """Which cells of each slot's body frame may hold anything (`avatar.paper`).
 
     Attributes:
         occupied: Above 0 where something may be.
         low: Corner of each slot's grid, metres.
         cells_per_m: Along each axis.
-        shape: Cells along each axis.
+        shape: SolvedCorrespondences along each axis.
         near, far: Corners of the box between whose walls samples lie, metres.
     """
 
@@ -133,11 +133,11 @@ class PosedGrid(NamedTuple):
     low: Float32[Tensor, "slots 3"]
     cells_per_m: Float32[Tensor, "slots 3"]
     shape: Int32[Tensor, "slots 3"]
-    near: Float32[Tensor, "slots 3"]
-    far: Float32[Tensor, "slots 3"]
+    ray_box_low: Float32[Tensor, "slots 3"]
+    ray_box_high: Float32[Tensor, "slots 3"]
 
 
-class Articulations(NamedTuple):
+class BlendedTransforms(NamedTuple):
     """Poses as Fast-SNARF keeps them: blended transforms of each, and where searches start.
 
     Attributes:
@@ -153,7 +153,7 @@ class Articulations(NamedTuple):
     inverses: Float32[Tensor, "slots starts 12"]
 
 
-class Marching(NamedTuple):
+class MarchSettings(NamedTuple):
     """How a ray is sampled.
 
     Attributes:
@@ -161,17 +161,17 @@ class Marching(NamedTuple):
         grace_m: How much farther a ray is followed once its cached optical depth says it is
             opaque; infinity for exact rendering. Metres, never a number of samples: a grace that
             shrinks with the step cuts grazing rays before the surface.
-        most: Samples a ray may have.
+        most: RaySamples a ray may have.
     """
 
-    step_m: float
-    grace_m: float
-    most: int
+    sample_step_m: float
+    opaque_margin_m: float
+    max_samples: int
 
     @property
-    def grace_steps(self) -> int:
+    def opaque_margin_steps(self) -> int:
         """The grace in samples."""
-        return int(min(self.grace_m / self.step_m + 1.0, 1e9))
+        return int(min(self.opaque_margin_m / self.sample_step_m + 1.0, 1e9))
 
 
 @runtime_checkable
@@ -180,95 +180,95 @@ class Backend(Protocol):
 
     name: str
 
-    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
+    def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
         """Hash-grid features."""
         ...
 
     def encode_backward(
-        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
     ) -> None:
         """Adds the table's gradient to `grad_table`."""
         ...
 
     def encode_points_backward(
-        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+        self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
     ) -> Points:
         """Gradient of the features with respect to the points."""
         ...
 
-    def build_cells(
+    def solve_correspondences(
         self,
         rig: Rig,
         bones: Float32[np.ndarray, "24 12"],
         band_m: float,
         cell_m: float,
         device: torch.device,
-    ) -> Cells:
+    ) -> SolvedCorrespondences:
         """The warp of a pose whose bones go from the canonical to the body frame."""
         ...
 
-    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
+    def march(self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings) -> RaySamples:
         """Canonical samples along rays."""
         ...
 
-    def march_on(
-        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
-    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
+    def march_resumable(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
         """The same, and the jitter with which each ray goes on that has all its `how.most`."""
         ...
 
-    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
+    def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
         """Premultiplied colour and alpha of each ray."""
         ...
 
     def composite_loss(
         self,
-        raw: Raw,
-        samples: Samples,
+        raw: RawOutputs,
+        samples: RaySamples,
         step_m: float,
-        target: Pixels,
+        target: PremultipliedPixels,
         background: Float32[Tensor, "rays 3"],
         alpha_weight: float,
         hard_weight: float,
-    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
+    ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
         """Rendering, loss of each ray, and the gradient of the mean loss for `raw`."""
         ...
 
-    def keep_highest(
-        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
+    def scatter_max_density(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
     ) -> None:
         """Raises the grid's cached density, in place, to that of the samples."""
         ...
 
-    def wrenches(
+    def bone_wrenches(
         self,
-        samples: Samples,
+        samples: RaySamples,
         grad_points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "rays"],
-        cells: CellTables,
-        skin: Skin,
+        cells: CorrespondenceTables,
+        skin: SkinningVolume,
         bones: Float32[Tensor, "slots 24 12"],
     ) -> Float32[Tensor, "rays 24 6"]:
         """What each ray's samples, pulled so, exert on the bones that move them."""
         ...
 
-    def follow(
-        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
+    def update_roots(
+        self, cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
     ) -> None:
         """Moves a slot's roots, in place, after its pose."""
         ...
 
-    def place(
-        self, rays: Rays, grid: PosedGrid, step_m: float
+    def sample_occupied_cells(
+        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
     ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        """Samples of the body frame in a grid's occupied cells, and how many each ray has."""
+        """RaySamples of the body frame in a grid's occupied cells, and how many each ray has."""
         ...
 
-    def find_roots(
+    def find_all_roots(
         self,
         points: Float32[Tensor, "points 3"],
         slots: Int32[Tensor, "points"],
-        poses: Articulations,
+        poses: BlendedTransforms,
     ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
         """Where each of Fast-SNARF's searches ends, and which found a root of its own."""
         ...

@@ -14,47 +14,47 @@ import warnings
 import torch
 
 from avatar.kernels.backend import Backend
-from avatar.kernels.selftest import strays
+from avatar.kernels.selftest import failing_operation
 from avatar.kernels.torch_backend import TorchBackend
-from capture.errors import BadInput
+from capture.errors import InputError
 
-_ASKING = threading.Lock()
+_SELF_TEST_LOCK = threading.Lock()
 
 
 def backend_for(device: torch.device) -> Backend:
     """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
 
     Raises:
-        BadInput: If the forced backend is unknown or cannot run on the device.
+        InputError: If the forced backend is unknown or cannot run on the device.
     """
     forced = os.environ.get("IA_BACKEND", "")
     if forced not in ("", "torch", "numba"):
-        raise BadInput(
+        raise InputError(
             f"The variable IA_BACKEND is {forced!r}; expected 'torch' or 'numba', or leave it out."
         )
     if forced == "numba" and device.type != "cpu":
-        raise BadInput(
+        raise InputError(
             f"IA_BACKEND=numba was asked for, but it runs on the CPU only, not on {device}. "
             "Leave it out, or give --device cpu."
         )
     if device.type == "cpu" and forced != "torch":
-        with _ASKING:  # kernels must not run in two threads at once: who comes second waits
-            if _numba_is_sound():
-                return _numba()
+        with _SELF_TEST_LOCK:  # kernels must not run in two threads at once: who comes second waits
+            if _numba_passes_self_test():
+                return _numba_backend()
     # a CudaBackend's seat: device.type == "cuda", and `strays` finds nothing on it
     return TorchBackend()
 
 
-def _numba() -> Backend:
+def _numba_backend() -> Backend:
     from avatar.kernels.cpu import NumbaBackend  # it compiles: only where it is used
 
     return NumbaBackend()
 
 
 @functools.cache
-def _numba_is_sound() -> bool:
+def _numba_passes_self_test() -> bool:
     """Whether the compiled kernels do here what they should; asked once, answered aloud if not."""
-    operation = strays(_numba())
+    operation = failing_operation(_numba_backend())
     if operation is not None:
         warnings.warn(
             f"The compiled kernel '{operation}' differs from its meaning on this machine; plain "

@@ -18,30 +18,30 @@ from avatar.kernels import (
     cpu_roots,
 )
 from avatar.kernels.backend import (
-    Articulations,
-    Cells,
-    CellTables,
+    BlendedTransforms,
+    SolvedCorrespondences,
+    CorrespondenceTables,
     Features,
-    Grid,
-    Marching,
-    Pixels,
+    DensityGrid,
+    MarchSettings,
+    PremultipliedPixels,
     Points,
-    PosedGrid,
-    Raw,
-    Rays,
-    Samples,
-    Skin,
-    Table,
+    PosedOccupancy,
+    RawOutputs,
+    RayBatch,
+    RaySamples,
+    SkinningVolume,
+    HashTable,
 )
 from avatar.levels import HashLevels
 from avatar.rig import Rig
 
-_LAST = threading.local()
-KEPT_SAMPLES = 1 << 20
+_SCRATCH = threading.local()
+MAX_REUSED_SAMPLES = 1 << 20
 """Room for more samples than this is given back at once."""
 
 
-def _levels(
+def _level_arrays(
     levels: HashLevels,
 ) -> tuple[
     Float32[np.ndarray, "3"],
@@ -50,20 +50,20 @@ def _levels(
     Int32[np.ndarray, "levels"],
     Int64[np.ndarray, "levels+1"],
 ]:
-    return levels.low, levels.cells_per_m, levels.counts, levels.dense, levels.offsets
+    return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
 
 
-def _room(
-    rays: int, most: int
+def _scratch_samples(
+    rays: int, max_samples: int
 ) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
     """Room for the samples of rays before they are packed; what a thread asked for last, if small.
 
     Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.
     """
-    key, room = getattr(_LAST, "room", (None, None))
-    if room is None or key != (rays, most):
-        room = np.empty((rays, most, 3), dtype=np.float32), np.empty((rays, most), dtype=np.int32)
-        _LAST.room = ((rays, most), room) if rays * most <= KEPT_SAMPLES else (None, None)
+    key, room = getattr(_SCRATCH, "room", (None, None))
+    if room is None or key != (rays, max_samples):
+        room = np.empty((rays, max_samples, 3), dtype=np.float32), np.empty((rays, max_samples), dtype=np.int32)
+        _SCRATCH.room = ((rays, max_samples), room) if rays * max_samples <= MAX_REUSED_SAMPLES else (None, None)
     return room
 
 
@@ -71,149 +71,149 @@ def _room(
 class NumbaBackend:
     """Numba kernels on torch's CPU memory.
 
-    Only the trainer's thread may call them; `build_cells` alone, which is serial, any thread may.
+    Only the trainer's thread may call them; `solve_correspondences` alone, which is serial, any thread may.
     """
 
     name = "numba"
 
-    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
-        features = torch.empty(len(points), levels.width)
-        cpu_grid.encode(points.numpy(), *_levels(levels), table.detach().numpy(), features.numpy())
+    def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
+        features = torch.empty(len(points), levels.feature_width)
+        cpu_grid.encode(points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy())
         return features
 
     def encode_backward(
-        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
     ) -> None:
         cpu_grid.encode_backward(
-            points.numpy(), *_levels(levels), grad_features.numpy(), grad_table.numpy()
+            points.numpy(), *_level_arrays(levels), grad_features.numpy(), grad_table.numpy()
         )
 
-    def build_cells(
+    def solve_correspondences(
         self,
         rig: Rig,
         bones: Float32[np.ndarray, "24 12"],
         band_m: float,
         cell_m: float,
         device: torch.device,
-    ) -> Cells:
-        return Cells(*cpu_cells.build_cells(rig, bones, band_m, cell_m))
+    ) -> SolvedCorrespondences:
+        return SolvedCorrespondences(*cpu_cells.solve_correspondences(rig, bones, band_m, cell_m))
 
-    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
-        return self.march_on(rays, cells, grid, how)[0]
+    def march(self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings) -> RaySamples:
+        return self.march_resumable(rays, cells, grid, how)[0]
 
-    def march_on(
-        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
-    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
-        padded, padded_rows = _room(len(rays.slots), how.most)
+    def march_resumable(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
+        padded, padded_rows = _scratch_samples(len(rays.slots), how.max_samples)
         count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
         first = torch.empty(len(rays.slots), dtype=torch.int64)
         cpu_march.march(
-            *(part.numpy() for part in rays), np.float32(how.step_m),
+            *(part.numpy() for part in rays), np.float32(how.sample_step_m),
             *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
-            *(part.numpy() for part in grid), how.grace_steps, padded, padded_rows, count.numpy(),
+            *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows, count.numpy(),
             reached.numpy(),
         )  # fmt: skip
-        total = cpu_march.place(count.numpy(), first.numpy())
+        total = cpu_march.prefix_sum(count.numpy(), first.numpy())
         points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
-        cpu_march.pack(
+        cpu_march.pack_samples(
             padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
         )
-        return Samples(points, first, count, rows), rays.jitter + reached
+        return RaySamples(points, first, count, rows), rays.jitter + reached
 
-    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
-        rendered = torch.empty(len(samples.count), 4)
+    def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
+        rendered = torch.empty(len(samples.counts), 4)
         cpu_composite.composite(
-            raw.numpy(), samples.first.numpy(), samples.count.numpy(), np.float32(step_m),
+            raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
             rendered.numpy(),
         )  # fmt: skip
         return rendered
 
     def composite_loss(
         self,
-        raw: Raw,
-        samples: Samples,
+        raw: RawOutputs,
+        samples: RaySamples,
         step_m: float,
-        target: Pixels,
+        target: PremultipliedPixels,
         background: Float32[Tensor, "rays 3"],
         alpha_weight: float,
         hard_weight: float,
-    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
-        rendered, loss = torch.empty(len(samples.count), 4), torch.empty(len(samples.count))
+    ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
+        rendered, loss = torch.empty(len(samples.counts), 4), torch.empty(len(samples.counts))
         grad = torch.empty_like(raw)
         cpu_composite.composite_loss(
-            raw.numpy(), samples.first.numpy(), samples.count.numpy(), np.float32(step_m),
+            raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
             target.numpy(), background.numpy(), np.float32(alpha_weight),
             np.float32(hard_weight), rendered.numpy(), loss.numpy(), grad.numpy(),
         )  # fmt: skip
         return rendered, loss, grad
 
-    def keep_highest(
-        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
+    def scatter_max_density(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
     ) -> None:
-        cpu_march.keep_highest(
+        cpu_march.scatter_max_density(
             points.numpy(), log_density.numpy(), grid.low.numpy(), grid.cells_per_m.numpy(),
             grid.density.numpy(),
         )  # fmt: skip
 
     def encode_points_backward(
-        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+        self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
     ) -> Points:
         grad = torch.empty_like(points)
         cpu_grid.encode_points_backward(
-            points.numpy(), *_levels(levels), table.detach().numpy(), grad_features.numpy(),
+            points.numpy(), *_level_arrays(levels), table.detach().numpy(), grad_features.numpy(),
             grad.numpy(),
         )  # fmt: skip
         return grad
 
-    def wrenches(
+    def bone_wrenches(
         self,
-        samples: Samples,
+        samples: RaySamples,
         grad_points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "rays"],
-        cells: CellTables,
-        skin: Skin,
+        cells: CorrespondenceTables,
+        skin: SkinningVolume,
         bones: Float32[Tensor, "slots 24 12"],
     ) -> Float32[Tensor, "rays 24 6"]:
         out = torch.zeros(len(slots), 24, 6)
-        cpu_pose.wrenches(
-            samples.points.numpy(), grad_points.numpy(), samples.rows.numpy(),
-            samples.first.numpy(), samples.count.numpy(), slots.numpy(), cells.roots.numpy(),
+        cpu_pose.bone_wrenches(
+            samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
+            samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
             *(part.numpy() for part in skin), bones.numpy(), out.numpy(),
         )  # fmt: skip
         return out
 
-    def follow(
-        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
+    def update_roots(
+        self, cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
     ) -> None:
-        cpu_pose.follow(
-            cells.index[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
+        cpu_pose.update_roots(
+            cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
             *(part.numpy() for part in skin), bones.numpy(),
         )  # fmt: skip
 
-    def place(
-        self, rays: Rays, grid: PosedGrid, step_m: float
+    def sample_occupied_cells(
+        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
     ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
         count = torch.empty(len(rays.slots), dtype=torch.int32)
         given = (
             *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
         )  # fmt: skip
-        cpu_lattice.count(*given, np.empty((0, 3), np.float32), count.numpy())
+        cpu_lattice.count_samples_numba(*given, np.empty((0, 3), np.float32), count.numpy())
         points = torch.empty(int(count.sum()), 3)
         first = torch.cumsum(count, 0) - count
-        cpu_lattice.place(*given, points.numpy(), first.numpy())
+        cpu_lattice.write_samples_numba(*given, points.numpy(), first.numpy())
         return points, count
 
-    def find_roots(
+    def find_all_roots(
         self,
         points: Float32[Tensor, "points 3"],
         slots: Int32[Tensor, "points"],
-        poses: Articulations,
+        poses: BlendedTransforms,
     ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
         starts = poses.inverses.shape[1]
         found = torch.empty(len(points), starts, 3)
         valid = torch.empty(len(points), starts, dtype=torch.bool)
-        cpu_roots.find_all(
+        cpu_roots.find_all_roots_numba(
             points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
             found.numpy(), valid.numpy(),
         )  # fmt: skip

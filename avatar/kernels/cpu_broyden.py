@@ -1,12 +1,12 @@
-"""One root of skinning by Broyden's method, and how the warp bends there, compiled for the CPU."""
+"""One root of skinning by BroydenLookup's method, and how the warp bends there, compiled for the CPU."""
 
 import math
 
 import numpy as np
 
-from avatar.kernels.cells import LONGEST_CORRECTION_M
-from avatar.kernels.cpu_skin import LANES, interpolate, moved
-from avatar.kernels.jit import FAST, LEAN, compile_kernel
+from avatar.kernels.cells import MAX_PROBE_CORRECTION_M
+from avatar.kernels.cpu_skin import MATRIX_LANES, interpolate_at, transform_point
+from avatar.kernels.jit import FAST_MATH, NO_ALLOCATION, compile_kernel
 
 F32, I32 = np.float32, np.int32
 TOLERANCE_M = 1e-4
@@ -14,9 +14,9 @@ ITERATIONS = 12
 LONGEST_STEP_M = 0.3
 
 
-@compile_kernel(inline="always", **FAST)
-def inverse_of(m, out):
-    """Inverse of the 3×3 part of a row-major 3×4 matrix."""
+@compile_kernel(inline="always", **FAST_MATH)
+def invert_rotation(m, out):
+    """InverseJacobian of the 3×3 part of a row-major 3×4 matrix."""
     a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     det = a * p + b * q + c * r
@@ -26,8 +26,8 @@ def inverse_of(m, out):
     out[6], out[7], out[8] = r * s, (b * g - a * h) * s, (a * e - b * d) * s
 
 
-@compile_kernel(inline="always", **FAST)
-def turned(m, x, y, z):
+@compile_kernel(inline="always", **FAST_MATH)
+def rotate_vector(m, x, y, z):
     """A vector turned by a row-major 3×3 matrix."""
     return (
         m[0] * x + m[1] * y + m[2] * z,
@@ -36,10 +36,10 @@ def turned(m, x, y, z):
     )
 
 
-@compile_kernel(inline="always", **FAST)
-def _learn(inverse, dx, dy, dz, yx, yy, yz):
-    """Broyden's good update of an inverse Jacobian: a step d has changed the value by y."""
-    jx, jy, jz = turned(inverse, yx, yy, yz)
+@compile_kernel(inline="always", **FAST_MATH)
+def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
+    """BroydenLookup's good update of an inverse Jacobian: a step d has changed the value by y."""
+    jx, jy, jz = rotate_vector(inverse, yx, yy, yz)
     den = dx * jx + dy * jy + dz * jz
     den = F32(1) / (den if abs(den) > F32(1e-12) else F32(1e-12))
     rx = dx * inverse[0] + dy * inverse[3] + dz * inverse[6]
@@ -57,17 +57,17 @@ def _learn(inverse, dx, dy, dz, yx, yy, yz):
     inverse[8] += uz * rz
 
 
-@compile_kernel(inline="always", **FAST)
-def _blended(transforms, low, nodes_per_m, x, y, z, out):
-    if transforms.shape[3] == LANES:
-        interpolate(transforms, low, nodes_per_m, x, y, z, LANES, out)
+@compile_kernel(inline="always", **FAST_MATH)
+def _blended_transform(transforms, low, nodes_per_m, x, y, z, out):
+    if transforms.shape[3] == MATRIX_LANES:
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, out)
     else:
-        interpolate(transforms, low, nodes_per_m, x, y, z, 12, out)
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, 12, out)
 
 
-@compile_kernel(**LEAN)
-def solve(transforms, low, nodes_per_m, p, x, blend, inverse, cold):
-    """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest.
+@compile_kernel(**NO_ALLOCATION)
+def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_inverse):
+    """BroydenLookup's method (good update) for LBS(x) = p, from x; True if it came to rest.
 
     Args:
         transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or `LANES`).
@@ -75,13 +75,13 @@ def solve(transforms, low, nodes_per_m, p, x, blend, inverse, cold):
         p: The posed point.
         x: Where to start; the root.
         blend: Room for `LANES` floats.
-        inverse: Inverse Jacobian to start with, row by row; what has been learnt of it.
+        inverse: InverseJacobian Jacobian to start with, row by row; what has been learnt of it.
         cold: Whether nothing is known of it, so that the blended rotation's inverse is taken.
     """
-    _blended(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
-    if cold:
-        inverse_of(blend, inverse)
-    sx, sy, sz = moved(blend, x[0], x[1], x[2])
+    _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+    if initialize_inverse:
+        invert_rotation(blend, inverse)
+    sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
     fx, fy, fz = sx - p[0], sy - p[1], sz - p[2]
     rests = False
     for _ in range(ITERATIONS):
@@ -89,37 +89,37 @@ def solve(transforms, low, nodes_per_m, p, x, blend, inverse, cold):
         rests = size <= F32(TOLERANCE_M * TOLERANCE_M)
         if size > F32(1):
             return False
-        dx, dy, dz = turned(inverse, -fx, -fy, -fz)
+        dx, dy, dz = rotate_vector(inverse, -fx, -fy, -fz)
         if dx * dx + dy * dy + dz * dz > F32(LONGEST_STEP_M * LONGEST_STEP_M):
             return False  # off the volume, or in a fold: nothing that follows would be sound
-        if rests and dx * dx + dy * dy + dz * dz > F32(TOLERANCE_M * LONGEST_CORRECTION_M):
+        if rests and dx * dx + dy * dy + dz * dz > F32(TOLERANCE_M * MAX_PROBE_CORRECTION_M):
             return True
         x[0] += dx
         x[1] += dy
         x[2] += dz
         if rests:  # the last step costs nothing: nobody asks where it led
             return True
-        _blended(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
-        sx, sy, sz = moved(blend, x[0], x[1], x[2])
+        _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+        sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
         gx, gy, gz = sx - p[0], sy - p[1], sz - p[2]
-        _learn(inverse, dx, dy, dz, gx - fx, gy - fy, gz - fz)
+        _broyden_update(inverse, dx, dy, dz, gx - fx, gy - fy, gz - fz)
         fx, fy, fz = gx, gy, gz
     return fx * fx + fy * fy + fz * fz <= F32(4 * TOLERANCE_M * TOLERANCE_M)
 
 
-@compile_kernel(inline="always", **FAST)
-def _probed(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
+@compile_kernel(inline="always", **FAST_MATH)
+def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
     """Where, relative to the root x of p, the root of p + d lies: linearly, and one chord step."""
-    ux, uy, uz = turned(inverse, dx, dy, dz)
-    interpolate(transforms, low, nodes_per_m, x[0] + ux, x[1] + uy, x[2] + uz, LANES, blend)
-    sx, sy, sz = moved(blend, x[0] + ux, x[1] + uy, x[2] + uz)
-    ex, ey, ez = turned(inverse, p[0] + dx - sx, p[1] + dy - sy, p[2] + dz - sz)
-    beyond = ex * ex + ey * ey + ez * ez > F32(LONGEST_CORRECTION_M * LONGEST_CORRECTION_M)
+    ux, uy, uz = rotate_vector(inverse, dx, dy, dz)
+    interpolate_at(transforms, low, nodes_per_m, x[0] + ux, x[1] + uy, x[2] + uz, MATRIX_LANES, blend)
+    sx, sy, sz = transform_point(blend, x[0] + ux, x[1] + uy, x[2] + uz)
+    ex, ey, ez = rotate_vector(inverse, p[0] + dx - sx, p[1] + dy - sy, p[2] + dz - sz)
+    beyond = ex * ex + ey * ey + ez * ez > F32(MAX_PROBE_CORRECTION_M * MAX_PROBE_CORRECTION_M)
     share = F32(0) if beyond else F32(1)
     return ux + share * ex, uy + share * ey, uz + share * ez
 
 
-@compile_kernel(**LEAN)
+@compile_kernel(**NO_ALLOCATION)
 def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
     """How roots move about the root x of a cell's centre p, from probes t towards its six faces.
 
@@ -139,8 +139,8 @@ def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
         dx = t if axis == 0 else F32(0)
         dy = t if axis == 1 else F32(0)
         dz = t if axis == 2 else F32(0)
-        ax, ay, az = _probed(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend)
-        bx, by, bz = _probed(transforms, low, nodes_per_m, p, -dx, -dy, -dz, x, inverse, blend)
+        ax, ay, az = _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend)
+        bx, by, bz = _probe_root(transforms, low, nodes_per_m, p, -dx, -dy, -dz, x, inverse, blend)
         warp[axis] = x[axis]
         warp[3 + axis], warp[6 + axis], warp[9 + axis] = (
             (ax - bx) * half, (ay - by) * half, (az - bz) * half,
@@ -151,7 +151,7 @@ def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
     return math.sqrt(bend)
 
 
-@compile_kernel(**LEAN)
+@compile_kernel(**NO_ALLOCATION)
 def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
     """Betters what `probe_faces` has written by probes towards the eight corners, and adds c_ij."""
     for c in range(3, 12):
@@ -163,7 +163,7 @@ def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
         i = F32(1) if corner & 4 else F32(-1)
         j = F32(1) if corner & 2 else F32(-1)
         k = F32(1) if corner & 1 else F32(-1)
-        ux, uy, uz = _probed(
+        ux, uy, uz = _probe_root(
             transforms, low, nodes_per_m, p, i * t, j * t, k * t, x, inverse, blend
         )
         ux, uy, uz = ux / (F32(8) * t * t), uy / (F32(8) * t * t), uz / (F32(8) * t * t)

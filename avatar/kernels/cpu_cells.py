@@ -10,35 +10,35 @@ import math
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from avatar.kernels.cells import BENT_M, PROBE, ROOTS, SAME_ROOT_M
-from avatar.kernels.cpu_broyden import inverse_of, probe_corners, probe_faces, solve, turned
-from avatar.kernels.cpu_skin import LANES, blend_nodes, interpolate, moved
-from avatar.kernels.jit import FAST, LEAN, compile_kernel
+from avatar.kernels.cells import MIN_SECOND_ORDER_M, PROBE_DISTANCE_CELLS, MAX_ROOTS, SAME_ROOT_M
+from avatar.kernels.cpu_broyden import invert_rotation, probe_corners, probe_faces, solve_root, rotate_vector
+from avatar.kernels.cpu_skin import MATRIX_LANES, blend_nodes, interpolate_at, transform_point
+from avatar.kernels.jit import FAST_MATH, NO_ALLOCATION, compile_kernel
 from avatar.rig import Rig
 
 F32, I32 = np.float32, np.int32
-SIDES = np.array(
+FACE_DIRECTIONS = np.array(
     [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], dtype=np.int32
 )
-REACH_M = 0.03
+SEARCH_MARGIN_M = 0.03
 """How far beyond the band root finding may look."""
-SURELY_OUT_M = 0.015
+MAX_PREDICTED_OVERSHOOT_M = 0.015
 """A root that is predicted this far beyond the band is not looked for."""
 
 
-def build_cells(
+def solve_correspondences(
     rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
 ) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
     """The corner, index and roots of one frame's `avatar.cells.WarpCells`."""
-    volume = posed_volume(rig, bones, band_m + REACH_M)
+    volume = blended_transform_volume(rig, bones, band_m + SEARCH_MARGIN_M)
     extent = rig.box_high - rig.box_low
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
-    room = np.empty(LANES + 15, dtype=np.float32)
+    room = np.empty(MATRIX_LANES + 15, dtype=np.float32)
     pose_seeds(*volume, rig.seeds, posed, inverses, room)
     low = posed.min(axis=0) - np.float32(band_m)
     shape = np.ceil((posed.max(axis=0) + np.float32(band_m) - low) / cell_m).astype(int)
     index = np.empty(tuple(shape), dtype=np.int32)
-    cells_per_m = np.array(rig.distance.shape, dtype=np.float32) / extent
+    cells_per_m = np.array(rig.skin_distance.shape, dtype=np.float32) / extent
     capacity = index.size
     while True:
         found = (  # memory that nobody writes to costs nothing
@@ -46,45 +46,45 @@ def build_cells(
             np.empty((capacity, 3), np.int32), np.empty((capacity, 30), np.float32),
             np.empty(capacity, np.bool_),
         )  # fmt: skip
-        count = flood(
+        count = flood_fill_roots(
             *volume, rig.seeds, posed, inverses,
-            rig.distance, cells_per_m, np.float32(band_m + 0.5 * cell_m),
+            rig.skin_distance, cells_per_m, np.float32(band_m + 0.5 * cell_m),
             low, np.float32(cell_m), index.shape, *found, room,
         )  # fmt: skip
         if count <= capacity:
             chains, following, _, warps, bent = found
-            return low, index, gather(chains, following, warps, bent, index.reshape(-1))
+            return low, index, pack_roots(chains, following, warps, bent, index.reshape(-1))
         capacity = count
 
 
-def posed_volume(
+def blended_transform_volume(
     rig: Rig, bones: Float32[np.ndarray, "24 12"], reach_m: float
 ) -> tuple[Float32[np.ndarray, "x y z lanes"], Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]]:
     """Blended transforms on the nodes of the weight volume, where these lie, and nodes per metre.
 
     Nodes farther from the skin than `reach_m` are left at zero.
     """
-    lanes = np.zeros((24, LANES), dtype=np.float32)
+    lanes = np.zeros((24, MATRIX_LANES), dtype=np.float32)
     lanes[:, :12] = bones
-    transforms = np.zeros((*rig.weights.shape[:3], LANES), dtype=np.float32)
-    blend_nodes(*rig.near_nodes(reach_m), lanes, transforms.reshape(-1, LANES))
+    transforms = np.zeros((*rig.weights.shape[:3], MATRIX_LANES), dtype=np.float32)
+    blend_nodes(*rig.skinning_nodes_within(reach_m), lanes, transforms.reshape(-1, MATRIX_LANES))
     last = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
     return transforms, rig.box_low, last / (rig.box_high - rig.box_low)
 
 
-@compile_kernel(**LEAN)
+@compile_kernel(**NO_ALLOCATION)
 def pose_seeds(transforms, low, nodes_per_m, seeds, posed, inverses, room):
     """Skins the seeds; `posed` (seeds, 3) and the inverse 3×3 blends (seeds, 9) are written."""
-    blend = room[:LANES]
+    blend = room[:MATRIX_LANES]
     for s in range(seeds.shape[0]):
         x, y, z = seeds[s, 0], seeds[s, 1], seeds[s, 2]
-        interpolate(transforms, low, nodes_per_m, x, y, z, LANES, blend)
-        posed[s, 0], posed[s, 1], posed[s, 2] = moved(blend, x, y, z)
-        inverse_of(blend, inverses[s])
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, blend)
+        posed[s, 0], posed[s, 1], posed[s, 2] = transform_point(blend, x, y, z)
+        invert_rotation(blend, inverses[s])
 
 
-@compile_kernel(inline="always", **FAST)
-def _off_skin(x, y, z, distance, low, cells_per_m):
+@compile_kernel(inline="always", **FAST_MATH)
+def _skin_distance(x, y, z, distance, low, cells_per_m):
     """Distance of a canonical point's cell from the skin; far outside the box."""
     a = I32(math.floor((x - low[0]) * cells_per_m[0]))
     b = I32(math.floor((y - low[1]) * cells_per_m[1]))
@@ -94,8 +94,8 @@ def _off_skin(x, y, z, distance, low, cells_per_m):
     return distance[a, b, c] if inside else F32(1)
 
 
-@compile_kernel(inline="always", **FAST)
-def _known(chain, following, found, x, y, z):
+@compile_kernel(inline="always", **FAST_MATH)
+def _is_known_root(chain, following, found, x, y, z):
     """Whether a cell's chain of roots holds one near a point, or holds no more."""
     count = 0
     while chain >= 0:
@@ -104,28 +104,28 @@ def _known(chain, following, found, x, y, z):
             return True
         count += 1
         chain = following[chain]
-    return count == ROOTS
+    return count == MAX_ROOTS
 
 
-@compile_kernel(inline="always", **FAST)
-def _sought(
+@compile_kernel(inline="always", **FAST_MATH)
+def _search_root(
     transforms, low, nodes_per_m, distance, cells_per_m, band_m, grid_low, cell_m,
     chains, following, cell_of, found, total, i, j, k, flat, x, inverse, p, blend,
 ):  # fmt: skip
     """Looks for a root of cell (i, j, k) near x, and takes it in; how many roots there are then."""
-    if _known(chains[flat], following, found, x[0], x[1], x[2]):
+    if _is_known_root(chains[flat], following, found, x[0], x[1], x[2]):
         return total
-    off = _off_skin(x[0], x[1], x[2], distance, low, cells_per_m)
-    if off > band_m + F32(SURELY_OUT_M):
+    off = _skin_distance(x[0], x[1], x[2], distance, low, cells_per_m)
+    if off > band_m + F32(MAX_PREDICTED_OVERSHOOT_M):
         return total
     p[0] = grid_low[0] + (F32(i) + F32(0.5)) * cell_m
     p[1] = grid_low[1] + (F32(j) + F32(0.5)) * cell_m
     p[2] = grid_low[2] + (F32(k) + F32(0.5)) * cell_m
-    if not solve(transforms, low, nodes_per_m, p, x, blend, inverse, False):
+    if not solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, False):
         return total
-    if _off_skin(x[0], x[1], x[2], distance, low, cells_per_m) > band_m:
+    if _skin_distance(x[0], x[1], x[2], distance, low, cells_per_m) > band_m:
         return total
-    if _known(chains[flat], following, found, x[0], x[1], x[2]):
+    if _is_known_root(chains[flat], following, found, x[0], x[1], x[2]):
         return total
     if total < following.shape[0]:
         for n in range(3):
@@ -138,8 +138,8 @@ def _sought(
     return total + 1
 
 
-@compile_kernel(**LEAN)
-def flood(
+@compile_kernel(**NO_ALLOCATION)
+def flood_fill_roots(
     transforms, low, nodes_per_m, seeds, posed, seed_inverses, distance, cells_per_m, band_m,
     grid_low, cell_m, shape, chains, following, cell_of, found, bent, room,
 ):  # fmt: skip
@@ -161,9 +161,9 @@ def flood(
 
     The last six are written. A returned number above the capacity means that it did not do.
     """
-    blend, inverse = room[:LANES], room[LANES : LANES + 9]
-    x, p = room[LANES + 9 : LANES + 12], room[LANES + 12 : LANES + 15]
-    t = F32(PROBE) * cell_m
+    blend, inverse = room[:MATRIX_LANES], room[MATRIX_LANES : MATRIX_LANES + 9]
+    x, p = room[MATRIX_LANES + 9 : MATRIX_LANES + 12], room[MATRIX_LANES + 12 : MATRIX_LANES + 15]
+    t = F32(PROBE_DISTANCE_CELLS) * cell_m
     for cell in range(chains.shape[0]):
         chains[cell] = -1
     total, done = 0, 0
@@ -173,14 +173,14 @@ def flood(
         k = I32((posed[s, 2] - grid_low[2]) / cell_m)
         for n in range(9):
             inverse[n] = seed_inverses[s, n]
-        ux, uy, uz = turned(
+        ux, uy, uz = rotate_vector(
             inverse,
             grid_low[0] + (F32(i) + F32(0.5)) * cell_m - posed[s, 0],
             grid_low[1] + (F32(j) + F32(0.5)) * cell_m - posed[s, 1],
             grid_low[2] + (F32(k) + F32(0.5)) * cell_m - posed[s, 2],
         )
         x[0], x[1], x[2] = seeds[s, 0] + ux, seeds[s, 1] + uy, seeds[s, 2] + uz
-        total = _sought(
+        total = _search_root(
             transforms, low, nodes_per_m, distance, cells_per_m, band_m, grid_low, cell_m,
             chains, following, cell_of, found, total, i, j, k, (i * shape[1] + j) * shape[2] + k,
             x, inverse, p, blend,
@@ -196,14 +196,14 @@ def flood(
             for n in range(9):
                 inverse[n] = root[3 + n]
             bend = probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, root)
-            bent[done] = bend * F32(0.25) * cell_m * cell_m > F32(BENT_M)
+            bent[done] = bend * F32(0.25) * cell_m * cell_m > F32(MIN_SECOND_ORDER_M)
             if bent[done]:
                 for n in range(9):
                     inverse[n] = root[3 + n]
                 probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, root)
                 probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, root)
             for side in range(6):
-                a, b, c = i + SIDES[side, 0], j + SIDES[side, 1], k + SIDES[side, 2]
+                a, b, c = i + FACE_DIRECTIONS[side, 0], j + FACE_DIRECTIONS[side, 1], k + FACE_DIRECTIONS[side, 2]
                 if a < 0 or b < 0 or c < 0 or a >= shape[0] or b >= shape[1] or c >= shape[2]:
                     continue
                 axis, step_m = side // 2, cell_m * F32(1 - 2 * (side % 2))
@@ -212,7 +212,7 @@ def flood(
                 x[2] = root[2] + step_m * root[9 + axis]
                 for n in range(9):
                     inverse[n] = root[3 + n]
-                total = _sought(
+                total = _search_root(
                     transforms, low, nodes_per_m, distance, cells_per_m, band_m, grid_low, cell_m,
                     chains, following, cell_of, found, total, a, b, c,
                     (a * shape[1] + b) * shape[2] + c, x, inverse, p, blend,
@@ -221,9 +221,9 @@ def flood(
     return total
 
 
-@compile_kernel(**FAST)
-def gather(chains, following, found, bent, index):
-    """Writes `WarpCells.index`, flat, and returns `WarpCells.roots`."""
+@compile_kernel(**FAST_MATH)
+def pack_roots(chains, following, found, bent, index):
+    """Writes `CorrespondenceGrid.index`, flat, and returns `CorrespondenceGrid.roots`."""
     rows = 1  # row 0 stays unused, so that no packed index is 0
     for cell in range(index.shape[0]):
         count, bends, chain = 0, False, chains[cell]

@@ -1,10 +1,10 @@
-"""Volume rendering of packed samples, its losses and their gradient, compiled for the CPU."""
+"""SkinningTensors rendering of packed samples, its losses and their gradient, compiled for the CPU."""
 
 import numpy as np
 from numba import prange
 
-from avatar.kernels.jit import FAST, compile_kernel
-from avatar.kernels.reference import ALPHA_DEAD_ZONE, HUBER_DELTA, MAX_LOG_DENSITY
+from avatar.kernels.jit import FAST_MATH, compile_kernel
+from avatar.kernels.reference import ALPHA_DEAD_ZONE, COLOR_HUBER_DELTA, MAX_LOG_DENSITY
 
 F32 = np.float32
 
@@ -14,14 +14,14 @@ def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
 
 
-@compile_kernel(parallel=True, **FAST)
-def composite(raw, first, count, step_m, rendered):
+@compile_kernel(parallel=True, **FAST_MATH)
+def composite(raw, offsets, counts, sample_step_m, rendered):
     """Premultiplied colour and alpha of each ray from its samples, front to back."""
-    for ray in prange(first.shape[0]):
+    for ray in prange(offsets.shape[0]):
         through = F32(1)
         red, green, blue = F32(0), F32(0), F32(0)
-        for i in range(first[ray], first[ray] + count[ray]):
-            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m)
+        for i in range(offsets[ray], offsets[ray] + counts[ray]):
+            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
             weight = through * (F32(1) - kept)
             through *= kept
             red += weight * _sigmoid(raw[i, 0])
@@ -35,20 +35,20 @@ def composite(raw, first, count, step_m, rendered):
 
 @compile_kernel(inline="always")
 def _huber_slope(error, scale):
-    return max(F32(-1), min(F32(1), error * F32(1.0 / HUBER_DELTA))) * scale
+    return max(F32(-1), min(F32(1), error * F32(1.0 / COLOR_HUBER_DELTA))) * scale
 
 
 @compile_kernel(inline="always")
 def _huber(error):
     size = abs(error)
-    if size <= F32(HUBER_DELTA):
-        return size * size * F32(0.5 / HUBER_DELTA)
-    return size - F32(0.5 * HUBER_DELTA)
+    if size <= F32(COLOR_HUBER_DELTA):
+        return size * size * F32(0.5 / COLOR_HUBER_DELTA)
+    return size - F32(0.5 * COLOR_HUBER_DELTA)
 
 
-@compile_kernel(parallel=True, **FAST)
+@compile_kernel(parallel=True, **FAST_MATH)
 def composite_loss(
-    raw, first, count, step_m, target, background, alpha_weight, hard_weight,
+    raw, offsets, counts, sample_step_m, target, background, alpha_weight, hard_surface_weight,
     rendered, loss, grad_raw,
 ):  # fmt: skip
     """Composite, loss of every ray, and the gradient of the mean loss with respect to `raw`.
@@ -58,13 +58,13 @@ def composite_loss(
     opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
     Meanwhile `grad_raw` holds each sample's colour and the light that passes it.
     """
-    share = F32(1) / F32(first.shape[0])
-    for ray in prange(first.shape[0]):
-        start, stop = first[ray], first[ray] + count[ray]
+    share = F32(1) / F32(offsets.shape[0])
+    for ray in prange(offsets.shape[0]):
+        start, stop = offsets[ray], offsets[ray] + counts[ray]
         through = F32(1)
         red, green, blue = F32(0), F32(0), F32(0)
         for i in range(start, stop):
-            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m)
+            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
             weight = through * (F32(1) - kept)
             through *= kept
             q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
@@ -92,11 +92,11 @@ def composite_loss(
         if abs(off) > F32(ALPHA_DEAD_ZONE):
             g_alpha = alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
         solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
-        g_alpha += hard_weight * share * (solid - empty) / (solid + empty)
+        g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
         loss[ray] = (
             _huber(d0) + _huber(d1) + _huber(d2)
             + alpha_weight * max(F32(0), abs(off) - F32(ALPHA_DEAD_ZONE))
-            - hard_weight * np.log(solid + empty)
+            - hard_surface_weight * np.log(solid + empty)
         )  # fmt: skip
 
         behind = F32(0)
@@ -107,7 +107,7 @@ def composite_loss(
             grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
             grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
             grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
-            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * step_m
+            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
             inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
             grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
             behind += weight * value

@@ -9,17 +9,17 @@ write to one place: no atomics, and the same sums for any number of threads.
 import numpy as np
 from numba import get_num_threads, prange
 
-from avatar.kernels.jit import FAST, compile_kernel
-from avatar.kernels.vector4 import dot4, load4, plus4, store4, times4
-from avatar.levels import FEATURES, PRIMES
+from avatar.kernels.jit import FAST_MATH, compile_kernel
+from avatar.kernels.vector4 import dot4, load4, add4, store4, scale4
+from avatar.levels import FEATURES_PER_LEVEL, PRIMES
 
-BLOCK = 256
+POINTS_PER_BLOCK = 256
 F32, I32, U32 = np.float32, np.int32, np.uint32
 PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
 
 
 @compile_kernel(inline="always")
-def _placed(points, start, stop, low, places):
+def _box_coordinates(points, start, stop, low, places):
     """Where the points of a block lie in the box, metres."""
     for i in range(stop - start):
         for axis in range(3):
@@ -27,7 +27,7 @@ def _placed(points, start, stop, low, places):
 
 
 @compile_kernel(inline="always")
-def _found(places, number, scale, counts, cells, within):
+def _locate_cells(places, number, scale, counts, cells, within):
     """The cell of each place on one level, and where in it the place lies."""
     for axis in range(3):
         last = I32(counts[axis] - 2)
@@ -39,7 +39,7 @@ def _found(places, number, scale, counts, cells, within):
 
 
 @compile_kernel(inline="always")
-def _numbered(cells, number, counts, dense, first, size, entries):
+def _corner_entries(cells, number, counts, dense, first, size, entries):
     """Entries of the corners of each cell, x fastest."""
     if dense == 1:
         along_y, along_z = counts[0], counts[0] * counts[1]
@@ -64,7 +64,7 @@ def _numbered(cells, number, counts, dense, first, size, entries):
 
 
 @compile_kernel(inline="always")
-def _weighed(within, number, weights):
+def _trilinear_weights(within, number, weights):
     """Trilinear weights of the corners."""
     for i in range(number):
         x, y, z = within[0, i], within[1, i], within[2, i]
@@ -74,51 +74,51 @@ def _weighed(within, number, weights):
         weights[4, i], weights[5, i], weights[6, i], weights[7, i] = a * z, b * z, c * z, d * z
 
 
-@compile_kernel(parallel=True, **FAST)
+@compile_kernel(parallel=True, **FAST_MATH)
 def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
     """Trilinear features of all levels; points outside the box extrapolate from its border."""
-    for block in prange((points.shape[0] + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        number = min(points.shape[0] - start, BLOCK)
-        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
-        cells = np.empty((3, BLOCK), I32)
-        entries, weights = np.empty((8, BLOCK), I32), np.empty((8, BLOCK), F32)
-        _placed(points, start, start + number, low, places)
+    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+        start = block * POINTS_PER_BLOCK
+        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells = np.empty((3, POINTS_PER_BLOCK), I32)
+        entries, weights = np.empty((8, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), F32)
+        _box_coordinates(points, start, start + number, low, places)
         for level in range(cells_per_m.shape[0]):
             first, size = offsets[level], offsets[level + 1] - offsets[level]
-            _found(places, number, cells_per_m[level], counts[level], cells, within)
-            _numbered(cells, number, counts[level], dense[level], first, size, entries)
-            _weighed(within, number, weights)
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+            _trilinear_weights(within, number, weights)
             for i in range(number):
-                total = times4(weights[0, i], load4(table, entries[0, i], 0))
+                total = scale4(weights[0, i], load4(table, entries[0, i], 0))
                 for corner in range(1, 8):
                     entry = load4(table, entries[corner, i], 0)
-                    total = plus4(total, times4(weights[corner, i], entry))
-                store4(features, start + i, level * FEATURES, total)
+                    total = add4(total, scale4(weights[corner, i], entry))
+                store4(features, start + i, level * FEATURES_PER_LEVEL, total)
 
 
-@compile_kernel(parallel=True, **FAST)
+@compile_kernel(parallel=True, **FAST_MATH)
 def _encode_backward(
     points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
 ):
     for thread in prange(threads):
-        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
-        cells = np.empty((3, BLOCK), I32)
-        entries, weights = np.empty((8, BLOCK), I32), np.empty((8, BLOCK), F32)
-        for start in range(0, points.shape[0], BLOCK):
-            number = min(points.shape[0] - start, BLOCK)
-            _placed(points, start, start + number, low, places)
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells = np.empty((3, POINTS_PER_BLOCK), I32)
+        entries, weights = np.empty((8, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), F32)
+        for start in range(0, points.shape[0], POINTS_PER_BLOCK):
+            number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+            _box_coordinates(points, start, start + number, low, places)
             for level in range(thread, cells_per_m.shape[0], threads):
                 first, size = offsets[level], offsets[level + 1] - offsets[level]
-                _found(places, number, cells_per_m[level], counts[level], cells, within)
-                _numbered(cells, number, counts[level], dense[level], first, size, entries)
-                _weighed(within, number, weights)
+                _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+                _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+                _trilinear_weights(within, number, weights)
                 for i in range(number):
-                    grad = load4(grad_features, start + i, level * FEATURES)
+                    grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
                     for corner in range(8):
                         entry = entries[corner, i]
-                        added = times4(weights[corner, i], grad)
-                        store4(grad_table, entry, 0, plus4(load4(grad_table, entry, 0), added))
+                        added = scale4(weights[corner, i], grad)
+                        store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
 
 
 def encode_backward(
@@ -132,13 +132,13 @@ def encode_backward(
 
 
 @compile_kernel(inline="always")
-def _pulled(within, pulls, number, scale, total):
+def _add_point_gradient(within, corner_gradients, number, scale, total):
     """Adds one level's gradient, from what pulls at the corners of each cell."""
     for i in range(number):
         x, y, z = within[0, i], within[1, i], within[2, i]
         u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
-        p0, p1, p2, p3 = pulls[0, i], pulls[1, i], pulls[2, i], pulls[3, i]
-        p4, p5, p6, p7 = pulls[4, i], pulls[5, i], pulls[6, i], pulls[7, i]
+        p0, p1, p2, p3 = corner_gradients[0, i], corner_gradients[1, i], corner_gradients[2, i], corner_gradients[3, i]
+        p4, p5, p6, p7 = corner_gradients[4, i], corner_gradients[5, i], corner_gradients[6, i], corner_gradients[7, i]
         total[0, i] += scale * (
             v * w * (p1 - p0) + y * w * (p3 - p2) + v * z * (p5 - p4) + y * z * (p7 - p6)
         )
@@ -150,27 +150,27 @@ def _pulled(within, pulls, number, scale, total):
         )
 
 
-@compile_kernel(parallel=True, **FAST)
+@compile_kernel(parallel=True, **FAST_MATH)
 def encode_points_backward(
     points, low, cells_per_m, counts, dense, offsets, table, grad_features, grad_points
 ):
     """Gradient of `encode` with respect to its points, written to `grad_points`."""
-    for block in prange((points.shape[0] + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        number = min(points.shape[0] - start, BLOCK)
-        places, within = np.empty((3, BLOCK), F32), np.empty((3, BLOCK), F32)
-        cells, entries = np.empty((3, BLOCK), I32), np.empty((8, BLOCK), I32)
-        pulls, total = np.empty((8, BLOCK), F32), np.zeros((3, BLOCK), F32)
-        _placed(points, start, start + number, low, places)
+    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+        start = block * POINTS_PER_BLOCK
+        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
+        pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
+        _box_coordinates(points, start, start + number, low, places)
         for level in range(cells_per_m.shape[0]):
             first, size = offsets[level], offsets[level + 1] - offsets[level]
-            _found(places, number, cells_per_m[level], counts[level], cells, within)
-            _numbered(cells, number, counts[level], dense[level], first, size, entries)
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
             for i in range(number):
-                grad = load4(grad_features, start + i, level * FEATURES)
+                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
                 for corner in range(8):
                     pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
-            _pulled(within, pulls, number, cells_per_m[level], total)
+            _add_point_gradient(within, pulls, number, cells_per_m[level], total)
         for i in range(number):
             for axis in range(3):
                 grad_points[start + i, axis] = total[axis, i]

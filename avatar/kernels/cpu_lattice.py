@@ -1,4 +1,4 @@
-"""Samples along rays in the occupied cells of a body frame's grid, compiled for the CPU.
+"""RaySamples along rays in the occupied cells of a body frame's grid, compiled for the CPU.
 
 The lattice is walked twice: once to count, once to write, for nobody knows before how many
 samples a ray will have.
@@ -7,20 +7,20 @@ samples a ray will have.
 import numpy as np
 from numba import prange
 
-from avatar.kernels.cpu_march import _safe
-from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.cpu_march import nonzero
+from avatar.kernels.jit import FAST_MATH, compile_kernel
 
 F32, I32 = np.float32, np.int32
 
 
-@compile_kernel(**FAST)
-def _walk(
+@compile_kernel(**FAST_MATH)
+def _march_ray_numba(
     origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, near, far, points, first
 ):
-    """Samples of one ray; they are written from row `first` on, unless it is negative."""
+    """RaySamples of one ray; they are written from row `first` on, unless it is negative."""
     enter, leave = F32(0), F32(1e9)
     for axis in range(3):
-        direction = _safe(towards[axis])
+        direction = nonzero(towards[axis])
         one, other = (near[axis] - origin[axis]) / direction, (far[axis] - origin[axis]) / direction
         enter = max(enter, min(one, other))
         leave = min(leave, max(one, other))
@@ -44,8 +44,8 @@ def _walk(
         step += 1
 
 
-@compile_kernel(parallel=True, **FAST)
-def count(
+@compile_kernel(parallel=True, **FAST_MATH)
+def count_samples_numba(
     origins,
     directions,
     slots,
@@ -63,14 +63,14 @@ def count(
     """How many samples each ray has."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
-        counts[ray] = _walk(
+        counts[ray] = _march_ray_numba(
             origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
             cells_per_m[slot], shape[slot], near[slot], far[slot], nowhere, -1,
         )  # fmt: skip
 
 
-@compile_kernel(parallel=True, **FAST)
-def place(
+@compile_kernel(parallel=True, **FAST_MATH)
+def write_samples_numba(
     origins,
     directions,
     slots,
@@ -88,7 +88,7 @@ def place(
     """Writes each ray's samples, from its own row on."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
-        _walk(
+        _march_ray_numba(
             origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
             cells_per_m[slot], shape[slot], near[slot], far[slot], points, first[ray],
         )  # fmt: skip

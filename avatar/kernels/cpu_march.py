@@ -3,27 +3,27 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.jit import FAST, LEAN, compile_kernel
+from avatar.kernels.jit import FAST_MATH, NO_ALLOCATION, compile_kernel
 from avatar.kernels.reference import MAX_LOG_DENSITY, OPAQUE_DEPTH
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
-ENDLESS = 10**9
-"""A grace of so many samples never ends: `Marching.grace_steps` of exact rendering."""
+UNLIMITED_STEPS = 10**9
+"""A grace of so many samples never ends: `MarchSettings.grace_steps` of exact rendering."""
 
 
 @compile_kernel(inline="always")
-def _safe(x):
+def nonzero(x):
     return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 
-@compile_kernel(inline="always", **FAST)
-def _cell(g, count):
+@compile_kernel(inline="always", **FAST_MATH)
+def _cell_index(g, count):
     """The cell along one axis of a place in cells that is inside, but for rounding."""
     return U32(min(max(I32(g), I32(0)), count - I32(1)))
 
 
-@compile_kernel(inline="always", **FAST)
-def _bend(roots, slot, row, x, y, z):
+@compile_kernel(inline="always", **FAST_MATH)
+def _second_order_term(roots, slot, row, x, y, z):
     """What a bent warp adds at (x, y, z) from its cell's centre: Σ c_ij d_i d_j."""
     a, b = row + U32(1), row + U32(2)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -37,8 +37,8 @@ def _bend(roots, slot, row, x, y, z):
     )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST)
-def _warped(roots, slot, row, bent, x, y, z):
+@compile_kernel(inline="always", **FAST_MATH)
+def canonical_point(roots, slot, row, bent, x, y, z):
     """The canonical point of what lies (x, y, z) from the centre of a cell with a root."""
     u = roots[slot, row, U32(0)] + (
         roots[slot, row, U32(3)] * x + roots[slot, row, U32(4)] * y + roots[slot, row, U32(5)] * z
@@ -50,13 +50,13 @@ def _warped(roots, slot, row, bent, x, y, z):
         roots[slot, row, U32(9)] * x + roots[slot, row, U32(10)] * y + roots[slot, row, U32(11)] * z
     )
     if bent:
-        a, b, c = _bend(roots, slot, row, x, y, z)
+        a, b, c = _second_order_term(roots, slot, row, x, y, z)
         u, v, w = u + a, v + b, w + c
     return u, v, w
 
 
-@compile_kernel(inline="always", **FAST)
-def _cached(occupied, density, low, cells_per_m, x, y, z, asked):
+@compile_kernel(inline="always", **FAST_MATH)
+def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density):
     """Cached density of the canonical cell that holds a point; -1 where nothing may be.
 
     Where nobody asks for the density it is 0: the occupancy alone fits a core's cache.
@@ -68,25 +68,25 @@ def _cached(occupied, density, low, cells_per_m, x, y, z, asked):
         return F32(-1)
     if occupied[a, b, c] == 0:
         return F32(-1)
-    return density[a, b, c] if asked else F32(0)
+    return density[a, b, c] if needs_density else F32(0)
 
 
-@compile_kernel(parallel=True, **LEAN)
+@compile_kernel(parallel=True, **NO_ALLOCATION)
 def march(
-    origins, directions, slots, jitter, step_m,
+    origins, directions, slots, jitter, sample_step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
-    occupied, density, low, cells_per_m, grace_steps, points, rows, counts, reached,
+    occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
 ):  # fmt: skip
     """Canonical sample points along rays of the body frame, and the root each was warped with.
 
-    Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
+    RaySamples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
     has a root whose canonical cell is occupied; of several roots the one of highest cached density
     counts. A ray ends `grace_steps` samples after its cached optical depth has passed
     `OPAQUE_DEPTH`, or when `points` holds no more; `reached` is where it would go on.
     """
     most = U32(points.shape[1])
-    ends = grace_steps < ENDLESS
-    cells_a_m, steps_a_m = F32(1) / cell_m, F32(1) / step_m
+    ends = opaque_margin_steps < UNLIMITED_STEPS
+    cells_a_m, steps_a_m = F32(1) / cell_m, F32(1) / sample_step_m
     for ray in prange(origins.shape[0]):
         slot = U32(slots[ray])
         nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
@@ -95,7 +95,7 @@ def march(
         oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
         oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
         dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        ix, iy, iz = cell_m / _safe(dx), cell_m / _safe(dy), cell_m / _safe(dz)
+        ix, iy, iz = cell_m / nonzero(dx), cell_m / nonzero(dy), cell_m / nonzero(dz)
         dx, dy, dz = dx * cells_a_m, dy * cells_a_m, dz * cells_a_m
         ax, ay, az = -ox * ix, -oy * iy, -oz * iz
         bx, by, bz = (F32(nx) - ox) * ix, (F32(ny) - oy) * iy, (F32(nz) - oz) * iz
@@ -104,13 +104,13 @@ def march(
         wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
         wy = F32(1) if iy > 0 else F32(0)
         wz = F32(1) if iz > 0 else F32(0)
-        optical, left, kept, step = F32(0), grace_steps, U32(0), F32(0)
+        optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
         while kept < most:
-            t = enter + (step + jitter[ray]) * step_m
+            t = enter + (step + jitter[ray]) * sample_step_m
             if t >= leave:
                 break
             gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
-            i, j, k = _cell(gx, nx), _cell(gy, ny), _cell(gz, nz)
+            i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
             packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
             if packed <= 0:
                 way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
@@ -129,8 +129,8 @@ def march(
             row, bent = U32(packed >> 3), packed & 4
             asked = ends or packed & 3 > 1
             for _ in range(packed & 3):
-                x, y, z = _warped(cell_roots, slot, row, bent, ex, ey, ez)
-                here = _cached(occupied, density, low, cells_per_m, x, y, z, asked)
+                x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
+                here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
                 if here > best:
                     best, chosen = here, row
                     px, py, pz = x, y, z
@@ -141,18 +141,18 @@ def march(
                 points[ray, kept, 2] = pz
                 rows[ray, kept] = chosen
                 kept += U32(1)
-                optical += best * step_m
+                optical += best * sample_step_m
                 if optical > F32(OPAQUE_DEPTH):
                     left -= 1
                     if left < 0:
                         break
             step += F32(1)
         counts[ray] = kept
-        reached[ray] = I32(step)
+        next_steps[ray] = I32(step)
 
 
-@compile_kernel(**LEAN)
-def place(counts, first):
+@compile_kernel(**NO_ALLOCATION)
+def prefix_sum(counts, first):
     """Writes where each ray's samples begin when they stand without gaps; how many there are."""
     total = 0
     for ray in range(counts.shape[0]):
@@ -162,7 +162,7 @@ def place(counts, first):
 
 
 @compile_kernel(parallel=True, nogil=True)
-def pack(padded, padded_rows, first, counts, points, rows):
+def pack_samples(padded, padded_rows, first, counts, points, rows):
     """Copies each ray's samples from its own line to one list without gaps."""
     for ray in prange(counts.shape[0]):
         for n in range(counts[ray]):
@@ -172,7 +172,7 @@ def pack(padded, padded_rows, first, counts, points, rows):
 
 
 @compile_kernel(nogil=True, fastmath=True)
-def keep_highest(points, log_density, low, cells_per_m, density):
+def scatter_max_density(points, log_density, low, cells_per_m, density):
     """Raises the cached density of each sample's cell to the sample's own."""
     nx, ny, nz = density.shape
     for i in range(points.shape[0]):

@@ -9,20 +9,20 @@ by one wrench a bone: the force Σ w g and the moment Σ w (B x) × g.
 import numpy as np
 from numba import prange
 
-from avatar.kernels.cpu_skin import interpolate, moved
-from avatar.kernels.jit import FAST, compile_kernel
-from avatar.kernels.pose import LONGEST_STEP_M
+from avatar.kernels.cpu_skin import interpolate_at, transform_point
+from avatar.kernels.jit import FAST_MATH, compile_kernel
+from avatar.kernels.pose import MAX_ROOT_STEP_M
 
 F32, I32 = np.float32, np.int32
 
 
-@compile_kernel(**FAST)
+@compile_kernel(**FAST_MATH)
 def _weights_at(weights, low, nodes_per_m, x, y, z, out):
-    interpolate(weights, low, nodes_per_m, x, y, z, 24, out)
+    interpolate_at(weights, low, nodes_per_m, x, y, z, 24, out)
 
 
-@compile_kernel(parallel=True, **FAST)
-def wrenches(
+@compile_kernel(parallel=True, **FAST_MATH)
+def bone_wrenches(
     points, grad_points, rows, first, count, slots, cell_roots,
     weights, low, nodes_per_m, bones, out,
 ):  # fmt: skip
@@ -53,7 +53,7 @@ def wrenches(
                 if w < F32(1e-3):
                     continue
                 m, felt = bones[slot, joint], out[ray, joint]
-                px, py, pz = moved(m, x, y, z)
+                px, py, pz = transform_point(m, x, y, z)
                 felt[0] += w * fx
                 felt[1] += w * fy
                 felt[2] += w * fz
@@ -62,8 +62,8 @@ def wrenches(
                 felt[5] += w * (px * fy - py * fx)
 
 
-@compile_kernel(**FAST)
-def _skinned(weights, low, nodes_per_m, bones, x, y, z, share, blend):
+@compile_kernel(**FAST_MATH)
+def _skin_point(weights, low, nodes_per_m, bones, x, y, z, share, blend):
     _weights_at(weights, low, nodes_per_m, x, y, z, share)
     for q in range(12):
         blend[q] = F32(0)
@@ -71,11 +71,11 @@ def _skinned(weights, low, nodes_per_m, bones, x, y, z, share, blend):
         if share[joint] > F32(0):
             for q in range(12):
                 blend[q] += share[joint] * bones[joint, q]
-    return moved(blend, x, y, z)
+    return transform_point(blend, x, y, z)
 
 
-@compile_kernel(parallel=True, **FAST)
-def follow(index, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bones):
+@compile_kernel(parallel=True, **FAST_MATH)
+def update_roots(packed_cells, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bones):
     """Moves a frame's roots after its pose: one chord step each, towards the cell's centre.
 
     Args:
@@ -89,11 +89,11 @@ def follow(index, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bon
         share, blend = np.empty(24, np.float32), np.empty(12, np.float32)
         for j in range(shape[1]):
             for k in range(shape[2]):
-                packed = index[(i * shape[1] + j) * shape[2] + k]
+                packed = packed_cells[(i * shape[1] + j) * shape[2] + k]
                 rows = 3 if packed & 4 else 1
                 for candidate in range(packed & 3):
                     r = roots[(packed >> 3) + candidate * rows]
-                    sx, sy, sz = _skinned(
+                    sx, sy, sz = _skin_point(
                         weights, low, nodes_per_m, bones, r[0], r[1], r[2], share, blend
                     )
                     ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
@@ -103,7 +103,7 @@ def follow(index, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bon
                     dy = r[6] * ex + r[7] * ey + r[8] * ez
                     dz = r[9] * ex + r[10] * ey + r[11] * ez
                     length = np.sqrt(dx * dx + dy * dy + dz * dz)
-                    if length > F32(LONGEST_STEP_M):
+                    if length > F32(MAX_ROOT_STEP_M):
                         continue
                     r[0] += dx
                     r[1] += dy

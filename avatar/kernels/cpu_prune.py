@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from avatar.kernels.jit import FAST, compile_kernel
+from avatar.kernels.jit import FAST_MATH, compile_kernel
 
 F32, I32 = np.float32, np.int32
-MARGIN = 1.001
+CELL_SCALE_MARGIN = 1.001
 """A cell is taken to be this much larger than it is: a sample on its wall counts, too."""
 
 
 @compile_kernel(inline="always")
-def _span(root, across, low, per_m, cells):
+def _cell_span(root, across, low, per_m, cells):
     """First and last canonical cell, on one axis, that a warp cell reaches."""
     first = I32(np.floor((root - across - low) * per_m))
     last = I32(np.floor((root + across - low) * per_m))
@@ -18,7 +18,7 @@ def _span(root, across, low, per_m, cells):
 
 
 @compile_kernel(inline="always")
-def _reach(roots, row, bent, half):
+def _image_extent(roots, row, bent, half):
     """How far from its root, at most, a cell's warp reaches along each canonical axis."""
     r = roots[row]
     x = half * (abs(r[3]) + abs(r[4]) + abs(r[5]))
@@ -34,7 +34,7 @@ def _reach(roots, row, bent, half):
 
 
 @compile_kernel(inline="always")
-def _any(occupied, a0, a1, b0, b1, c0, c1):
+def _any_occupied(occupied, a0, a1, b0, b1, c0, c1):
     for a in range(a0, a1 + 1):
         for b in range(b0, b1 + 1):
             for c in range(c0, c1 + 1):
@@ -43,25 +43,25 @@ def _any(occupied, a0, a1, b0, b1, c0, c1):
     return False
 
 
-@compile_kernel(**FAST)
-def prune(index, roots, cell_m, occupied, low, cells_per_m, pruned):
+@compile_kernel(**FAST_MATH)
+def cull_cells(packed_cells, roots, cell_m, occupied, low, cells_per_m, culled_cells):
     """The index without those cells of which no sample can lie in an occupied canonical cell.
 
     A cell's warp is affine, or of second order where it is bent, so that a box about its image
     holds every sample in it: none is lost.
     """
-    half = F32(0.5 * MARGIN) * cell_m
+    half = F32(0.5 * CELL_SCALE_MARGIN) * cell_m
     nx, ny, nz = occupied.shape
-    for cell in range(index.shape[0]):
-        packed = index[cell]
-        pruned[cell] = 0
+    for cell in range(packed_cells.shape[0]):
+        packed = packed_cells[cell]
+        culled_cells[cell] = 0
         rows = 3 if packed & 4 else 1
         for candidate in range(packed & 3):
             row = (packed >> 3) + candidate * rows
-            x, y, z = _reach(roots, row, rows > 1, half)
-            a0, a1 = _span(roots[row, 0], x, low[0], cells_per_m[0], nx)
-            b0, b1 = _span(roots[row, 1], y, low[1], cells_per_m[1], ny)
-            c0, c1 = _span(roots[row, 2], z, low[2], cells_per_m[2], nz)
-            if _any(occupied, a0, a1, b0, b1, c0, c1):
-                pruned[cell] = packed
+            x, y, z = _image_extent(roots, row, rows > 1, half)
+            a0, a1 = _cell_span(roots[row, 0], x, low[0], cells_per_m[0], nx)
+            b0, b1 = _cell_span(roots[row, 1], y, low[1], cells_per_m[1], ny)
+            c0, c1 = _cell_span(roots[row, 2], z, low[2], cells_per_m[2], nz)
+            if _any_occupied(occupied, a0, a1, b0, b1, c0, c1):
+                culled_cells[cell] = packed
                 break

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from avatar.kernels.jit import FAST, LEAN, compile_kernel
+from avatar.kernels.jit import FAST_MATH, NO_ALLOCATION, compile_kernel
 
 F32, U32 = np.float32, np.uint32
-LANES = 16
+MATRIX_LANES = 16
 """Floats that a 3×4 matrix takes in a volume of transforms: as many as a register and a cache line
 hold. The last four are nothing."""
 
 
-@compile_kernel(inline="always", **FAST)
-def interpolate(volume, low, nodes_per_m, x, y, z, channels, out):
+@compile_kernel(inline="always", **FAST_MATH)
+def interpolate_at(volume, low, nodes_per_m, x, y, z, channels, out):
     """Trilinear values of a volume (x, y, z, channels) at a point; the border's outside."""
     a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(volume.shape[0] - 1.001))
     b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(volume.shape[1] - 1.001))
@@ -31,8 +31,8 @@ def interpolate(volume, low, nodes_per_m, x, y, z, channels, out):
         )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST)
-def moved(m, x, y, z):
+@compile_kernel(inline="always", **FAST_MATH)
+def transform_point(m, x, y, z):
     """A point moved by a row-major 3×4 matrix."""
     return (
         m[0] * x + m[1] * y + m[2] * z + m[3],
@@ -41,7 +41,7 @@ def moved(m, x, y, z):
     )
 
 
-@compile_kernel(**LEAN)
+@compile_kernel(**NO_ALLOCATION)
 def blend_nodes(nodes, first, joints, shares, bones, transforms):
     """Blends the bones' matrices at some nodes of a volume (flat, `LANES`), in place.
 
@@ -54,9 +54,9 @@ def blend_nodes(nodes, first, joints, shares, bones, transforms):
     """
     for n in range(nodes.shape[0]):
         node = nodes[n]
-        for q in range(LANES):
+        for q in range(MATRIX_LANES):
             transforms[node, q] = shares[first[n]] * bones[joints[first[n]], q]
         for e in range(first[n] + 1, first[n + 1]):
             joint, share = joints[e], shares[e]
-            for q in range(LANES):
+            for q in range(MATRIX_LANES):
                 transforms[node, q] += share * bones[joint, q]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numba
 
-FAST: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
+FAST_MATH: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
 """Of a kernel: sums may be reordered, nothing raises on a zero divisor, other threads run on."""
-LEAN: dict[str, Any] = {**FAST, "_nrt": False}
+NO_ALLOCATION: dict[str, Any] = {**FAST_MATH, "_nrt": False}
 """Of a kernel that allocates nothing: no array is counted when it is named or passed on. Counting
 is atomic, and takes half of the time where arrays go from one small kernel to the next."""
 
@@ -36,14 +36,14 @@ def compile_kernel(
             kernel = numba.njit(**options)(plain)
         file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if file is not None:
-            file._source_stamp = _sources(Path(plain.__code__.co_filename).parent)
+            file._source_stamp = _source_digest(Path(plain.__code__.co_filename).parent)
         return kernel
 
     return decorate
 
 
 @functools.cache
-def _sources(folder: Path) -> str:
+def _source_digest(folder: Path) -> str:
     """A digest of every source in a folder."""
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.py")):

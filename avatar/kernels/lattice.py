@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int32, Integer
 from torch import Tensor
 
 
-def place(
+def sample_occupied_cells(
     origins: Float32[Tensor, "rays 3"],
     directions: Float32[Tensor, "rays 3"],
     slots: Int32[Tensor, "rays"],
@@ -20,7 +20,7 @@ def place(
     near: Float32[Tensor, "slots 3"],
     far: Float32[Tensor, "slots 3"],
 ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-    """Samples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
+    """RaySamples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
 
     A ray enters the box between `near` and `far`, and ends where it leaves it. Beyond the grid its
     outermost cells count.

@@ -5,13 +5,13 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from avatar.kernels.reference import root_row
-from avatar.kernels.skin import skinned, weights_at
+from avatar.kernels.skin import skin_points, interpolate_volume
 
-LONGEST_STEP_M = 0.05
+MAX_ROOT_STEP_M = 0.05
 """A root never moves farther than this at once: where the chord is longer the warp has a fold."""
 
 
-def wrenches(
+def bone_wrenches(
     points: Float[Tensor, "samples 3"],
     grad_points: Float[Tensor, "samples 3"],
     roots: Float[Tensor, "samples 12"],
@@ -26,15 +26,15 @@ def wrenches(
     of weight w takes the force w g and, about the body frame's origin, the moment w (B x) × g.
     """
     force = (roots[:, 3:].unflatten(1, (3, 3)).mT @ grad_points[..., None])[:, None, :, 0]
-    share = weights_at(points, weights, low, nodes_per_m)[..., None]
+    share = interpolate_volume(points, weights, low, nodes_per_m)[..., None]
     matrix = bones.unflatten(2, (3, 4))
     carried = (matrix[..., :3] @ points[:, None, :, None])[..., 0] + matrix[..., 3]
     moment = torch.linalg.cross(carried, force.expand_as(carried))
     return torch.cat([share * force, share * moment], dim=2)
 
 
-def follow(
-    index: Int32[Tensor, "gx gy gz"],
+def update_roots(
+    packed_cells: Int32[Tensor, "gx gy gz"],
     grid_low: Float[Tensor, "3"],
     cell_m: float,
     roots: Float[Tensor, "roots 12"],
@@ -47,14 +47,14 @@ def follow(
 
     How the warp bends about a root is taken along as it is, like the inverse Jacobian.
     """
-    cell = (index > 0).nonzero()
-    packed = index[tuple(cell.T)]
+    cell = (packed_cells > 0).nonzero()
+    packed = packed_cells[tuple(cell.T)]
     for candidate in range(3):
         held = (packed & 3) > candidate
         row = root_row(packed[held], candidate).long()
         center = grid_low + (cell[held] + 0.5) * cell_m
         x, inverse = roots[row, :3], roots[row, 3:].unflatten(1, (3, 3))
-        error = center - skinned(x, weights, low, nodes_per_m, bones)
+        error = center - skin_points(x, weights, low, nodes_per_m, bones)
         step = (inverse @ error[..., None])[..., 0]
-        moves = step.norm(dim=1) <= LONGEST_STEP_M
+        moves = step.norm(dim=1) <= MAX_ROOT_STEP_M
         roots[row, :3] = torch.where(moves[:, None], x + step, x)

@@ -12,7 +12,7 @@ from torch import Tensor
 from avatar.levels import PRIMES, HashLevels
 
 MAX_LOG_DENSITY = 9.0
-HUBER_DELTA = 0.1
+COLOR_HUBER_DELTA = 0.1
 ALPHA_DEAD_ZONE = 1e-3
 OPAQUE_DEPTH = 12.0
 """Optical depth, by cached densities, from which a training ray may end after its grace."""
@@ -33,7 +33,7 @@ def encode(
     device = points.device
     features = []
     for level in range(len(levels.cells_per_m)):
-        counts = torch.from_numpy(levels.counts[level]).to(device).long()
+        counts = torch.from_numpy(levels.vertex_counts[level]).to(device).long()
         scaled = (points - torch.from_numpy(levels.low).to(points)) * float(
             levels.cells_per_m[level]
         )
@@ -43,19 +43,19 @@ def encode(
         for corner in range(8):
             offset = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=device)
             weight = torch.where(offset.bool(), within, 1.0 - within).prod(dim=-1)
-            entries = _entries(cell + offset, levels, level)
+            entries = _table_entries(cell + offset, levels, level)
             total = total + weight[:, None] * table.index_select(0, entries)
         features.append(total)
     return torch.cat(features, dim=-1)
 
 
-def _entries(
+def _table_entries(
     vertices: Int64[Tensor, "points 3"], levels: HashLevels, level: int
 ) -> Int64[Tensor, "points"]:
     first, last = int(levels.offsets[level]), int(levels.offsets[level + 1])
     x, y, z = vertices.unbind(dim=-1)
-    if levels.dense[level]:
-        nx, ny = int(levels.counts[level, 0]), int(levels.counts[level, 1])
+    if levels.is_dense[level]:
+        nx, ny = int(levels.vertex_counts[level, 0]), int(levels.vertex_counts[level, 1])
         return first + x + nx * (y + ny * z)
     hashed = (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
     return first + (hashed & (last - first - 1))
@@ -64,23 +64,23 @@ def _entries(
 def activate(
     raw: Float[Tensor, "samples 4"],
 ) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples"]]:
-    """Colour in [0, 1] and density in 1/m of the network's raw outputs."""
+    """SrgbColor in [0, 1] and density in 1/m of the network's raw outputs."""
     return torch.sigmoid(raw[:, :3]), torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY))
 
 
 def composite(
     raw: Float[Tensor, "samples 4"],
-    first: Int64[Tensor, "rays"],
-    count: Int32[Tensor, "rays"],
-    step_m: float,
+    offsets: Int64[Tensor, "rays"],
+    counts: Int32[Tensor, "rays"],
+    sample_step_m: float,
 ) -> Float[Tensor, "rays 4"]:
     """Premultiplied colour Σ T_i α_i c_i and alpha 1 - Π (1 - α_i) (InstantAvatar, eq. 4)."""
-    most = max(int(count.max()) if len(count) else 0, 1)
+    most = max(int(counts.max()) if len(counts) else 0, 1)
     order = torch.arange(most, device=raw.device)
-    held = order < count[:, None]
+    held = order < counts[:, None]
     color, density = activate(torch.cat([raw, raw.new_zeros(1, 4)]))
-    index = torch.where(held, first[:, None] + order, len(raw))
-    kept = torch.where(held, torch.exp(-density[index] * step_m), torch.ones((), dtype=raw.dtype))
+    index = torch.where(held, offsets[:, None] + order, len(raw))
+    kept = torch.where(held, torch.exp(-density[index] * sample_step_m), torch.ones((), dtype=raw.dtype))
     through = torch.cumprod(kept, dim=1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], dim=1)
     weight = before * (1.0 - kept)
@@ -113,7 +113,7 @@ def loss_per_ray(
     )
     size = error.abs()
     huber = torch.where(
-        size <= HUBER_DELTA, 0.5 * size**2 / HUBER_DELTA, size - 0.5 * HUBER_DELTA
+        size <= COLOR_HUBER_DELTA, 0.5 * size**2 / COLOR_HUBER_DELTA, size - 0.5 * COLOR_HUBER_DELTA
     ).sum(dim=1)
     off = ((alpha - truth).abs() - ALPHA_DEAD_ZONE).clamp(min=0.0)[:, 0]
     hard = -torch.log(torch.exp(-alpha) + torch.exp(alpha - 1.0))[:, 0]
@@ -125,7 +125,7 @@ def march(
     directions: Float32[Tensor, "rays 3"],
     slots: Int32[Tensor, "rays"],
     jitter: Float32[Tensor, "rays"],
-    step_m: float,
+    sample_step_m: float,
     cell_index: Int32[Tensor, "slots cells"],
     cell_roots: Float32[Tensor, "slots roots 12"],
     cell_low: Float32[Tensor, "slots 3"],
@@ -135,8 +135,8 @@ def march(
     density: Float32[Tensor, "x y z"],
     low: Float32[Tensor, "3"],
     cells_per_m: Float32[Tensor, "3"],
-    grace_steps: int,
-    most: int,
+    opaque_margin_steps: int,
+    max_samples: int,
 ) -> tuple[
     Float32[Tensor, "samples 3"],
     Int32[Tensor, "samples"],
@@ -145,7 +145,7 @@ def march(
 ]:
     """Canonical sample points along rays of the body frame, packed ray by ray.
 
-    Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
+    RaySamples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
     has a root whose canonical cell is occupied; of several roots the one of highest cached density
     counts. A ray ends `grace_steps` samples after its cached optical depth has passed
     `OPAQUE_DEPTH`, or after `most` samples.
@@ -161,8 +161,8 @@ def march(
     far = near + shape * cell_m / towards
     enter = torch.minimum(near, far).amax(dim=1).clamp(min=0.0)
     leave = torch.maximum(near, far).amin(dim=1)
-    steps = math.ceil(max(float((leave - enter).max()), 0.0) / step_m) + 1
-    t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * step_m
+    steps = math.ceil(max(float((leave - enter).max()), 0.0) / sample_step_m) + 1
+    t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * sample_step_m
     inside = t < leave[:, None]
     position = origins[:, None] + t[..., None] * directions[:, None]
     local = position - cell_low[slot][:, None]
@@ -177,18 +177,18 @@ def march(
     for candidate in range(3):
         exists = (packed & 3) > candidate
         row = root_row(packed, candidate)
-        canonical = warped(cell_roots, slot[:, None], row, packed & 4 > 0, offset)
-        cached, kept = _look_up(canonical, occupied, density, low, cells_per_m)
+        canonical = canonical_points(cell_roots, slot[:, None], row, packed & 4 > 0, offset)
+        cached, kept = _cached_density(canonical, occupied, density, low, cells_per_m)
         better = exists & kept & (cached > best)
         best = torch.where(better, cached, best)
         rows = torch.where(better, row, rows)
         points = torch.where(better[..., None], canonical, points)
 
     kept = best >= 0.0
-    opaque = torch.cumsum(best.clamp(min=0.0) * step_m, dim=1) > OPAQUE_DEPTH
+    opaque = torch.cumsum(best.clamp(min=0.0) * sample_step_m, dim=1) > OPAQUE_DEPTH
     counted = (opaque & kept).int()
-    kept &= torch.cumsum(counted, dim=1) - counted <= grace_steps
-    kept &= torch.cumsum(kept.int(), dim=1) <= most
+    kept &= torch.cumsum(counted, dim=1) - counted <= opaque_margin_steps
+    kept &= torch.cumsum(kept.int(), dim=1) <= max_samples
     after = torch.arange(1, steps + 1, device=slot.device) * kept
     return points[kept], rows[kept].int(), kept.sum(dim=1).int(), after.amax(dim=1).int()
 
@@ -199,7 +199,7 @@ def root_row(packed: Int32[Tensor, "*cells"], candidate: int) -> Int32[Tensor, "
     return torch.where((packed & 3) > candidate, row, 0).int()
 
 
-def warped(
+def canonical_points(
     roots: Float32[Tensor, "slots roots 12"],
     slot: Int64[Tensor, "*#points"],
     row: Int32[Tensor, "*points"],
@@ -220,7 +220,7 @@ def warped(
     return torch.where(bent[..., None], straight + bend, straight)
 
 
-def _look_up(
+def _cached_density(
     points: Float32[Tensor, "rays steps 3"],
     occupied: UInt8[Tensor, "x y z"],
     density: Float32[Tensor, "x y z"],
@@ -235,7 +235,7 @@ def _look_up(
     return density[x, y, z], inside & (occupied[x, y, z] != 0)
 
 
-def keep_highest(
+def scatter_max_density(
     points: Float[Tensor, "points 3"],
     log_density: Float[Tensor, "points"],
     low: Float32[Tensor, "3"],

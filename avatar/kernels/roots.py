@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from avatar.kernels.skin import find_roots
+from avatar.kernels.skin import broyden_roots
 
 START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
 """Fast-SNARF's: a search starts where each of these bones alone would carry the sample."""
@@ -12,7 +12,7 @@ SAME_ROOT_M = 1e-3
 """Roots closer than this are one."""
 
 
-def find_all(
+def find_all_roots(
     points: Float[Tensor, "points 3"],
     slots: Int32[Tensor, "points"],
     blended: Float[Tensor, "slots x y z 12"],
@@ -20,10 +20,10 @@ def find_all(
     nodes_per_m: Float[Tensor, "3"],
     inverses: Float[Tensor, "slots starts 12"],
 ) -> tuple[Float[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-    """Every canonical point that skinning carries to a sample, by Broyden's method (§3.2).
+    """Every canonical point that skinning carries to a sample, by BroydenLookup's method (§3.2).
 
     Args:
-        points: Samples, each in the body frame of its slot.
+        points: RaySamples, each in the body frame of its slot.
         slots: Which pose each belongs to.
         blended: Σ w_j B_j on the nodes of the canonical box, for each slot.
         low, nodes_per_m: Where those nodes are.
@@ -42,7 +42,7 @@ def find_all(
         matrix = inverses[slot].unflatten(1, (3, 4))
         target = points[here, None].expand(len(here), starts, 3)
         start = (matrix[:, :, :3] @ target[..., None])[..., 0] + matrix[:, :, 3]
-        found, rests = find_roots(
+        found, rests = broyden_roots(
             target.flatten(0, 1), start.flatten(0, 1), blended[slot], low, nodes_per_m, unit
         )
         roots[here] = found.unflatten(0, (len(here), starts))

@@ -8,48 +8,48 @@ from jaxtyping import Float32
 
 from avatar.kernels.backend import (
     Backend,
-    Cells,
-    CellTables,
-    Grid,
-    Marching,
-    Rays,
-    Samples,
+    SolvedCorrespondences,
+    CorrespondenceTables,
+    DensityGrid,
+    MarchSettings,
+    RayBatch,
+    RaySamples,
 )
-from avatar.kernels.skin import skinned
+from avatar.kernels.skin import skin_points
 from avatar.kernels.torch_backend import TorchBackend
-from avatar.levels import FEATURES, HashLevels
+from avatar.levels import FEATURES_PER_LEVEL, HashLevels
 from avatar.rig import Rig
 
-POINTS = 256
-CELL_M = 0.05
-TOLERANCE = 1e-3
+TEST_POINTS = 256
+TEST_CELL_M = 0.05
+RELATIVE_TOLERANCE = 1e-3
 """Largest difference allowed, as a share of the largest value."""
 
 
-def strays(backend: Backend) -> str | None:
+def failing_operation(backend: Backend) -> str | None:
     """The operation in which a backend differs from the reference on 256 points, or None.
 
     Args:
         backend: Any but the reference itself.
     """
     generator = torch.Generator().manual_seed(0)
-    levels = HashLevels.over(
+    levels = HashLevels.spanning(
         np.zeros(3, dtype=np.float32), np.array([1.0, 0.6, 0.4], dtype=np.float32),
         coarsest_m=0.2, finest_m=0.02, levels=4, table_size=1024,
     )  # fmt: skip
-    table = torch.randn(levels.entries, FEATURES, generator=generator)
-    points = torch.rand(POINTS, 3, generator=generator) * torch.tensor([1.0, 0.6, 0.4])
-    slope = torch.randn(POINTS, levels.width, generator=generator)
-    raw = torch.randn(POINTS, 4, generator=generator) + torch.tensor([0.0, 0.0, 0.0, 3.0])
-    count = torch.full((16,), POINTS // 16, dtype=torch.int32)
-    rows = torch.zeros(POINTS, dtype=torch.int32)
-    samples = Samples(points, torch.cumsum(count, 0) - count, count, rows)
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
+    points = torch.rand(TEST_POINTS, 3, generator=generator) * torch.tensor([1.0, 0.6, 0.4])
+    slope = torch.randn(TEST_POINTS, levels.feature_width, generator=generator)
+    raw = torch.randn(TEST_POINTS, 4, generator=generator) + torch.tensor([0.0, 0.0, 0.0, 3.0])
+    count = torch.full((16,), TEST_POINTS // 16, dtype=torch.int32)
+    rows = torch.zeros(TEST_POINTS, dtype=torch.int32)
+    samples = RaySamples(points, torch.cumsum(count, 0) - count, count, rows)
     target = torch.rand(16, 4, generator=generator)
     background = torch.rand(16, 3, generator=generator)
 
     rig, bones = _bent_tube()
     canonical = torch.from_numpy(rig.seeds) * torch.tensor([1.0, 1.2, 1.2])
-    cells = _cells(TorchBackend(), rig, bones)
+    cells = _solve_tables(TorchBackend(), rig, bones)
 
     def results(of: Backend) -> dict[str, torch.Tensor]:
         grad_table = torch.zeros_like(table)
@@ -59,10 +59,10 @@ def strays(backend: Backend) -> str | None:
             "encode": of.encode(points, table, levels),
             "encode_backward": grad_table,
             "encode_points_backward": of.encode_points_backward(points, slope, table, levels),
-            "build_cells": _looked_up(
-                TorchBackend(), _cells(of, rig, bones), rig, bones, canonical
+            "build_cells": _march_to_seeds(
+                TorchBackend(), _solve_tables(of, rig, bones), rig, bones, canonical
             ),
-            "march": _looked_up(of, cells, rig, bones, canonical),
+            "march": _march_to_seeds(of, cells, rig, bones, canonical),
             "composite": of.composite(raw, samples, 0.01),
             "composite_loss": torch.cat([rendered.flatten(), loss, grad.flatten() * len(loss)]),
         }
@@ -70,7 +70,7 @@ def strays(backend: Backend) -> str | None:
     expected = results(TorchBackend())
     for name, values in results(backend).items():
         off = float((values - expected[name]).abs().max() / expected[name].abs().max())
-        if not off <= TOLERANCE or math.isnan(off):
+        if not off <= RELATIVE_TOLERANCE or math.isnan(off):
             return name
     return None
 
@@ -92,8 +92,8 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
         rest_joints=np.zeros((24, 3)), parents=np.full(24, -1),
         canonical_rotations=np.zeros((23, 3)),
         box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
-        distance=np.abs(off_axis - 0.05).astype(np.float32), inside=off_axis < 0.05,
-        seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * POINTS],
+        skin_distance=np.abs(off_axis - 0.05).astype(np.float32), inside_skin=off_axis < 0.05,
+        seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * TEST_POINTS],
         seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
     )  # fmt: skip
     bones = np.tile(np.eye(4)[:3], (24, 1, 1))
@@ -101,38 +101,38 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
     return rig, bones.reshape(24, 12).astype(np.float32)
 
 
-def _cells(of: Backend, rig: Rig, bones: Float32[np.ndarray, "24 12"]) -> CellTables:
-    built: Cells = of.build_cells(rig, bones, 0.05, CELL_M, torch.device("cpu"))
-    return CellTables(
-        torch.from_numpy(built.index.reshape(1, -1)), torch.from_numpy(built.roots[None]),
+def _solve_tables(of: Backend, rig: Rig, bones: Float32[np.ndarray, "24 12"]) -> CorrespondenceTables:
+    built: SolvedCorrespondences = of.solve_correspondences(rig, bones, 0.05, TEST_CELL_M, torch.device("cpu"))
+    return CorrespondenceTables(
+        torch.from_numpy(built.packed_cells.reshape(1, -1)), torch.from_numpy(built.roots[None]),
         torch.from_numpy(built.low[None]),
-        torch.tensor([built.index.shape], dtype=torch.int32), CELL_M,
+        torch.tensor([built.packed_cells.shape], dtype=torch.int32), TEST_CELL_M,
     )  # fmt: skip
 
 
-def _looked_up(
+def _march_to_seeds(
     of: Backend,
-    cells: CellTables,
+    cells: CorrespondenceTables,
     rig: Rig,
     bones: Float32[np.ndarray, "24 12"],
     canonical: Float32[torch.Tensor, "points 3"],
 ) -> Float32[torch.Tensor, "points 3"]:
     """Where marching finds what skinning has carried off; 0 where it finds nothing."""
     extent = rig.box_high - rig.box_low
-    low, shape = torch.from_numpy(rig.box_low), np.array(rig.distance.shape, dtype=np.float32)
+    low, shape = torch.from_numpy(rig.box_low), np.array(rig.skin_distance.shape, dtype=np.float32)
     nodes_per_m = torch.from_numpy((np.array(rig.weights.shape[:3], np.float32) - 1) / extent)
-    posed = skinned(
+    posed = skin_points(
         canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
     )
-    grid = Grid(
-        torch.ones(rig.distance.shape, dtype=torch.uint8), torch.ones(rig.distance.shape), low,
+    grid = DensityGrid(
+        torch.ones(rig.skin_distance.shape, dtype=torch.uint8), torch.ones(rig.skin_distance.shape), low,
         torch.from_numpy(shape / extent),
     )  # fmt: skip
-    rays = Rays(
+    rays = RayBatch(
         posed, torch.tensor([[0.6, 0.64, 0.48]]).repeat(len(posed), 1),
         torch.zeros(len(posed), dtype=torch.int32), torch.zeros(len(posed)),
     )  # fmt: skip
-    samples = of.march(rays, cells, grid, Marching(9.0, math.inf, 1))
+    samples = of.march(rays, cells, grid, MarchSettings(9.0, math.inf, 1))
     found = torch.zeros_like(posed)
-    found[samples.count > 0] = samples.points
+    found[samples.counts > 0] = samples.points
     return found

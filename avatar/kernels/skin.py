@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def weights_at(
+def interpolate_volume(
     points: Float[Tensor, "points 3"],
     weights: Float[Tensor, "x y z channels"],
     low: Float[Tensor, "3"],
@@ -21,7 +21,7 @@ def weights_at(
     return read[0, :, :, 0, 0].T
 
 
-def skinned(
+def skin_points(
     points: Float[Tensor, "points 3"],
     weights: Float[Tensor, "x y z channels"],
     low: Float[Tensor, "3"],
@@ -29,11 +29,11 @@ def skinned(
     bones: Float[Tensor, "channels 12"],
 ) -> Float[Tensor, "points 3"]:
     """Linear blend skinning: x ↦ Σ w_j(x) B_j x (Fast-SNARF, eq. 3)."""
-    blend = (weights_at(points, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
+    blend = (interpolate_volume(points, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
     return (blend[..., :3] @ points[..., None])[..., 0] + blend[..., 3]
 
 
-def find_roots(
+def broyden_roots(
     targets: Float[Tensor, "points 3"],
     starts: Float[Tensor, "points 3"],
     weights: Float[Tensor, "x y z channels"],
@@ -44,7 +44,7 @@ def find_roots(
     iterations: int = 12,
     tolerance_m: float = 1e-4,
 ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, "points"]]:
-    """Canonical points that skinning carries to `targets`, by Broyden's method per sample.
+    """Canonical points that skinning carries to `targets`, by BroydenLookup's method per sample.
 
     Fast-SNARF, §3.2. The inverse Jacobian starts from the blended rotation's inverse.
 
@@ -52,14 +52,14 @@ def find_roots(
         The roots, and which of them came to rest within the tolerance.
     """
     x = starts.clone()
-    blend = (weights_at(x, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
+    blend = (interpolate_volume(x, weights, low, nodes_per_m) @ bones).unflatten(1, (3, 4))
     inverse = torch.linalg.inv(blend[..., :3])
-    error = skinned(x, weights, low, nodes_per_m, bones) - targets
+    error = skin_points(x, weights, low, nodes_per_m, bones) - targets
     for _ in range(iterations):
         moving = (error.norm(dim=-1) > tolerance_m)[:, None]
         step = torch.where(moving, -(inverse @ error[..., None])[..., 0], 0.0)
         x = x + step
-        new = skinned(x, weights, low, nodes_per_m, bones) - targets
+        new = skin_points(x, weights, low, nodes_per_m, bones) - targets
         change = (inverse @ (new - error)[..., None])[..., 0]
         scale = (step * change).sum(dim=-1, keepdim=True)
         scale = torch.where(scale.abs() < 1e-12, 1e-12, scale)

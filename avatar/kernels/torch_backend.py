@@ -9,22 +9,22 @@ from torch import Tensor
 
 from avatar.kernels import lattice, pose, reference, roots
 from avatar.kernels.backend import (
-    Articulations,
-    Cells,
-    CellTables,
+    BlendedTransforms,
+    SolvedCorrespondences,
+    CorrespondenceTables,
     Features,
-    Grid,
-    Marching,
-    Pixels,
+    DensityGrid,
+    MarchSettings,
+    PremultipliedPixels,
     Points,
-    PosedGrid,
-    Raw,
-    Rays,
-    Samples,
-    Skin,
-    Table,
+    PosedOccupancy,
+    RawOutputs,
+    RayBatch,
+    RaySamples,
+    SkinningVolume,
+    HashTable,
 )
-from avatar.kernels.cells import build_cells
+from avatar.kernels.cells import solve_correspondences
 from avatar.levels import HashLevels
 from avatar.rig import Rig
 
@@ -38,12 +38,12 @@ class TorchBackend:
 
     name = "torch"
 
-    def encode(self, points: Points, table: Table, levels: HashLevels) -> Features:
+    def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
         with torch.no_grad():
             return reference.encode(points, table, levels)
 
     def encode_backward(
-        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: Table
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
     ) -> None:
         table = torch.zeros_like(grad_table, requires_grad=True)
         with torch.enable_grad():
@@ -51,67 +51,67 @@ class TorchBackend:
             (grad,) = torch.autograd.grad((features * grad_features).sum(), table)
         grad_table += grad
 
-    def build_cells(
+    def solve_correspondences(
         self,
         rig: Rig,
         bones: Float32[np.ndarray, "24 12"],
         band_m: float,
         cell_m: float,
         device: torch.device,
-    ) -> Cells:
+    ) -> SolvedCorrespondences:
         def there(part: np.ndarray) -> Tensor:
             return torch.from_numpy(part).to(device)
 
         extent = rig.box_high - rig.box_low
         nodes_per_m = (np.array(rig.weights.shape[:3], dtype=np.float32) - 1) / extent
-        cells_per_m = np.array(rig.distance.shape, dtype=np.float32) / extent
+        cells_per_m = np.array(rig.skin_distance.shape, dtype=np.float32) / extent
         volume = there(rig.weights), there(rig.box_low), there(nodes_per_m), there(bones)
-        built = build_cells(
-            volume, there(rig.seeds), there(rig.seed_parts), there(rig.distance),
+        built = solve_correspondences(
+            volume, there(rig.seeds), there(rig.seed_parts), there(rig.skin_distance),
             there(cells_per_m), band_m, cell_m,
         )  # fmt: skip
-        return Cells(*(part.cpu().numpy() for part in built))
+        return SolvedCorrespondences(*(part.cpu().numpy() for part in built))
 
-    def march(self, rays: Rays, cells: CellTables, grid: Grid, how: Marching) -> Samples:
-        return self.march_on(rays, cells, grid, how)[0]
+    def march(self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings) -> RaySamples:
+        return self.march_resumable(rays, cells, grid, how)[0]
 
-    def march_on(
-        self, rays: Rays, cells: CellTables, grid: Grid, how: Marching
-    ) -> tuple[Samples, Float32[Tensor, "rays"]]:
+    def march_resumable(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
         points, rows, count, reached = reference.march(
-            *rays, how.step_m, *cells, *grid, how.grace_steps, how.most
+            *rays, how.sample_step_m, *cells, *grid, how.opaque_margin_steps, how.max_samples
         )
-        samples = Samples(points, torch.cumsum(count, 0) - count, count, rows)
+        samples = RaySamples(points, torch.cumsum(count, 0) - count, count, rows)
         return samples, rays.jitter + reached
 
-    def composite(self, raw: Raw, samples: Samples, step_m: float) -> Pixels:
+    def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
         with torch.no_grad():
-            return reference.composite(raw, samples.first, samples.count, step_m)
+            return reference.composite(raw, samples.offsets, samples.counts, step_m)
 
     def composite_loss(
         self,
-        raw: Raw,
-        samples: Samples,
+        raw: RawOutputs,
+        samples: RaySamples,
         step_m: float,
-        target: Pixels,
+        target: PremultipliedPixels,
         background: Float32[Tensor, "rays 3"],
         alpha_weight: float,
         hard_weight: float,
-    ) -> tuple[Pixels, Float32[Tensor, "rays"], Raw]:
+    ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
         leaf = raw.detach().requires_grad_()
         with torch.enable_grad():
-            rendered = reference.composite(leaf, samples.first, samples.count, step_m)
+            rendered = reference.composite(leaf, samples.offsets, samples.counts, step_m)
             loss = reference.loss_per_ray(rendered, target, background, alpha_weight, hard_weight)
             (grad,) = torch.autograd.grad(loss.mean(), leaf)
         return rendered.detach(), loss.detach(), grad
 
-    def keep_highest(
-        self, points: Points, log_density: Float32[Tensor, "points"], grid: Grid
+    def scatter_max_density(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
     ) -> None:
-        reference.keep_highest(points, log_density, grid.low, grid.cells_per_m, grid.density)
+        reference.scatter_max_density(points, log_density, grid.low, grid.cells_per_m, grid.density)
 
     def encode_points_backward(
-        self, points: Points, grad_features: Features, table: Table, levels: HashLevels
+        self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
     ) -> Points:
         leaf = points.detach().requires_grad_()
         with torch.enable_grad():
@@ -119,37 +119,37 @@ class TorchBackend:
             (grad,) = torch.autograd.grad((features * grad_features).sum(), leaf)
         return grad
 
-    def wrenches(
+    def bone_wrenches(
         self,
-        samples: Samples,
+        samples: RaySamples,
         grad_points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "rays"],
-        cells: CellTables,
-        skin: Skin,
+        cells: CorrespondenceTables,
+        skin: SkinningVolume,
         bones: Float32[Tensor, "slots 24 12"],
     ) -> Float32[Tensor, "rays 24 6"]:
-        ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.count)
+        ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.counts)
         slot = slots[ray].long()
-        roots = cells.roots[slot, samples.rows.long()]
-        wrench = pose.wrenches(samples.points, grad_points, roots, bones[slot], *skin)
+        roots = cells.roots[slot, samples.root_rows.long()]
+        wrench = pose.bone_wrenches(samples.points, grad_points, roots, bones[slot], *skin)
         return wrench.new_zeros(len(slots), 24, 6).index_add_(0, ray, wrench)
 
-    def follow(
-        self, cells: CellTables, slot: int, skin: Skin, bones: Float32[Tensor, "24 12"]
+    def update_roots(
+        self, cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
     ) -> None:
         nx, ny, nz = cells.shape[slot].tolist()
-        index = cells.index[slot, : nx * ny * nz].view(nx, ny, nz)
-        pose.follow(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
+        index = cells.packed_cells[slot, : nx * ny * nz].view(nx, ny, nz)
+        pose.update_roots(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
 
-    def place(
-        self, rays: Rays, grid: PosedGrid, step_m: float
+    def sample_occupied_cells(
+        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
     ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        return lattice.place(*rays, step_m, *grid)
+        return lattice.sample_occupied_cells(*rays, step_m, *grid)
 
-    def find_roots(
+    def find_all_roots(
         self,
         points: Float32[Tensor, "points 3"],
         slots: Int32[Tensor, "points"],
-        poses: Articulations,
+        poses: BlendedTransforms,
     ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-        return roots.find_all(points, slots, *poses)
+        return roots.find_all_roots(points, slots, *poses)

@@ -12,9 +12,9 @@ from numba.core import cgutils
 from numba.core.types import Type, float32, intp, none
 from numba.extending import intrinsic, models, register_model
 
-FAST = ("fast",)
+FAST_MATH_FLAGS = ("fast",)
 """What `avatar.kernels.jit.FAST` allows: a product and a sum may be one instruction."""
-REGISTER = ir.VectorType(ir.FloatType(), 4)
+FLOAT4 = ir.VectorType(ir.FloatType(), 4)
 
 
 class Vector4(Type):
@@ -26,11 +26,11 @@ class Vector4(Type):
 
 
 @register_model(Vector4)
-class _InRegister(models.PrimitiveModel):
+class _Vector4Model(models.PrimitiveModel):
     """How a `Vector4` is held: as LLVM's vector."""
 
     def __init__(self, data_model_manager, numba_type):
-        super().__init__(data_model_manager, numba_type, REGISTER)
+        super().__init__(data_model_manager, numba_type, FLOAT4)
 
 
 vector4 = Vector4()
@@ -41,19 +41,19 @@ def operation(function: Callable[..., Any]) -> Callable[..., Any]:
     return intrinsic(function)
 
 
-def _place(context, builder, signature, arguments):
+def _row_pointer(context, builder, signature, arguments):
     """Where the four numbers lie that begin at `array[row, column]`."""
     array_type = signature.args[0]
     array = context.make_array(array_type)(context, builder, arguments[0])
     pointer = cgutils.get_item_pointer(
         context, builder, array_type, array, arguments[1:3], wraparound=False
     )
-    return builder.bitcast(pointer, REGISTER.as_pointer())
+    return builder.bitcast(pointer, FLOAT4.as_pointer())
 
 
-def _everywhere(builder, number):
+def _broadcast(builder, number):
     """A vector of one number four times."""
-    nothing = ir.Constant(REGISTER, ir.Undefined)
+    nothing = ir.Constant(FLOAT4, ir.Undefined)
     first = ir.Constant(ir.VectorType(ir.IntType(32), 4), [0, 0, 0, 0])
     start = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(start, nothing, first)
@@ -64,7 +64,7 @@ def load4(typing_context, array, row, column):
     """`array[row, column : column + 4]`; row and column are not negative, and not checked."""
 
     def code(context, builder, signature, arguments):
-        return builder.load(_place(context, builder, signature, arguments), align=4)
+        return builder.load(_row_pointer(context, builder, signature, arguments), align=4)
 
     return vector4(array, intp, intp), code
 
@@ -74,28 +74,28 @@ def store4(typing_context, array, row, column, values):
     """`array[row, column : column + 4] = values`; row and column are not checked."""
 
     def code(context, builder, signature, arguments):
-        builder.store(arguments[3], _place(context, builder, signature, arguments), align=4)
+        builder.store(arguments[3], _row_pointer(context, builder, signature, arguments), align=4)
         return context.get_dummy_value()
 
     return none(array, intp, intp, vector4), code
 
 
 @operation
-def times4(typing_context, factor, values):
+def scale4(typing_context, factor, values):
     """`factor * values`."""
 
     def code(context, builder, signature, arguments):
-        return builder.fmul(_everywhere(builder, arguments[0]), arguments[1], flags=FAST)
+        return builder.fmul(_broadcast(builder, arguments[0]), arguments[1], flags=FAST_MATH_FLAGS)
 
     return vector4(float32, vector4), code
 
 
 @operation
-def plus4(typing_context, one, other):
+def add4(typing_context, one, other):
     """`one + other`."""
 
     def code(context, builder, signature, arguments):
-        return builder.fadd(*arguments, flags=FAST)
+        return builder.fadd(*arguments, flags=FAST_MATH_FLAGS)
 
     return vector4(vector4, vector4), code
 
@@ -105,11 +105,11 @@ def dot4(typing_context, one, other):
     """The sum of the products."""
 
     def code(context, builder, signature, arguments):
-        product = builder.fmul(*arguments, flags=FAST)
+        product = builder.fmul(*arguments, flags=FAST_MATH_FLAGS)
         a, b, c, d = (
             builder.extract_element(product, ir.Constant(ir.IntType(32), lane)) for lane in range(4)
         )
-        pairs = builder.fadd(a, c, flags=FAST), builder.fadd(b, d, flags=FAST)
-        return builder.fadd(*pairs, flags=FAST)
+        pairs = builder.fadd(a, c, flags=FAST_MATH_FLAGS), builder.fadd(b, d, flags=FAST_MATH_FLAGS)
+        return builder.fadd(*pairs, flags=FAST_MATH_FLAGS)
 
     return float32(vector4, vector4), code

@@ -11,30 +11,30 @@ import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
-from avatar.kernels.backend import CellTables, PosedGrid
-from avatar.paper.emptiness import persons_box
+from avatar.kernels.backend import CorrespondenceTables, PosedOccupancy
+from avatar.paper.emptiness import person_boxes
 from avatar.paper.posed_field import PosedField
 from avatar.rig import Rig
 
-SIDE = 64
-DECAY = 0.8
+GRID_CELLS = 64
+GRID_DECAY = 0.8
 """What a cell keeps of its density from one update to the next."""
-OPACITY = 0.01
+GRID_OPACITY = 0.01
 """Of one centimetre; a cell below it, or below the mean if that is lower, is empty."""
-BEYOND_M = 0.25
+GRID_MARGIN_M = 0.25
 """How far beyond the longest chain of bones the sequence's grid reaches."""
-FRAME_EVERY = 4
+FRAME_GRID_INTERVAL = 4
 """Steps between renewals of a frame's grid: with 100 frames each one's turn comes in 400 steps."""
 
 
-def occupied_by(density: Float32[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """Cells that hold something, and all their neighbours."""
+def threshold_and_dilate(density: Float32[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+    """SolvedCorrespondences that hold something, and all their neighbours."""
     opacity = 1.0 - torch.exp(-0.01 * density)
-    full = (opacity > opacity.mean().clamp(max=OPACITY)).float()
+    full = (opacity > opacity.mean().clamp(max=GRID_OPACITY)).float()
     return torch.nn.functional.max_pool3d(full[None], 3, stride=1, padding=1)[0].to(torch.uint8)
 
 
-def jittered(
+def jittered_points(
     cells: Int64[Tensor, "cells 3"],
     low: Float32[Tensor, "3"],
     cell_m: Float32[Tensor, "3"],
@@ -45,7 +45,7 @@ def jittered(
     return low + (cells + within.to(low.device)) * cell_m
 
 
-def cells_between(
+def cells_in_block(
     first: tuple[int, int, int], last: tuple[int, int, int], device: torch.device
 ) -> Int64[Tensor, "cells 3"]:
     """The cells of a block, its last ones not included."""
@@ -54,7 +54,7 @@ def cells_between(
 
 
 @final
-class EmptyPool:
+class EmptyPointPool:
     """Canonical points that the latest probes found in empty cells."""
 
     def __init__(self, device: torch.device) -> None:
@@ -75,7 +75,7 @@ class EmptyPool:
 
 
 @final
-class UnionGrid:
+class SequenceGrid:
     """Training, in the paper: the union over the sequence, as the moving maximum of one grid.
 
     As in the paper it forgets: what no drawn frame has shown for a few hundred steps is dropped.
@@ -85,7 +85,7 @@ class UnionGrid:
         occupied: Everything, until the first update.
     """
 
-    def __init__(self, rig: Rig, field: PosedField, *, every: int, device: torch.device) -> None:
+    def __init__(self, rig: Rig, field: PosedField, *, interval: int, device: torch.device) -> None:
         """A grid that knows nothing.
 
         Args:
@@ -94,38 +94,38 @@ class UnionGrid:
             every: Steps between updates.
             device: Where it lives.
         """
-        reach = _reach(rig) + BEYOND_M
+        reach = _reach(rig) + GRID_MARGIN_M
         pelvis = torch.from_numpy(rig.rest_joints[0]).float().to(device)
-        self._field, self._every = field, every
-        self._low, self._cell_m = pelvis - reach, 2.0 * reach / SIDE
+        self._field, self._every = field, interval
+        self._low, self._cell_m = pelvis - reach, 2.0 * reach / GRID_CELLS
         self._slots: list[int] = []
-        self._pool = EmptyPool(device)
-        self.density: Float32[Tensor, "64 64 64"] = torch.zeros((SIDE,) * 3, device=device)
+        self._pool = EmptyPointPool(device)
+        self.density: Float32[Tensor, "64 64 64"] = torch.zeros((GRID_CELLS,) * 3, device=device)
         self.occupied: UInt8[Tensor, "64 64 64"] = torch.ones(
-            (SIDE,) * 3, dtype=torch.uint8, device=device
+            (GRID_CELLS,) * 3, dtype=torch.uint8, device=device
         )
 
-    def grid(self, cells: CellTables) -> PosedGrid:
+    def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
         """The same for every slot."""
         slots = len(cells.low)
-        return PosedGrid(
+        return PosedOccupancy(
             self.occupied.view(1, -1).expand(slots, -1),
             self._low.repeat(slots, 1),
             torch.full_like(cells.low, 1.0 / self._cell_m),
-            torch.full_like(cells.shape, SIDE),
-            *persons_box(cells),
+            torch.full_like(cells.shape, GRID_CELLS),
+            *person_boxes(cells),
         )
 
-    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """From empty cells of the frame that was probed last."""
         return self._pool.draw(count, generator)
 
-    def admit(self, slot: int, cells: CellTables) -> None:
+    def add_frame(self, slot: int, cells: CorrespondenceTables) -> None:
         """The frame will be drawn for updates."""
         if slot not in self._slots:
             self._slots.append(slot)
 
-    def update(self, steps: int, cells: CellTables, generator: torch.Generator) -> None:
+    def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Probes a random frame, every so many steps."""
         if steps % self._every == 0 and self._slots:
             drawn = torch.randint(
@@ -133,25 +133,25 @@ class UnionGrid:
             )
             self.probe(self._slots[int(drawn)], cells, generator)
 
-    def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
+    def probe(self, slot: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Takes in what one frame holds. Outside the person's box it holds nothing."""
-        low, high = (corner[slot] - self._low for corner in persons_box(cells))
-        first = (low / self._cell_m).floor().long().clamp(0, SIDE).tolist()
-        last = (high / self._cell_m).ceil().long().clamp(0, SIDE).tolist()
-        block = cells_between(tuple(first), tuple(last), low.device)
+        low, high = (corner[slot] - self._low for corner in person_boxes(cells))
+        first = (low / self._cell_m).floor().long().clamp(0, GRID_CELLS).tolist()
+        last = (high / self._cell_m).ceil().long().clamp(0, GRID_CELLS).tolist()
+        block = cells_in_block(tuple(first), tuple(last), low.device)
         cell_m = torch.full_like(low, self._cell_m)
-        probed = self._field.probe(jittered(block, self._low, cell_m, generator), slot, cells)
-        near = (block[:, 0] * SIDE + block[:, 1]) * SIDE + block[:, 2]
+        probed = self._field.density_at(jittered_points(block, self._low, cell_m, generator), slot, cells)
+        near = (block[:, 0] * GRID_CELLS + block[:, 1]) * GRID_CELLS + block[:, 2]
         flat = self.density.view(-1)
-        flat *= DECAY
+        flat *= GRID_DECAY
         flat[near] = torch.maximum(flat[near], probed.density)
-        self.occupied = occupied_by(self.density)
-        empty = self.occupied.view(-1)[near[probed.found]] == 0
+        self.occupied = threshold_and_dilate(self.density)
+        empty = self.occupied.view(-1)[near[probed.has_root]] == 0
         self._pool.fill(probed.canonical[empty])
 
 
 @final
-class FrameGrids:
+class PerFrameGrids:
     """Rendering, in the paper: a grid for each pose, over the person's own box.
 
     In training the grids are renewed in turn, each as a moving maximum.
@@ -165,8 +165,8 @@ class FrameGrids:
         """Grids without frames."""
         self._field = field
         self._turn: list[int] = []
-        self._pool = EmptyPool(device)
-        cube = (slots, SIDE, SIDE, SIDE)
+        self._pool = EmptyPointPool(device)
+        cube = (slots, GRID_CELLS, GRID_CELLS, GRID_CELLS)
         self.density: Float32[Tensor, "slots 64 64 64"] = torch.zeros(cube, device=device)
         self.occupied: UInt8[Tensor, "slots 64 64 64"] = torch.zeros(
             cube, dtype=torch.uint8, device=device
@@ -174,18 +174,18 @@ class FrameGrids:
         self._low = torch.zeros(slots, 3, device=device)
         self._cell_m = torch.ones(slots, 3, device=device)
 
-    def grid(self, cells: CellTables) -> PosedGrid:
+    def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
         """Each slot's own, in the box that it had when it was probed."""
-        shape = torch.full_like(cells.shape, SIDE)
-        far = self._low + SIDE * self._cell_m
+        shape = torch.full_like(cells.shape, GRID_CELLS)
+        far = self._low + GRID_CELLS * self._cell_m
         occupied = self.occupied.flatten(1)
-        return PosedGrid(occupied, self._low, 1.0 / self._cell_m, shape, self._low, far)
+        return PosedOccupancy(occupied, self._low, 1.0 / self._cell_m, shape, self._low, far)
 
-    def empty_points(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """From empty cells of the grid that was renewed last."""
         return self._pool.draw(count, generator)
 
-    def admit(self, slot: int, cells: CellTables) -> None:
+    def add_frame(self, slot: int, cells: CorrespondenceTables) -> None:
         """The slot's box is full until it is probed, and its turn is next."""
         if slot in self._turn:
             self._turn.remove(slot)
@@ -194,29 +194,29 @@ class FrameGrids:
         self.density[slot] = 0.0
         self.occupied[slot] = 1
 
-    def update(self, steps: int, cells: CellTables, generator: torch.Generator) -> None:
+    def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Renews one slot's grid, every so many steps."""
-        if steps % FRAME_EVERY == 0 and self._turn:
+        if steps % FRAME_GRID_INTERVAL == 0 and self._turn:
             slot = self._turn.pop(0)
             self._turn.append(slot)
-            self.density[slot] *= DECAY
+            self.density[slot] *= GRID_DECAY
             self._measure(slot, cells)
             self.probe(slot, cells, generator)
 
-    def probe(self, slot: int, cells: CellTables, generator: torch.Generator) -> None:
+    def probe(self, slot: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Raises one slot's densities to what a random point of each cell holds."""
-        block = cells_between((0, 0, 0), (SIDE, SIDE, SIDE), self._low.device)
-        points = jittered(block, self._low[slot], self._cell_m[slot], generator)
-        probed = self._field.probe(points, slot, cells)
+        block = cells_in_block((0, 0, 0), (GRID_CELLS, GRID_CELLS, GRID_CELLS), self._low.device)
+        points = jittered_points(block, self._low[slot], self._cell_m[slot], generator)
+        probed = self._field.density_at(points, slot, cells)
         flat = self.density[slot].view(-1)
         torch.maximum(flat, probed.density, out=flat)
-        self.occupied[slot] = occupied_by(self.density[slot])
-        empty = self.occupied[slot].view(-1)[probed.found] == 0
+        self.occupied[slot] = threshold_and_dilate(self.density[slot])
+        empty = self.occupied[slot].view(-1)[probed.has_root] == 0
         self._pool.fill(probed.canonical[empty])
 
-    def _measure(self, slot: int, cells: CellTables) -> None:
+    def _measure(self, slot: int, cells: CorrespondenceTables) -> None:
         self._low[slot] = cells.low[slot]
-        self._cell_m[slot] = cells.shape[slot] * (cells.cell_m / SIDE)
+        self._cell_m[slot] = cells.shape[slot] * (cells.cell_m / GRID_CELLS)
 
 
 def _reach(rig: Rig) -> float:

@@ -4,69 +4,69 @@ from collections.abc import Callable
 
 import torch
 
-from avatar.cells import WarpCells
-from avatar.config import Roots, Skipping, TrainConfig
-from avatar.kernels.backend import CellTables, Grid, Rays, Samples
+from avatar.cells import CorrespondenceGrid
+from avatar.config import RootScheme, SkippingScheme, TrainConfig
+from avatar.kernels.backend import CorrespondenceTables, DensityGrid, RayBatch, RaySamples
 from avatar.model import Avatar
-from avatar.paper.emptiness import BandKnown, Emptiness, NothingKnown
-from avatar.paper.grids import FrameGrids, UnionGrid
+from avatar.paper.emptiness import CorrespondenceBand, PosedEmptySpace, NoSkipping
+from avatar.paper.grids import PerFrameGrids, SequenceGrid
 from avatar.paper.posed_field import PosedField
-from avatar.paper.sampler import GloballySparse, PosedSampler
-from avatar.paper.warp import BroydenWarp, CellWarp, Warp
-from avatar.render import cell_tables
-from avatar.sampling import CanonicalSampler, Sampler
+from avatar.paper.sampler import GlobalSparsitySampler, PosedSampler
+from avatar.paper.warp import BroydenWarp, CorrespondenceWarp, CanonicalWarp
+from avatar.render import correspondence_tables
+from avatar.sampling import OccupancySampler, RaySampler
 from preprocess.pose import BodyPose
 
-RENDERING_PASSES = 5
+PROBES_PER_RENDERED_POSE = 5
 """Probes of each cell when a pose is rendered, as in the released code."""
 
 
-def sampler_for(config: TrainConfig, avatar: Avatar) -> Sampler:
+def sampler_for(config: TrainConfig, avatar: Avatar) -> RaySampler:
     """The sampler that a recipe asks for."""
-    sampler: Sampler
+    sampler: RaySampler
     if config.skipping == "canonical" and config.roots == "cells":
-        sampler = CanonicalSampler(avatar.field.backend, avatar.occupancy, config)
+        sampler = OccupancySampler(avatar.field.backend, avatar.occupancy, config)
     else:
         sampler = _posed_sampler(config, avatar)
     if config.empty_term == "occupancy":
         return sampler
     low, high = (torch.from_numpy(corner) for corner in (avatar.rig.box_low, avatar.rig.box_high))
     device = avatar.field.table.device
-    return GloballySparse(sampler, low.to(device), high.to(device))
+    return GlobalSparsitySampler(sampler, low.to(device), high.to(device))
 
 
 def _posed_sampler(config: TrainConfig, avatar: Avatar) -> PosedSampler:
     device = avatar.field.table.device
-    kept_in = avatar.occupancy.grid if config.skipping == "canonical" else None
-    warp = _warp(config.roots, avatar, config.key_frames, kept_in)
+    kept_in = avatar.occupancy.density_grid if config.skipping == "canonical" else None
+    warp = _warp(config.roots, avatar, config.replay_capacity, kept_in)
     field = PosedField(avatar.field, warp)
-    emptiness: Emptiness
+    emptiness: PosedEmptySpace
     match config.skipping:
         case "union":
-            emptiness = UnionGrid(avatar.rig, field, every=config.occupancy_every, device=device)
+            emptiness = SequenceGrid(avatar.rig, field, interval=config.occupancy_interval, device=device)
         case "frame":
-            emptiness = FrameGrids(field, config.key_frames, device)
+            emptiness = PerFrameGrids(field, config.replay_capacity, device)
         case "none":
-            emptiness = NothingKnown()
+            emptiness = NoSkipping()
         case "canonical":
-            emptiness = BandKnown(avatar.occupancy)
-    return PosedSampler(avatar.field.backend, emptiness, warp, config.step_m)
+            emptiness = CorrespondenceBand(avatar.occupancy)
+    return PosedSampler(avatar.field.backend, emptiness, warp, config.sample_step_m)
 
 
-def _warp(roots: Roots, avatar: Avatar, slots: int, kept_in: Grid | None) -> Warp:
+def _warp(roots: RootScheme, avatar: Avatar, slots: int, kept_in: DensityGrid | None) -> CanonicalWarp:
     if roots == "broyden":
         return BroydenWarp(avatar.field, avatar.rig, slots, kept_in=kept_in)
-    return CellWarp(avatar.field, avatar.occupancy)
+    return CorrespondenceWarp(avatar.field, avatar.occupancy)
 
 
-def rendering(
+def render_sampler(
     avatar: Avatar,
     pose: BodyPose,
-    cells: WarpCells,
+    cells: CorrespondenceGrid,
     *,
-    skipping: Skipping,
-    roots: Roots = "cells",
-) -> Callable[[Rays, CellTables], Samples] | None:
+    skipping: SkippingScheme,
+    roots: RootScheme = "cells",
+) -> Callable[[RayBatch, CorrespondenceTables], RaySamples] | None:
     """Where samples lie when a pose is rendered by one of the schemes, for `avatar.render.render`.
 
     Args:
@@ -94,19 +94,19 @@ def rendering(
     kept_in = avatar.rendering_grid() if skipping == "canonical" else None
     warp = _warp(roots, avatar, 1, kept_in)
     bones = avatar.rig.body_from_canonical(pose.joint_rotations)[:, :3].reshape(24, 12)
-    warp.admit(0, torch.from_numpy(bones).float().to(device))
-    emptiness: Emptiness = NothingKnown()
+    warp.set_pose(0, torch.from_numpy(bones).float().to(device))
+    emptiness: PosedEmptySpace = NoSkipping()
     if skipping == "frame":
-        emptiness = _probed(FrameGrids(PosedField(avatar.field, warp), 1, device), cells, device)
+        emptiness = _filled_grids(PerFrameGrids(PosedField(avatar.field, warp), 1, device), cells, device)
     elif skipping == "canonical":
-        emptiness = BandKnown(avatar.occupancy)
-    return PosedSampler(avatar.field.backend, emptiness, warp, avatar.step_m).samples
+        emptiness = CorrespondenceBand(avatar.occupancy)
+    return PosedSampler(avatar.field.backend, emptiness, warp, avatar.sample_step_m).sample_rays
 
 
-def _probed(grids: FrameGrids, cells: WarpCells, device: torch.device) -> FrameGrids:
-    tables = cell_tables(cells, device)
+def _filled_grids(grids: PerFrameGrids, cells: CorrespondenceGrid, device: torch.device) -> PerFrameGrids:
+    tables = correspondence_tables(cells, device)
     generator = torch.Generator(device=device).manual_seed(0)
-    grids.admit(0, tables)
-    for _ in range(RENDERING_PASSES):
+    grids.add_frame(0, tables)
+    for _ in range(PROBES_PER_RENDERED_POSE):
         grids.probe(0, tables, generator)
     return grids

@@ -8,17 +8,17 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from avatar.field import Field
-from avatar.kernels.backend import Articulations, CellTables, Grid, Marching, Rays
+from avatar.field import RadianceField
+from avatar.kernels.backend import BlendedTransforms, CorrespondenceTables, DensityGrid, MarchSettings, RayBatch
 from avatar.kernels.roots import START_BONES
-from avatar.occupancy import Occupancy, inside
+from avatar.occupancy import OccupancyGrid, in_occupied_cells
 from avatar.rig import Rig
 
-FAR_M = 1e3
+ONE_SAMPLE_STEP_M = 1e3
 """A step that leaves every box at once: a ray is asked at its origin alone."""
 
 
-class Warped(NamedTuple):
+class CanonicalPoints(NamedTuple):
     """Canonical points of those posed samples that have one.
 
     Attributes:
@@ -28,51 +28,51 @@ class Warped(NamedTuple):
     """
 
     points: Float32[Tensor, "found 3"]
-    rows: Int32[Tensor, "found"]
-    found: Bool[Tensor, "samples"]
+    root_rows: Int32[Tensor, "has_root"]
+    has_root: Bool[Tensor, "samples"]
 
 
 @runtime_checkable
-class Warp(Protocol):
+class CanonicalWarp(Protocol):
     """From the body frames of slots to canonical space."""
 
     def __call__(
         self,
         points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "samples"],
-        cells: CellTables,
-    ) -> Warped:
+        cells: CorrespondenceTables,
+    ) -> CanonicalPoints:
         """The canonical points of posed samples."""
         ...
 
-    def admit(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
+    def set_pose(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
         """Learns that a slot holds another pose from now on."""
         ...
 
 
 @final
-class CellWarp:
+class CorrespondenceWarp:
     """Warp cells; of several roots the one of highest cached density counts."""
 
-    def __init__(self, field: Field, occupancy: Occupancy) -> None:
+    def __init__(self, field: RadianceField, occupancy: OccupancyGrid) -> None:
         """Chooses between roots by what `occupancy` has cached, whether or not it is occupied."""
         self._backend = field.backend
-        everywhere = torch.ones_like(occupancy.grid.occupied)
-        self._grid = occupancy.grid._replace(occupied=everywhere)
+        everywhere = torch.ones_like(occupancy.density_grid.occupied)
+        self._grid = occupancy.density_grid._replace(occupied=everywhere)
 
     def __call__(
         self,
         points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "samples"],
-        cells: CellTables,
-    ) -> Warped:
+        cells: CorrespondenceTables,
+    ) -> CanonicalPoints:
         """Each sample is a ray of its own, and marching asks for its first point."""
         along = points.new_tensor([0.6, 0.64, 0.48]).expand(len(points), 3).contiguous()
-        rays = Rays(points, along, slots, points.new_zeros(len(points)))
-        samples = self._backend.march(rays, cells, self._grid, Marching(FAR_M, math.inf, 1))
-        return Warped(samples.points, samples.rows, samples.count > 0)
+        rays = RayBatch(points, along, slots, points.new_zeros(len(points)))
+        samples = self._backend.march(rays, cells, self._grid, MarchSettings(ONE_SAMPLE_STEP_M, math.inf, 1))
+        return CanonicalPoints(samples.points, samples.root_rows, samples.counts > 0)
 
-    def admit(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
+    def set_pose(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
         """Nothing to learn: the cells say it all."""
 
 
@@ -83,7 +83,7 @@ class BroydenWarp:
     Blended transforms of every slot stay in memory, about 11 MB each.
     """
 
-    def __init__(self, field: Field, rig: Rig, slots: int, *, kept_in: Grid | None = None) -> None:
+    def __init__(self, field: RadianceField, rig: Rig, slots: int, *, kept_in: DensityGrid | None = None) -> None:
         """A warp without poses.
 
         Args:
@@ -99,7 +99,7 @@ class BroydenWarp:
         self._high = torch.from_numpy(rig.box_high).to(device)
         self._kept_in = kept_in
         nodes = torch.tensor(self._weights.shape[:3], device=device) - 1
-        self.poses = Articulations(
+        self.poses = BlendedTransforms(
             # untouched memory costs nothing: pages are committed when they are written
             blended=torch.empty(slots, *self._weights.shape[:3], 12, device=device),
             low=self._low,
@@ -107,7 +107,7 @@ class BroydenWarp:
             inverses=torch.zeros(slots, len(START_BONES), 12, device=device),
         )
 
-    def admit(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
+    def set_pose(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
         """Blends the pose's transforms, and inverts those of the bones that searches start with."""
         torch.matmul(self._weights, bones, out=self.poses.blended[slot])
         square = np.tile(np.eye(4), (len(START_BONES), 1, 1))
@@ -119,24 +119,24 @@ class BroydenWarp:
         self,
         points: Float32[Tensor, "samples 3"],
         slots: Int32[Tensor, "samples"],
-        cells: CellTables,
-    ) -> Warped:
+        cells: CorrespondenceTables,
+    ) -> CanonicalPoints:
         """The densest root of each sample; the field is asked only where there are several."""
-        roots, valid = self._field.backend.find_roots(points, slots, self.poses)
-        valid &= self._counts(roots)
+        roots, valid = self._field.backend.find_all_roots(points, slots, self.poses)
+        valid &= self._is_accepted(roots)
         several = (valid.sum(dim=1) > 1).nonzero()[:, 0]
         best = valid.int().argmax(dim=1)
         if len(several):
             held = valid[several]
             score = torch.full(held.shape, -math.inf, device=held.device)
-            score[held] = self._field.raw_at(roots[several][held].contiguous())[:, 3]
+            score[held] = self._field.raw_outputs_at(roots[several][held].contiguous())[:, 3]
             best[several] = score.argmax(dim=1)
         found = valid.any(dim=1)
         chosen = roots[found, best[found]]
-        return Warped(chosen, chosen.new_zeros(len(chosen), dtype=torch.int32), found)
+        return CanonicalPoints(chosen, chosen.new_zeros(len(chosen), dtype=torch.int32), found)
 
-    def _counts(self, roots: Float32[Tensor, "samples starts 3"]) -> Bool[Tensor, "samples starts"]:
+    def _is_accepted(self, roots: Float32[Tensor, "samples starts 3"]) -> Bool[Tensor, "samples starts"]:
         if self._kept_in is not None:
-            flat = inside(self._kept_in, roots.flatten(0, 1))
+            flat = in_occupied_cells(self._kept_in, roots.flatten(0, 1))
             return flat.unflatten(0, roots.shape[:2])
         return ((roots >= self._low) & (roots <= self._high)).all(dim=-1)

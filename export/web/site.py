@@ -11,21 +11,21 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-from export.initialisers import initialisers
+from export.initialisers import graph_initializers
 from export.manifest import GoldenFrame
 from export.package import AvatarPackage, read_package
-from export.web.runtime import MODULE, SCRIPT, runtime_files
+from export.web.runtime import WASM_FILE, SCRIPT_FILE, runtime_files
 from preprocess.pose import BodyPose
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
 PAGE_SCRIPT = "ort.js"
 """Hosts such as nginx serve .mjs as a stream of bytes, which browsers do not run as a script."""
-NARROW = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
+PAGE_DTYPES = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
 """Element types that the page reads (arrays.js)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Look:
+class StartView:
     """Where the page's camera stands at first; it follows the pelvis.
 
     Attributes:
@@ -40,7 +40,7 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Clip:
+class PageMotion:
     """The motion that the page plays.
 
     Attributes:
@@ -51,16 +51,16 @@ class Clip:
 
     poses: Float32[np.ndarray, "poses 75"]
     fps: float
-    look: Look
+    start_view: StartView
 
 
-def pose_row(pose: BodyPose) -> Float32[np.ndarray, "75"]:
+def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
     """A pose as the page takes it."""
     parts = (pose.root_rotation, pose.root_translation, pose.joint_rotations.ravel())
     return np.concatenate(parts).astype(np.float32)
 
 
-def site(path: Path, clip: Clip, *, name: str, level: int = 6) -> dict[str, bytes]:
+def build_page(path: Path, clip: PageMotion, *, name: str, compression_level: int = 6) -> dict[str, bytes]:
     """All files of the page by their relative paths; index.html is the one to open.
 
     Args:
@@ -70,10 +70,10 @@ def site(path: Path, clip: Clip, *, name: str, level: int = 6) -> dict[str, byte
         level: How hard arrays are deflated: 1 on the way to one's own browser, 6 for a host.
 
     Raises:
-        BadInput: If the package is not sound, or onnxruntime-web is not there.
+        InputError: If the package is not sound, or onnxruntime-web is not there.
     """
     runtime = runtime_files()
-    draft = _Draft(level)
+    draft = _ArrayFiles(compression_level)
     package = read_package(path)
     manifest = package.manifest
     content = {
@@ -83,29 +83,29 @@ def site(path: Path, clip: Clip, *, name: str, level: int = 6) -> dict[str, byte
         "parents": manifest.parents.tolist(),
         "canonical_rotations": manifest.canonical_rotations.tolist(),
         "look": {
-            "axes": clip.look.axes.tolist(),
+            "axes": clip.start_view.axes.tolist(),
             "pelvis": manifest.rest_joints[0].tolist(),
-            "height_m": clip.look.height_m,
-            "middle_m": clip.look.middle_m,
+            "height_m": clip.start_view.height_m,
+            "middle_m": clip.start_view.middle_m,
         },
         "motion": {"fps": clip.fps, "poses": draft.array(clip.poses)},
-        "runtime": draft.array(_bytes(runtime.pop(MODULE))),
+        "runtime": draft.array(_byte_array(runtime.pop(WASM_FILE))),
         "tiers": {
-            tier: _tier(draft, package if tier == "hq" else read_package(path, tier=tier), tier)
+            tier: _tier_content(draft, package if tier == "hq" else read_package(path, tier=tier), tier)
             for tier in manifest.tiers
         },
         "golden": [
-            _golden(draft, frame, picture)
+            _golden_content(draft, frame, picture)
             for frame, picture in zip(manifest.golden, package.golden, strict=True)
         ],
     }
     draft.files["avatar.json"] = json.dumps(content, allow_nan=False).encode()
-    runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT)
+    runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT_FILE)
     draft.files.update({f"runtime/{file}": held for file, held in runtime.items()})
-    return {**page_files(), **draft.files}
+    return {**static_page_files(), **draft.files}
 
 
-def page_files() -> dict[str, bytes]:
+def static_page_files() -> dict[str, bytes]:
     """The page itself, the same for every avatar."""
     folder = resources.files("export.web").joinpath("page")
     files = [file for file in folder.iterdir() if file.name.endswith(PAGE_SUFFIXES)]
@@ -113,7 +113,7 @@ def page_files() -> dict[str, bytes]:
 
 
 @final
-class _Draft:
+class _ArrayFiles:
     """Files that name themselves after their content: what two tiers share is stored once."""
 
     def __init__(self, level: int) -> None:
@@ -122,7 +122,7 @@ class _Draft:
 
     def array(self, array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
         """Stores an array; returns what the page must know to read it."""
-        assert array.dtype.name in NARROW
+        assert array.dtype.name in PAGE_DTYPES
         plain = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
         planes = plain.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T
         content = np.ascontiguousarray(planes).tobytes()
@@ -138,28 +138,28 @@ class _Draft:
         }
 
 
-def _bytes(content: bytes) -> Shaped[np.ndarray, "bytes"]:
+def _byte_array(content: bytes) -> Shaped[np.ndarray, "bytes"]:
     return np.frombuffer(content, dtype=np.uint8)
 
 
-def _tier(draft: _Draft, package: AvatarPackage, tier: str) -> dict[str, Any]:
+def _tier_content(draft: _ArrayFiles, package: AvatarPackage, tier: str) -> dict[str, Any]:
     note = package.manifest.tiers[tier]
-    tables = initialisers(package.tables[tier], note.rules)
+    tables = graph_initializers(package.tables[tier], note.settings)
     return {
-        "rules": asdict(note.rules),
+        "settings": asdict(note.settings),
         "layout": asdict(note.layout),
-        "graph": draft.array(_bytes(package.graphs[tier])),
+        "graph": draft.array(_byte_array(package.graphs[tier])),
         "tables": [{"name": name, **draft.array(array)} for name, array in tables.items()],
     }
 
 
-def _golden(
-    draft: _Draft, frame: GoldenFrame, picture: Shaped[np.ndarray, "height width 4"]
+def _golden_content(
+    draft: _ArrayFiles, frame: GoldenFrame, picture: Shaped[np.ndarray, "height width 4"]
 ) -> dict[str, Any]:
     camera = frame.camera
     width, height = camera.size_px
     return {
-        "pose": [float(number) for number in pose_row(frame.pose)],
+        "pose": [float(number) for number in flatten_pose(frame.pose)],
         "camera": {
             "focal": list(camera.focal_px),
             "center": list(camera.center_px),

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from capture.images import natural_key
-from preprocess.cameras.named import NamedCamera, picture_name
+from capture.errors import InputError
+from capture.images import natural_sort_key
+from preprocess.cameras.named import NamedCamera, image_name
 
-PLACES = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
+MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""
 
-LEAST_CAMERA, IMAGE_HEAD, POINT = 24 + 3 * 8, 4 + 7 * 8 + 4, 24
+MIN_CAMERA_BYTES, IMAGE_HEADER_BYTES, POINT_BYTES = 24 + 3 * 8, 4 + 7 * 8 + 4, 24
 """Bytes of a camera in cameras.bin, before a picture's name in images.bin, of a point behind it."""
 
-PADDED = {
+OPENCV_DISTORTION = {
     "SIMPLE_PINHOLE": lambda p: (),
     "PINHOLE": lambda p: (),
     "SIMPLE_RADIAL": lambda p: (p[3], 0.0, 0.0, 0.0),
@@ -29,9 +29,9 @@ PADDED = {
 """OpenCV's coefficients in COLMAP's parameters, by the camera's model."""
 
 
-def find_model(folder: Path) -> Path | None:
+def find_colmap_model(folder: Path) -> Path | None:
     """The folder in which a COLMAP model lies, if one does."""
-    for place in PLACES:
+    for place in MODEL_SUBFOLDERS:
         for ending in (".bin", ".txt"):
             found = folder / place
             if all((found / f"{part}{ending}").is_file() for part in ("cameras", "images")):
@@ -39,34 +39,34 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: Path) -> list[NamedCamera]:
+def read_colmap_model(folder: Path) -> list[NamedCamera]:
     """The registered pictures of a model, by name; its world and its unit stay COLMAP's.
 
     Raises:
-        BadInput: If it cannot be read, is empty, or has a camera that OpenCV does not have.
+        InputError: If it cannot be read, is empty, or has a camera that OpenCV does not have.
     """
     import pycolmap  # heavy, and only needed for its own files
 
     pycolmap.logging.minloglevel = 3  # it would print to stderr what is said here
     try:
         with TemporaryDirectory() as bare:
-            _without_points(folder, Path(bare))
+            _copy_without_points(folder, Path(bare))
             model = pycolmap.Reconstruction(bare)
         images = sorted(
             (model.image(number) for number in model.reg_image_ids()),
-            key=lambda image: natural_key(Path(image.name)),
+            key=lambda image: natural_sort_key(Path(image.name)),
         )
     except Exception as cause:  # what C++ throws; a damaged count is a bad_alloc
-        raise BadInput(f"{folder} holds no COLMAP model that can be read ({cause}).") from cause
+        raise InputError(f"{folder} holds no COLMAP model that can be read ({cause}).") from cause
     if not images:
-        raise BadInput(f"The COLMAP model in {folder} has no registered picture.")
+        raise InputError(f"The COLMAP model in {folder} has no registered picture.")
     return [
-        NamedCamera(name=picture_name(image.name), camera=_camera(image, model, folder))
+        NamedCamera(name=image_name(image.name), camera=_camera(image, model, folder))
         for image in images
     ]
 
 
-def _without_points(folder: Path, bare: Path) -> None:
+def _copy_without_points(folder: Path, bare: Path) -> None:
     """Copies a model's cameras and pictures, which is all that is wanted, once they are sound.
 
     Counts that a damaged file claims are believed by COLMAP's reader, which then reads beyond the
@@ -82,14 +82,14 @@ def _without_points(folder: Path, bare: Path) -> None:
     if ending == ".txt":
         return
     cameras, images = ((bare / f"{part}.bin").read_bytes() for part in ("cameras", "images"))
-    if len(cameras) < 8 + LEAST_CAMERA * _count(cameras, 0):
+    if len(cameras) < 8 + MIN_CAMERA_BYTES * _count(cameras, 0):
         raise ValueError("cameras.bin is cut off")
     place = 8
     for _ in range(_count(images, 0)):
-        name_ends = images.find(b"\0", place + IMAGE_HEAD)
+        name_ends = images.find(b"\0", place + IMAGE_HEADER_BYTES)
         if name_ends < 0:
             raise ValueError("images.bin is cut off")
-        place = name_ends + 9 + POINT * _count(images, name_ends + 1)
+        place = name_ends + 9 + POINT_BYTES * _count(images, name_ends + 1)
         if place > len(images):
             raise ValueError("images.bin is cut off")
 
@@ -102,14 +102,14 @@ def _count(data: bytes, place: int) -> int:
 def _camera(image: Any, model: Any, folder: Path) -> Camera:
     lens = model.camera(image.camera_id)
     kind = lens.model_name
-    if kind not in PADDED:
-        raise BadInput(
+    if kind not in OPENCV_DISTORTION:
+        raise InputError(
             f"The COLMAP model in {folder} has a camera of the model {kind}; expected one of "
-            f"{', '.join(PADDED)}. Undistort the pictures first (colmap image_undistorter)."
+            f"{', '.join(OPENCV_DISTORTION)}. Undistort the pictures first (colmap image_undistorter)."
         )
     camera_from_world = np.eye(4)
     camera_from_world[:3] = image.cam_from_world().matrix()
-    distortion = tuple(float(k) for k in PADDED[kind](lens.params))
+    distortion = tuple(float(k) for k in OPENCV_DISTORTION[kind](lens.params))
     return Camera.from_intrinsic(
         lens.calibration_matrix(),
         (int(lens.width), int(lens.height)),

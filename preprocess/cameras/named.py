@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: y up and z back become y down and z forward."""
 
 
-MOST_PX = 100_000
+MAX_IMAGE_SIDE_PX = 100_000
 """Longest side of a picture."""
 
 
@@ -32,7 +32,7 @@ class NamedCamera:
     camera: Camera
 
 
-def picture_name(stored: str) -> str:
+def image_name(stored: str) -> str:
     """A picture's path in a stranger's file, of any system, without its ending."""
     path = PurePosixPath(stored.replace("\\", "/"))
     return str(path.with_suffix("")) if path.name else ""
@@ -42,10 +42,10 @@ def camera_from_opengl(
     world_from_camera: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "4 4"]:
     """OpenCV's camera-from-world of a world-from-camera matrix with OpenGL's camera axes."""
-    return OPENCV_FROM_OPENGL @ rigid_inverse(world_from_camera)
+    return OPENCV_FROM_OPENGL @ invert_rigid(world_from_camera)
 
 
-def rigid_inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def invert_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The inverse of a rotation and shift."""
     inverse = np.eye(4)
     inverse[:3, :3] = transform[:3, :3].T
@@ -53,27 +53,27 @@ def rigid_inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4
     return inverse
 
 
-def checked_rigid(numbers: Any, where: str) -> Float[np.ndarray, "4 4"]:
+def parse_rigid_transform(numbers: Any, where: str) -> Float[np.ndarray, "4 4"]:
     """A 3x4 or 4x4 rigid transform out of a stranger's file.
 
     Raises:
-        BadInput: If it is something else.
+        InputError: If it is something else.
     """
     try:
         found = np.array(numbers, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as cause:
-        raise BadInput(f"{where}: a matrix holds something that is no number.") from cause
+        raise InputError(f"{where}: a matrix holds something that is no number.") from cause
     if found.shape not in ((3, 4), (4, 4)) or not np.isfinite(found).all():
-        raise BadInput(f"{where}: expected finite 4x4 matrices, found the shape {found.shape}.")
+        raise InputError(f"{where}: expected finite 4x4 matrices, found the shape {found.shape}.")
     transform = np.eye(4)
     transform[:3] = found[:3]
     turn = transform[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0.0:
-        raise BadInput(f"{where}: a camera's matrix is not rigid (rotation and shift, no scale).")
+        raise InputError(f"{where}: a camera's matrix is not rigid (rotation and shift, no scale).")
     return transform
 
 
-def pinhole(
+def parse_pinhole_camera(
     numbers: dict[str, Any],
     keys: tuple[str, str, str, str, str, str],
     camera_from_world: Float[np.ndarray, "4 4"],
@@ -90,16 +90,16 @@ def pinhole(
         where: For messages.
 
     Raises:
-        BadInput: If one is missing, or no positive number.
+        InputError: If one is missing, or no positive number.
     """
     try:
         fx, fy, cx, cy, width, height = (float(numbers[key]) for key in keys)
     except (KeyError, TypeError, ValueError, OverflowError) as cause:
-        raise BadInput(f"{where}: expected the numbers {', '.join(keys)}; {cause}.") from cause
-    sizes = min(width, height) >= 1.0 and max(width, height) <= MOST_PX
+        raise InputError(f"{where}: expected the numbers {', '.join(keys)}; {cause}.") from cause
+    sizes = min(width, height) >= 1.0 and max(width, height) <= MAX_IMAGE_SIDE_PX
     if not np.isfinite([fx, fy, cx, cy, width, height]).all() or min(fx, fy) <= 0.0 or not sizes:
-        raise BadInput(
-            f"{where}: focal length and size must be positive pixels, and at most {MOST_PX}."
+        raise InputError(
+            f"{where}: focal length and size must be positive pixels, and at most {MAX_IMAGE_SIDE_PX}."
         )
     return Camera(
         focal_px=(fx, fy),

@@ -6,22 +6,22 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from capture.images import natural_key
+from capture.errors import InputError
+from capture.images import natural_sort_key
 from preprocess.cameras.named import (
     NamedCamera,
     camera_from_opengl,
-    checked_rigid,
-    picture_name,
-    pinhole,
-    rigid_inverse,
+    parse_rigid_transform,
+    image_name,
+    parse_pinhole_camera,
+    invert_rigid,
 )
 
-LENSES = (
+SUPPORTED_CAMERA_MODELS = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
 )  # fmt: skip
 
-OTHER_SIZE = 0.1
+MAX_CENTER_OFFSET = 0.1
 """By so much of its size a principal point may be off the middle of its own picture."""
 
 
@@ -39,33 +39,33 @@ def read_transforms(
             files hold an angle of view only).
 
     Raises:
-        BadInput: If it holds something else.
+        InputError: If it holds something else.
     """
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise BadInput(f"{path} holds no `frames`; a transforms.json of nerfstudio was expected.")
+        raise InputError(f"{path} holds no `frames`; a transforms.json of nerfstudio was expected.")
     applied = np.eye(4)
     if "applied_transform" in content:
-        applied = checked_rigid(content["applied_transform"], f"{path}, applied_transform")
+        applied = parse_rigid_transform(content["applied_transform"], f"{path}, applied_transform")
     named = []
     for frame in frames:
         if not isinstance(frame, dict):
-            raise BadInput(f"{path}: one of the `frames` is no object; is the file damaged?")
+            raise InputError(f"{path}: one of the `frames` is no object; is the file damaged?")
         name = _name(frame, path)
         try:
             camera = _camera({**content, **frame}, applied, path, size_px)
         except (TypeError, ValueError, OverflowError) as cause:
-            if isinstance(cause, BadInput):
+            if isinstance(cause, InputError):
                 raise
-            raise BadInput(f"{path}: a camera's numbers are none ({cause}).") from cause
+            raise InputError(f"{path}: a camera's numbers are none ({cause}).") from cause
         named.append(NamedCamera(name=name, camera=camera))
-    return sorted(named, key=lambda each: natural_key(Path(each.name or "")))
+    return sorted(named, key=lambda each: natural_sort_key(Path(each.name or "")))
 
 
 def _name(frame: dict[str, Any], path: Path) -> str:
     if not isinstance(frame.get("file_path"), str):
-        raise BadInput(f"{path}: a frame has no `file_path`, so nobody knows whose camera it is.")
-    return picture_name(frame["file_path"])
+        raise InputError(f"{path}: a frame has no `file_path`, so nobody knows whose camera it is.")
+    return image_name(frame["file_path"])
 
 
 def _camera(
@@ -73,23 +73,23 @@ def _camera(
 ) -> Camera:
     """One frame's camera; what the frame does not say, the file does."""
     lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")
-    if lens not in LENSES:
-        raise BadInput(
-            f"{path}: camera model {lens}; expected one of {', '.join(LENSES)}. Undistort the "
+    if lens not in SUPPORTED_CAMERA_MODELS:
+        raise InputError(
+            f"{path}: camera model {lens}; expected one of {', '.join(SUPPORTED_CAMERA_MODELS)}. Undistort the "
             "pictures first (cv2.fisheye.undistortImage, or colmap image_undistorter)."
         )
     numbers = _with_size(numbers, size_px)
-    world = checked_rigid(numbers.get("transform_matrix"), f"{path}, transform_matrix")
+    world = parse_rigid_transform(numbers.get("transform_matrix"), f"{path}, transform_matrix")
     if "fl_x" not in numbers and "camera_angle_x" in numbers:
         numbers = {**numbers, **_from_angles(numbers, path)}
     numbers = {"fl_y": numbers.get("fl_x"), **numbers}
     if "cx" not in numbers and "w" in numbers and "h" in numbers:
         numbers = {**numbers, "cx": numbers["w"] / 2.0, "cy": numbers["h"] / 2.0}
     bends = [float(numbers.get(key) or 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    return pinhole(
+    return parse_pinhole_camera(
         numbers,
         ("fl_x", "fl_y", "cx", "cy", "w", "h"),
-        camera_from_opengl(rigid_inverse(applied) @ world),
+        camera_from_opengl(invert_rigid(applied) @ world),
         tuple(bends),
         str(path),
     )
@@ -102,7 +102,7 @@ def _with_size(numbers: dict[str, Any], size_px: tuple[int, int] | None) -> dict
     width, height = size_px
     if {"cx", "cy"} <= numbers.keys():
         cx, cy = float(numbers["cx"]), float(numbers["cy"])
-        if abs(cx / width - 0.5) > OTHER_SIZE or abs(cy / height - 0.5) > OTHER_SIZE:
+        if abs(cx / width - 0.5) > MAX_CENTER_OFFSET or abs(cy / height - 0.5) > MAX_CENTER_OFFSET:
             width, height = round(2.0 * cx), round(2.0 * cy)
     return {**numbers, "w": width, "h": height}
 
@@ -115,5 +115,5 @@ def _from_angles(numbers: dict[str, Any], path: Path) -> dict[str, float]:
         if "camera_angle_y" in numbers:
             down = float(numbers["h"]) / 2.0 / np.tan(float(numbers["camera_angle_y"]) / 2.0)
     except (KeyError, TypeError, ValueError) as cause:
-        raise BadInput(f"{path}: expected w, h and camera_angle_x, or fl_x ({cause}).") from cause
+        raise InputError(f"{path}: expected w, h and camera_angle_x, or fl_x ({cause}).") from cause
     return {"fl_x": across, "fl_y": down}

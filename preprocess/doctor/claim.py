@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.camera import Camera
-from capture.source import Source
+from capture.source import FrameSource
 from preprocess.camera_file import CameraTrack
-from preprocess.doctor.film import AS_FILMED, FilmView
+from preprocess.doctor.film import IDENTITY_TRANSFORM, VideoTransform
 from preprocess.pose import Motion
 
-SPARSEST = 6.0
-"""Frames from one pose to the next beyond which those between have none."""
+MAX_FRAME_STEP = 6.0
+"""EvaluationFrames from one pose to the next beyond which those between have none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Claim:
+class CaptureGeometry:
     """A capture's poses and cameras in a form that a cure can change in one place.
 
     Attributes:
@@ -31,17 +31,17 @@ class Claim:
     """
 
     motion: Motion
-    places: Float[np.ndarray, "poses"]
+    row_frames: Float[np.ndarray, "poses"]
     intrinsics: Float[np.ndarray, "cameras 3 3"]
     extrinsics: Float[np.ndarray, "cameras 4 4"]
     size_px: tuple[int, int]
     distortion: tuple[float, ...] = ()
-    inverted: bool = False
-    alone: bool = False
-    film: FilmView = AS_FILMED
+    masks_inverted: bool = False
+    keeps_person_only: bool = False
+    video_transform: VideoTransform = IDENTITY_TRANSFORM
 
     @classmethod
-    def of(cls, motion: Motion, cameras: CameraTrack, source: Source) -> "Claim":
+    def of(cls, motion: Motion, cameras: CameraTrack, source: FrameSource) -> "CaptureGeometry":
         """What the files say, before anything is doubted.
 
         Rows of no stated frame or time are taken in order: of all frames, or of the wanted ones.
@@ -49,47 +49,47 @@ class Claim:
         first = cameras.cameras[0]
         return cls(
             motion=motion,
-            places=_places(motion, source),
+            places=_row_frames(motion, source),
             intrinsics=np.stack([camera.intrinsic for camera in cameras.cameras]),
             extrinsics=np.stack([camera.camera_from_world for camera in cameras.cameras]),
             size_px=first.size_px,
             distortion=first.distortion,
         )
 
-    def row_of(self, frame: int) -> int | None:
+    def row_for_frame(self, frame: int) -> int | None:
         """The valid row that is nearest to a frame, if it is near enough to be its own."""
-        reach = 0.5 * min(max(1.0, step_of(self.places)), SPARSEST) + 1e-6
-        away = np.where(self.motion.valid, np.abs(self.places - frame), np.inf)
+        reach = 0.5 * min(max(1.0, frame_step(self.row_frames)), MAX_FRAME_STEP) + 1e-6
+        away = np.where(self.motion.valid, np.abs(self.row_frames - frame), np.inf)
         row = int(np.argmin(away))
         return row if away[row] <= reach else None
 
     def camera_rows(self) -> Int[np.ndarray, "poses"]:
         """Which camera sees each pose."""
-        numbers = np.nan_to_num(self.places).round().astype(np.int64)
+        numbers = np.nan_to_num(self.row_frames).round().astype(np.int64)
         return numbers.clip(0, len(self.extrinsics) - 1)
 
-    def eyes(self) -> Float[np.ndarray, "cameras 3"]:
+    def camera_centers(self) -> Float[np.ndarray, "cameras 3"]:
         """Where the cameras stand in the world."""
         turned, moved = self.extrinsics[:, :3, :3], self.extrinsics[:, :3, 3]
         return -np.einsum("cba,cb->ca", turned, moved)
 
-    def camera(self, row: int, size_px: tuple[int, int]) -> Camera:
+    def camera_at(self, row: int, size_px: tuple[int, int]) -> Camera:
         """One camera, for pictures of another size of the same shape."""
         row = min(row, len(self.extrinsics) - 1)
         camera = Camera.from_intrinsic(
             self.intrinsics[row], self.size_px, self.extrinsics[row], self.distortion
         )
-        return camera.resized(size_px)
+        return camera.resize(size_px)
 
 
-def step_of(places: Float[np.ndarray, "poses"]) -> float:
-    """Frames from one row to the next, as a rule."""
-    steps = np.diff(np.sort(places[np.isfinite(places)]))
+def frame_step(row_frames: Float[np.ndarray, "poses"]) -> float:
+    """EvaluationFrames from one row to the next, as a rule."""
+    steps = np.diff(np.sort(row_frames[np.isfinite(row_frames)]))
     steps = steps[steps > 0.0]
     return float(np.median(steps)) if len(steps) else 1.0
 
 
-def _places(motion: Motion, source: Source) -> Float[np.ndarray, "poses"]:
+def _row_frames(motion: Motion, source: FrameSource) -> Float[np.ndarray, "poses"]:
     if motion.frames is not None:
         return motion.frames.astype(np.float64)
     if motion.times_s is not None and source.duration_s:

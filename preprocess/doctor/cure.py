@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.doctor.claim import Claim
+from preprocess.doctor.claim import CaptureGeometry
 
 CAUSES = (
     "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
-    "frame_rate", "left_right", "root_origin", "focal", "body_scale", "film_rotation",
-    "film_mirrored", "film_offset", "film_crop",
+    "frame_rate", "left_right", "root_origin", "focal", "body_scale", "video_rotation",
+    "video_mirrored", "video_offset", "video_crop",
 )  # fmt: skip
 """By these names mistakes are called, in commands and files."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cure:
+class Correction:
     """One mistake, undone.
 
     Attributes:
@@ -29,59 +29,59 @@ class Cure:
     """
 
     cause: str
-    words: str
-    undo: Callable[[Claim], Claim]
+    description: str
+    apply: Callable[[CaptureGeometry], CaptureGeometry]
     factor: float | None = None
-    frames: int | None = None
+    frame_shift: int | None = None
 
 
-def shifted(frames: int) -> Cure:
+def undo_pose_delay(frames: int) -> Correction:
     """Poses that come too late (positive) or too early by some frames."""
     late, other = ("late", "early") if frames > 0 else ("early", "late")
-    return Cure(
+    return Correction(
         cause="frame_offset",
-        words=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late} "
+        description=f"the poses come {abs(frames)} frame{'s' if abs(frames) > 1 else ''} too {late} "
         f"(or the masks too {other})",
-        undo=lambda c: replace(c, places=c.places - frames),
-        frames=frames,
+        apply=lambda c: replace(c, row_frames=c.row_frames - frames),
+        frame_shift=frames,
     )
 
 
-def film_turned(quarter_turns: int) -> Cure:
+def undo_video_rotation(quarter_turns: int) -> Correction:
     """Pictures rotated counter-clockwise by this many quarter turns, unlike masks and poses."""
     degrees = 90 * (quarter_turns % 4)
     way = "" if degrees == 180 else " counter-clockwise" if degrees == 90 else " clockwise"
 
-    def undo(claim: Claim) -> Claim:
-        turns = (claim.film.quarter_turns - quarter_turns) % 4
-        return replace(claim, film=replace(claim.film, quarter_turns=turns))
+    def undo(claim: CaptureGeometry) -> CaptureGeometry:
+        turns = (claim.video_transform.quarter_turns - quarter_turns) % 4
+        return replace(claim, video_transform=replace(claim.video_transform, quarter_turns=turns))
 
-    return Cure(
-        cause="film_rotation",
-        words=f"the film alone is rotated by {min(degrees, 360 - degrees)}°{way}; its masks and "
+    return Correction(
+        cause="video_rotation",
+        description=f"the film alone is rotated by {min(degrees, 360 - degrees)}°{way}; its masks and "
         "poses belong to pictures that are not",
-        undo=undo,
+        apply=undo,
     )
 
 
-def film_mirrored(quarter_turns: int) -> Cure:
+def undo_video_mirroring(quarter_turns: int) -> Correction:
     """Pictures with left and right exchanged, and rotated, unlike masks and poses."""
 
-    def undo(claim: Claim) -> Claim:
-        film = claim.film
+    def undo(claim: CaptureGeometry) -> CaptureGeometry:
+        film = claim.video_transform
         turns = (film.quarter_turns - quarter_turns) % 4
-        return replace(claim, film=replace(film, quarter_turns=turns, mirrored=not film.mirrored))
+        return replace(claim, video_transform=replace(film, quarter_turns=turns, mirrored=not film.mirrored))
 
     also = f" and rotated by {90 * quarter_turns}°" if quarter_turns else ""
-    return Cure(
-        cause="film_mirrored",
-        words=f"the film alone is mirrored{also}; its masks and poses belong to pictures that "
+    return Correction(
+        cause="video_mirrored",
+        description=f"the film alone is mirrored{also}; its masks and poses belong to pictures that "
         "are not",
-        undo=undo,
+        apply=undo,
     )
 
 
-def film_shifted(frames: int) -> Cure:
+def undo_video_offset(frames: int) -> Correction:
     """A film whose frame 0 has the masks and poses of another frame number."""
     count = f"{abs(frames)} frame{'s' if abs(frames) > 1 else ''}"
     words = (
@@ -89,24 +89,24 @@ def film_shifted(frames: int) -> Cure:
         if frames > 0
         else f"the film starts {count} earlier than its masks and poses"
     )
-    return Cure(
-        cause="film_offset",
-        words=words,
-        undo=lambda c: replace(c, film=replace(c.film, first=c.film.first + frames)),
-        frames=frames,
+    return Correction(
+        cause="video_offset",
+        description=words,
+        apply=lambda c: replace(c, video_transform=replace(c.video_transform, first_frame=c.video_transform.first_frame + frames)),
+        frame_shift=frames,
     )
 
 
-def film_reversed(frames: int) -> Cure:
+def undo_video_reversal(frames: int) -> Correction:
     """A film of some frames that runs backwards against masks and poses."""
-    return Cure(
-        cause="film_offset",
-        words="the film runs backwards against its masks and poses",
-        undo=lambda c: replace(c, film=replace(c.film, first=frames - 1, backwards=True)),
+    return Correction(
+        cause="video_offset",
+        description="the film runs backwards against its masks and poses",
+        apply=lambda c: replace(c, video_transform=replace(c.video_transform, first_frame=frames - 1, backwards=True)),
     )
 
 
-def film_cropped(window: tuple[float, float, float, float]) -> Cure:
+def undo_video_crop(window: tuple[float, float, float, float]) -> Correction:
     """A film that shows only a part of the masks' picture, or has borders added around it.
 
     Args:
@@ -115,36 +115,36 @@ def film_cropped(window: tuple[float, float, float, float]) -> Cure:
     left, top, right, bottom = window
     inside = right - left < 1.0 and bottom - top < 1.0
     kind = "was cropped" if inside else "has borders, or was scaled down"
-    return Cure(
-        cause="film_crop",
-        words=f"the film {kind} after its masks and poses were made: it shows {left:.0%} to "
+    return Correction(
+        cause="video_crop",
+        description=f"the film {kind} after its masks and poses were made: it shows {left:.0%} to "
         f"{right:.0%} of their width and {top:.0%} to {bottom:.0%} of their height",
-        undo=lambda c: replace(c, film=replace(c.film, window=window)),
+        apply=lambda c: replace(c, video_transform=replace(c.video_transform, window=window)),
         factor=right - left,
     )
 
 
-def refocused(factor: float) -> Cure:
+def scale_focal_length(factor: float) -> Correction:
     """Focal lengths that are too short (factor above 1) or too long."""
 
-    def undo(claim: Claim) -> Claim:
+    def undo(claim: CaptureGeometry) -> CaptureGeometry:
         intrinsics = claim.intrinsics.copy()
         intrinsics[:, [0, 1], [0, 1]] *= factor
         return replace(claim, intrinsics=intrinsics)
 
     wrong = "short" if factor > 1.0 else "long"
-    return Cure(
+    return Correction(
         cause="focal",
-        words=f"the focal length is too {wrong}; {factor:.3f} times fits",
-        undo=undo,
+        description=f"the focal length is too {wrong}; {factor:.3f} times fits",
+        apply=undo,
         factor=factor,
     )
 
 
-def recentred(right_px: float, down_px: float) -> Cure:
+def shift_principal_point(right_px: float, down_px: float) -> Correction:
     """Principal points that are so many pixels too far left and up (negative: right and down)."""
 
-    def undo(claim: Claim) -> Claim:
+    def undo(claim: CaptureGeometry) -> CaptureGeometry:
         intrinsics = claim.intrinsics.copy()
         intrinsics[:, :2, 2] += np.array([right_px, down_px])
         return replace(claim, intrinsics=intrinsics)
@@ -154,15 +154,15 @@ def recentred(right_px: float, down_px: float) -> Cure:
         f"{abs(down_px):.0f} px too far {'up' if down_px > 0.0 else 'down'}",
     )
     shown = [s for s, px in zip(sides, (right_px, down_px), strict=True) if abs(px) >= 1.0]
-    return Cure(
+    return Correction(
         cause="focal",
-        words=f"the principal point is {' and '.join(shown) or 'elsewhere'}; was the video cropped "
+        description=f"the principal point is {' and '.join(shown) or 'elsewhere'}; was the video cropped "
         "after its poses or its camera were made?",
-        undo=undo,
+        apply=undo,
     )
 
 
-def rescaled(factor: float, pelvis: Float[np.ndarray, "3"]) -> Cure:
+def divide_distances(factor: float, pelvis: Float[np.ndarray, "3"]) -> Correction:
     """A person who is too small (factor above 1) or too large for where the poses put them.
 
     Nothing but the ratio of size and distance is seen in pictures, and the body's size is its own:
@@ -170,8 +170,8 @@ def rescaled(factor: float, pelvis: Float[np.ndarray, "3"]) -> Cure:
     towards it; else the whole world does, cameras included.
     """
 
-    def undo(claim: Claim) -> Claim:
-        eyes = claim.eyes()
+    def undo(claim: CaptureGeometry) -> CaptureGeometry:
+        eyes = claim.camera_centers()
         fixed = eyes.mean(axis=0) if np.ptp(eyes, axis=0).max() < 1e-3 else np.zeros(3)
         pelves = pelvis + claim.motion.root_translations
         moved = fixed + (pelves - fixed) / factor
@@ -186,4 +186,4 @@ def rescaled(factor: float, pelvis: Float[np.ndarray, "3"]) -> Cure:
 
     wrong = "small" if factor > 1.0 else "large"
     words = f"the body is too {wrong} for its distance; {factor:.3f} times its size fits"
-    return Cure(cause="body_scale", words=words, undo=undo, factor=factor)
+    return Correction(cause="body_scale", description=words, apply=undo, factor=factor)

@@ -9,33 +9,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.errors import BadInput
-from capture.source import Source
+from capture.errors import InputError
+from capture.source import FrameSource
 from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
-from preprocess.doctor.claim import Claim
-from preprocess.doctor.evidence import Evidence, gather
-from preprocess.fit.pictures import glance
-from preprocess.fit.refit import FRAMES, Refit, refitted
-from preprocess.fit.stature import farther, height_of
-from preprocess.fit.unmasked import fitted_to_pictures
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.doctor.evidence import SilhouetteObjective, sample_masks
+from preprocess.fit.pictures import sample_video
+from preprocess.fit.refit import ALIGNMENT_SAMPLES, BodyPlacement, place_body_on_masks
+from preprocess.fit.stature import rescale_motion, body_height_m
+from preprocess.fit.unmasked import place_body_on_images
 from preprocess.masks.files import Masks
-from preprocess.observe import check_cameras, check_masks
+from preprocess.observe import associate_cameras, associate_masks
 from preprocess.pose import Motion
 from preprocess.silhouette import SkinPoints
 
-BETTER = 0.02
+MIN_OWN_SHAPE_GAIN = 0.02
 """By how much the body's own proportions must fit better than SMPL's to be taken instead."""
-SAME_M = 5e-4
+SAME_SHAPE_M = 5e-4
 """Bodies whose resting skin is nowhere farther apart are one."""
-TOLD_M = 0.01
+REPORTED_DIFFERENCE_M = 0.01
 """Differences in height, or of a joint from the pelvis, that are spoken of."""
-SOMEBODY_ELSE = 0.08
+MAX_HEIGHT_DIFFERENCE = 0.08
 """Difference in height, as a share, beyond which it may not be the same person."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BodyFit:
+class BodyAlignment:
     """A person and poses that belong together.
 
     Attributes:
@@ -47,116 +47,116 @@ class BodyFit:
 
     shaped: ShapedBody
     motion: Motion
-    words: str = ""
-    refit: Refit | None = None
+    description: str = ""
+    placement: BodyPlacement | None = None
 
 
-def is_foreign(motion: Motion, shaped: ShapedBody) -> bool:
+def needs_placement(motion: Motion, shaped: ShapedBody) -> bool:
     """Whether poses were made for a body model whose size nobody knows here."""
-    return shaped.body.family not in ("smpl", motion.model)
+    return shaped.body.family not in ("smpl", motion.body_model)
 
 
-def fit_body(
+def align_body(
     motion: Motion,
     shaped: ShapedBody,
     cameras: CameraTrack,
-    source: Source,
+    source: FrameSource,
     masks: Masks | None,
-) -> BodyFit:
+) -> BodyAlignment:
     """Body and motion as they fit the masks, if the tracker had another body in mind.
 
     The body's own mean proportions are tried beside SMPL's; they are taken if they fit better by
-    `BETTER`: files say SMPL of poses that were fitted to something else.
+    `MIN_OWN_SHAPE_GAIN`: files say SMPL of poses that were fitted to something else.
 
     Args:
         motion: In the cameras' world.
-        shaped: The body that is used, with SMPL's mean joints (`shaped_for`).
+        shaped: The body that is used, with SMPL's mean joints (`shape_for_motion`).
         cameras: Of the frames' size.
         source: The frames; few are decoded, and none if there are masks in files.
         masks: The masks; None if the pictures have an alpha channel, or nobody knows any.
     """
-    if not is_foreign(motion, shaped):
-        return BodyFit(shaped=shaped, motion=motion)
-    claim = Claim.of(motion, cameras, source)
+    if not needs_placement(motion, shaped):
+        return BodyAlignment(shaped=shaped, motion=motion)
+    claim = CaptureGeometry.of(motion, cameras, source)
     if masks is None and not source.has_alpha:
-        seen = seen_in_pictures(claim, shaped, cameras, source)
-        fit = BodyFit(shaped=shaped, motion=motion)
-        return fit if seen is None else _taken(seen, shaped, motion)
-    evidence = evidence_of(shaped, cameras, source, masks)
+        seen = place_from_video(claim, shaped, cameras, source)
+        fit = BodyAlignment(shaped=shaped, motion=motion)
+        return fit if seen is None else _accept(seen, shaped, motion)
+    evidence = silhouette_objective_of(shaped, cameras, source, masks)
     if evidence is None:
-        return BodyFit(shaped=shaped, motion=motion)
-    refit = refitted(claim, evidence)
+        return BodyAlignment(shaped=shaped, motion=motion)
+    refit = place_body_on_masks(claim, evidence)
     own = shaped.body.with_shape()
-    other = refitted(claim, _of(evidence, own))
-    if other.worth_it and other.after > refit.after + BETTER:
-        words = f"{other.in_words()} Its own proportions fit better than SMPL's."
-        return BodyFit(shaped=own, motion=other.motion, words=words, refit=other)
-    return _taken(refit, shaped, motion)
+    other = place_body_on_masks(claim, _with_body(evidence, own))
+    if other.is_improvement and other.iou_after > refit.iou_after + MIN_OWN_SHAPE_GAIN:
+        words = f"{other.describe()} Its own proportions fit better than SMPL's."
+        return BodyAlignment(shaped=own, motion=other.motion, description=words, placement=other)
+    return _accept(refit, shaped, motion)
 
 
-def fit_to_person(
+def align_to_person(
     motion: Motion,
     shaped: ShapedBody,
     person: ShapedBody,
     cameras: CameraTrack,
-    source: Source,
+    source: FrameSource,
     masks: Masks | None,
-) -> BodyFit:
+) -> BodyAlignment:
     """The motion for the person that an avatar has, which never changes.
 
     Args:
         motion: In the cameras' world, for the body `shaped`.
         shaped: The person that these poses' tracker had in mind.
         person: The avatar's.
-        cameras, source, masks: As in `fit_body`.
+        cameras, source, masks: As in `align_body`.
     """
-    foreign, same = is_foreign(motion, shaped), are_alike(person, shaped)
+    foreign, same = needs_placement(motion, shaped), is_same_person(person, shaped)
     if same and not foreign:
-        return BodyFit(shaped=person, motion=motion)
+        return BodyAlignment(shaped=person, motion=motion)
     masked = masks is not None or source.has_alpha
-    evidence = evidence_of(person, cameras, source, masks) if masked else None
-    claim = Claim.of(motion, cameras, source)
+    evidence = silhouette_objective_of(person, cameras, source, masks) if masked else None
+    claim = CaptureGeometry.of(motion, cameras, source)
     if not same and not (foreign and evidence is not None):
-        motion = farther(claim, shaped, person)
-        claim = Claim.of(motion, cameras, source)
-    told = "" if foreign or same else _compared(shaped, person)
+        motion = rescale_motion(claim, shaped, person)
+        claim = CaptureGeometry.of(motion, cameras, source)
+    told = "" if foreign or same else _describe_difference(shaped, person)
     refit = None
     if evidence is not None:
-        refit = refitted(claim, evidence)
+        refit = place_body_on_masks(claim, evidence)
     elif foreign and not masked:
-        refit = seen_in_pictures(claim, person, cameras, source)
+        refit = place_from_video(claim, person, cameras, source)
     if refit is None:
-        return BodyFit(shaped=person, motion=motion, words=told)
-    return _taken(refit, person, motion, told)
+        return BodyAlignment(shaped=person, motion=motion, description=told)
+    return _accept(refit, person, motion, told)
 
 
-def are_alike(a: ShapedBody, b: ShapedBody) -> bool:
+def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
     """Whether two shapes of one body are the same person."""
     same = a.vertices.shape == b.vertices.shape
     return same and all(
-        bool(np.abs(one - other).max() < SAME_M)
+        bool(np.abs(one - other).max() < SAME_SHAPE_M)
         for one, other in ((a.vertices, b.vertices), (a.joints, b.joints))
     )
 
 
-def _taken(refit: Refit, shaped: ShapedBody, motion: Motion, told: str = "") -> BodyFit:
+def _accept(placement: BodyPlacement, shaped: ShapedBody, motion: Motion, prefix: str = "") -> BodyAlignment:
     """The refit, if it is worth it."""
-    return BodyFit(
+    return BodyAlignment(
         shaped=shaped,
-        motion=refit.motion if refit.worth_it else motion,
-        words=f"{told} {refit.in_words()}".strip(),
-        refit=refit,
+        motion=placement.motion if placement.is_improvement else motion,
+        description=f"{prefix} {placement.describe()}".strip(),
+        placement=placement,
     )
 
 
-def _compared(shaped: ShapedBody, person: ShapedBody) -> str:
+def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
     """How the body that poses were made for differs from the avatar's; empty if it hardly does."""
-    theirs, ours = height_of(shaped), height_of(person)
+    theirs, ours = body_height_m(shaped), body_height_m(person)
     off = (shaped.joints - shaped.joints[0]) - (person.joints - person.joints[0])
     apart = float(np.linalg.norm(off, axis=1).max())
-    if abs(theirs - ours) < TOLD_M and apart < TOLD_M:
+    if abs(theirs - ours) < REPORTED_DIFFERENCE_M and apart < REPORTED_DIFFERENCE_M:
         return ""
-    doubt = " Is it the same person?" if abs(theirs / ours - 1.0) > SOMEBODY_ELSE else ""
+    doubt = " Is it the same person?" if abs(theirs / ours - 1.0) > MAX_HEIGHT_DIFFERENCE else ""
     return (
         f"Their betas state a body of {100.0 * theirs:.0f} cm, the avatar's has "
         f"{100.0 * ours:.0f} cm (joints up to {100.0 * apart:.1f} cm elsewhere): the avatar keeps "
@@ -164,31 +164,31 @@ def _compared(shaped: ShapedBody, person: ShapedBody) -> str:
     )
 
 
-def seen_in_pictures(
-    claim: Claim, shaped: ShapedBody, cameras: CameraTrack, source: Source
-) -> Refit | None:
+def place_from_video(
+    geometry: CaptureGeometry, shaped: ShapedBody, cameras: CameraTrack, source: FrameSource
+) -> BodyPlacement | None:
     """The body fitted to a few pictures; None where parts do not fit, which is said elsewhere."""
     skin = SkinPoints.of(shaped)
     try:
-        pictures = glance(claim, skin, cameras, source)
-    except BadInput:
+        pictures = sample_video(geometry, skin, cameras, source)
+    except InputError:
         return None
-    return fitted_to_pictures(claim, skin, pictures)
+    return place_body_on_images(geometry, skin, pictures)
 
 
-def evidence_of(
-    shaped: ShapedBody, cameras: CameraTrack, source: Source, masks: Masks | None
-) -> Evidence | None:
+def silhouette_objective_of(
+    shaped: ShapedBody, cameras: CameraTrack, source: FrameSource, masks: Masks | None
+) -> SilhouetteObjective | None:
     """A few masks; None where parts do not fit or show nobody, which is said elsewhere."""
     try:
-        rows = check_masks(masks, source), check_cameras(cameras, source)
-        return gather(
-            source, masks, *rows, SkinPoints.of(shaped), count=FRAMES, without=cameras.missing
+        rows = associate_masks(masks, source), associate_cameras(cameras, source)
+        return sample_masks(
+            source, masks, *rows, SkinPoints.of(shaped), count=ALIGNMENT_SAMPLES, excluded_frames=cameras.frames_without_camera
         )
-    except BadInput:
+    except InputError:
         return None
 
 
-def _of(evidence: Evidence, shaped: ShapedBody) -> Evidence:
+def _with_body(evidence: SilhouetteObjective, shaped: ShapedBody) -> SilhouetteObjective:
     """The same masks, for another person."""
-    return Evidence(witnesses=evidence.witnesses, skin=SkinPoints.of(shaped))
+    return SilhouetteObjective(samples=evidence.samples, skin=SkinPoints.of(shaped))

@@ -2,33 +2,33 @@
 
 from dataclasses import replace
 
-from capture.errors import BadInput
-from capture.source import Source
-from preprocess.body import Body
+from capture.errors import InputError
+from capture.source import FrameSource
+from preprocess.body import BodyModel
 from preprocess.camera_file import CameraTrack
-from preprocess.doctor.claim import Claim
-from preprocess.doctor.diagnosis import GOOD, mean
-from preprocess.fit.body_fit import evidence_of
-from preprocess.fit.pictures import edges, glance
-from preprocess.fit.refit import EDGES, refitted
-from preprocess.fit.unmasked import fitted_to_pictures
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.doctor.diagnosis import GOOD_IOU, mean_score
+from preprocess.fit.body_fit import silhouette_objective_of
+from preprocess.fit.pictures import edge_contrast, sample_video
+from preprocess.fit.refit import MIN_EDGE_CONTRAST, place_body_on_masks
+from preprocess.fit.unmasked import place_body_on_images
 from preprocess.masks.files import Masks
 from preprocess.pose import Motion
-from preprocess.poses.place import placed
-from preprocess.shape import shaped_for
+from preprocess.poses.place import place_in_camera_world
+from preprocess.shape import shape_for_motion
 from preprocess.silhouette import SkinPoints
 
-CLEARLY = 0.05
+MIN_SMPL_IOU_GAIN = 0.05
 """By how much SMPL's body must agree better with the masks to be taken."""
-SHARPER = 1.1
+MIN_SMPL_CONTRAST_RATIO = 1.1
 """Without masks: how many times more it must stand out from what is beside it in the pictures."""
 
 
-def with_family(
-    read: Motion,
-    body: Body,
+def detect_body_model(
+    motion_read: Motion,
+    body: BodyModel,
     cameras: CameraTrack,
-    source: Source,
+    source: FrameSource,
     masks: Masks | None,
     *,
     cameras_given: bool,
@@ -41,63 +41,63 @@ def with_family(
     Args:
         read: As `read_poses` gives it.
         body: The one that is used.
-        cameras, source, masks: See `fit_body`.
+        cameras, source, masks: See `align_body`.
         cameras_given: See `placed`.
     """
-    if read.model_said or body.family == "smpl":
-        return read
+    if motion_read.model_is_stated or body.family == "smpl":
+        return motion_read
     if masks is None and not source.has_alpha:
-        return _by_pictures(read, body, cameras, source, cameras_given=cameras_given)
+        return _detect_from_images(motion_read, body, cameras, source, cameras_given=cameras_given)
     after = {}
-    for model in (read.model, "smpl"):
-        motion = replace(read, model=model)
-        shaped = shaped_for(body, motion)
-        motion = placed(motion, shaped, cameras, cameras_given=cameras_given)
-        evidence = evidence_of(shaped, cameras, source, masks)
+    for model in (motion_read.body_model, "smpl"):
+        motion = replace(motion_read, body_model=model)
+        shaped = shape_for_motion(body, motion)
+        motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
+        evidence = silhouette_objective_of(shaped, cameras, source, masks)
         if evidence is None:
-            return read
-        claim = Claim.of(motion, cameras, source)
-        if model == read.model and mean(evidence.scores(claim)) >= GOOD:
-            return read
-        after[model] = refitted(claim, evidence).after
-    if after["smpl"] < after[read.model] + CLEARLY:
-        return read
-    found = f"with which masks agree by {after['smpl']:.2f} (else {after[read.model]:.2f})"
-    return _taken_for_smpls(read, found)
+            return motion_read
+        claim = CaptureGeometry.of(motion, cameras, source)
+        if model == motion_read.body_model and mean_score(evidence.frame_scores(claim)) >= GOOD_IOU:
+            return motion_read
+        after[model] = place_body_on_masks(claim, evidence).iou_after
+    if after["smpl"] < after[motion_read.body_model] + MIN_SMPL_IOU_GAIN:
+        return motion_read
+    found = f"with which masks agree by {after['smpl']:.2f} (else {after[motion_read.body_model]:.2f})"
+    return _label_smpl(motion_read, found)
 
 
-def _by_pictures(
-    read: Motion, body: Body, cameras: CameraTrack, source: Source, *, cameras_given: bool
+def _detect_from_images(
+    motion_read: Motion, body: BodyModel, cameras: CameraTrack, source: FrameSource, *, cameras_given: bool
 ) -> Motion:
     """The same where there are no masks: by how the pictures' edges run along the body."""
     stands_out = {}
-    for model in (read.model, "smpl"):
-        motion = replace(read, model=model)
-        shaped = shaped_for(body, motion)
-        motion = placed(motion, shaped, cameras, cameras_given=cameras_given)
-        claim, skin = Claim.of(motion, cameras, source), SkinPoints.of(shaped)
+    for model in (motion_read.body_model, "smpl"):
+        motion = replace(motion_read, body_model=model)
+        shaped = shape_for_motion(body, motion)
+        motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
+        claim, skin = CaptureGeometry.of(motion, cameras, source), SkinPoints.of(shaped)
         try:
-            pictures = glance(claim, skin, cameras, source)
-        except BadInput:
-            return read
-        if model == read.model:
-            stands_out[model] = edges(claim, skin, pictures)
+            pictures = sample_video(claim, skin, cameras, source)
+        except InputError:
+            return motion_read
+        if model == motion_read.body_model:
+            stands_out[model] = edge_contrast(claim, skin, pictures)
         else:
-            fitted = fitted_to_pictures(claim, skin, pictures)
-            stands_out[model] = edges(replace(claim, motion=fitted.motion), skin, pictures)
-    if stands_out["smpl"] < SHARPER * max(stands_out[read.model], EDGES):
-        return read
+            fitted = place_body_on_images(claim, skin, pictures)
+            stands_out[model] = edge_contrast(replace(claim, motion=fitted.motion), skin, pictures)
+    if stands_out["smpl"] < MIN_SMPL_CONTRAST_RATIO * max(stands_out[motion_read.body_model], MIN_EDGE_CONTRAST):
+        return motion_read
     found = (
         f"whose outline stands out {stands_out['smpl']:.1f} times from what is beside it in the "
-        f"pictures (else {stands_out[read.model]:.1f} times)"
+        f"pictures (else {stands_out[motion_read.body_model]:.1f} times)"
     )
-    return _taken_for_smpls(read, found)
+    return _label_smpl(motion_read, found)
 
 
-def _taken_for_smpls(read: Motion, found: str) -> Motion:
+def _label_smpl(motion_read: Motion, reason: str) -> Motion:
     said = (
         "The poses' file does not say for which body they were made (`model`); they are taken for "
-        f"SMPL's, {found}."
+        f"SMPL's, {reason}."
     )
-    note = said if read.note is None else f"{read.note} {said}"
-    return replace(read, model="smpl", note=note)
+    note = said if motion_read.note is None else f"{motion_read.note} {said}"
+    return replace(motion_read, body_model="smpl", note=note)

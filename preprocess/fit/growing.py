@@ -16,28 +16,28 @@ from jaxtyping import Shaped
 from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.body import ShapedBody
-from preprocess.doctor.claim import Claim
-from preprocess.doctor.evidence import Evidence, Witness
-from preprocess.fit.pictures import Picture, small_size
-from preprocess.fit.refit import FRAMES, Refit, moved_pelvis, refitted
-from preprocess.fit.unmasked import fitted_to_pictures
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.doctor.evidence import SilhouetteObjective, MaskSample
+from preprocess.fit.pictures import ImageSample, thumbnail_size_px
+from preprocess.fit.refit import ALIGNMENT_SAMPLES, BodyPlacement, move_pelvis, place_body_on_masks
+from preprocess.fit.unmasked import place_body_on_images
 from preprocess.kinematics import rotation_matrices
 from preprocess.observation import Observation
-from preprocess.observe import Dropped
+from preprocess.observe import DroppedFrame
 from preprocess.pose import BodyPose, Motion
-from preprocess.silhouette import PERSON_PX, SkinPoints
+from preprocess.silhouette import SILHOUETTE_PERSON_PX, SkinPoints
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Seen:
+class _KeptFrame:
     """A frame that is kept: the tracker's own pose, and the mask or the picture, small."""
 
     pose: BodyPose
-    small: Shaped[np.ndarray, "height width *_"]
+    thumbnail: Shaped[np.ndarray, "height width *_"]
 
 
 @final
-class GrowingFit:
+class LiveAlignment:
     """Fits the poses of one stream, seen by a camera that stands still, to one body.
 
     Attributes:
@@ -54,72 +54,72 @@ class GrowingFit:
             model: Whose poses they are.
             masked: Whether masks come along; else pictures are looked at.
         """
-        self.refit: Refit | None = None
-        self.frames = 0
-        self._skin, self._model, self.masked = SkinPoints.of(shaped), model, masked
-        self._seen: list[_Seen] = []
+        self.placement: BodyPlacement | None = None
+        self.frame_count = 0
+        self._skin, self._model, self.uses_masks = SkinPoints.of(shaped), model, masked
+        self._seen: list[_KeptFrame] = []
         self._count, self._every = 0, 1
 
-    def of(self, observation: Observation) -> Observation:
+    def align(self, observation: Observation) -> Observation:
         """The observation with its pose as it fits the masks, this one among them."""
-        pose = self._fitted(observation.pose, observation.camera, observation.alpha)
+        pose = self._align_pose(observation.pose, observation.camera, observation.alpha)
         return observation if pose is observation.pose else replace(observation, pose=pose)
 
-    def observing(
-        self, observed: Callable[[Frame], Observation | Dropped]
-    ) -> Callable[[Frame], Observation | Dropped]:
+    def align_observations(
+        self, observe: Callable[[Frame], Observation | DroppedFrame]
+    ) -> Callable[[Frame], Observation | DroppedFrame]:
         """What makes observations of frames, their poses fitted to the masks in them."""
 
-        def fitted(frame: Frame) -> Observation | Dropped:
-            seen = observed(frame)
-            return seen if isinstance(seen, Dropped) else self.of(seen)
+        def fitted(frame: Frame) -> Observation | DroppedFrame:
+            seen = observe(frame)
+            return seen if isinstance(seen, DroppedFrame) else self.align(seen)
 
         return fitted
 
-    def posing(
+    def align_poses(
         self, pose_of: Callable[[Frame], BodyPose | str], camera: Camera
     ) -> Callable[[Frame], BodyPose | str]:
         """What gives frames their poses, fitted to the pictures, before masks are estimated."""
 
         def fitted(frame: Frame) -> BodyPose | str:
             pose = pose_of(frame)
-            return pose if isinstance(pose, str) else self._fitted(pose, camera, frame.rgb)
+            return pose if isinstance(pose, str) else self._align_pose(pose, camera, frame.rgb)
 
         return fitted
 
-    def _fitted(
+    def _align_pose(
         self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
     ) -> BodyPose:
         """The pose of a new frame as it fits all masks, or pictures, that are kept."""
         if self._count % self._every == 0:
             self._keep(pose, camera, seen)
         self._count += 1
-        if self._count >= 2 * self.frames:
-            self.frames = self._count
-            self.refit = self._found(camera)
-        if self.refit is None or not self.refit.worth_it:
+        if self._count >= 2 * self.frame_count:
+            self.frame_count = self._count
+            self.placement = self._solve(camera)
+        if self.placement is None or not self.placement.is_improvement:
             return pose
-        return self._moved(pose, camera, self.refit)
+        return self._place(pose, camera, self.placement)
 
     def _keep(
         self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
     ) -> None:
         """Remembers a frame; of more than twice what a search takes, every other one goes."""
         if self._seen:
-            height, width = self._seen[0].small.shape[:2]
-        elif self.masked:
+            height, width = self._seen[0].thumbnail.shape[:2]
+        elif self.uses_masks:
             rows = np.flatnonzero((seen > 0.5).any(axis=1))
-            scale = min(1.0, PERSON_PX / (rows[-1] + 1 - rows[0]))
+            scale = min(1.0, SILHOUETTE_PERSON_PX / (rows[-1] + 1 - rows[0]))
             height, width = (max(8, round(side * scale)) for side in seen.shape)
         else:
-            width, height = small_size(self._skin, pose, camera)
+            width, height = thumbnail_size_px(self._skin, pose, camera)
         small = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-        self._seen.append(_Seen(pose=pose, small=small))
-        if len(self._seen) >= 2 * FRAMES:
+        self._seen.append(_KeptFrame(pose=pose, thumbnail=small))
+        if len(self._seen) >= 2 * ALIGNMENT_SAMPLES:
             self._every *= 2
             del self._seen[1::2]
 
-    def _found(self, camera: Camera) -> Refit:
+    def _solve(self, camera: Camera) -> BodyPlacement:
         """What all that is remembered says."""
         poses = [seen.pose for seen in self._seen]
         count = len(poses)
@@ -129,35 +129,35 @@ class GrowingFit:
             joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
             valid=np.ones(count, dtype=bool),
             betas=np.zeros(10),
-            model=self._model,
+            body_model=self._model,
         )
-        claim = Claim(
+        claim = CaptureGeometry(
             motion=motion,
-            places=np.arange(count, dtype=np.float64),
+            row_frames=np.arange(count, dtype=np.float64),
             intrinsics=camera.intrinsic[None],
             extrinsics=camera.camera_from_world[None],
             size_px=camera.size_px,
             distortion=camera.distortion,
         )
-        if not self.masked:
+        if not self.uses_masks:
             pictures = [
-                Picture(index=index, camera_row=0, rgb=seen.small)
+                ImageSample(index=index, camera_row=0, rgb=seen.thumbnail)
                 for index, seen in enumerate(self._seen)
             ]
-            return fitted_to_pictures(claim, self._skin, pictures)
+            return place_body_on_images(claim, self._skin, pictures)
         witnesses = tuple(
-            Witness(index=index, camera_row=0, alpha=seen.small.astype(np.float32))
+            MaskSample(index=index, camera_row=0, alpha=seen.thumbnail.astype(np.float32))
             for index, seen in enumerate(self._seen)
         )
-        return refitted(claim, Evidence(witnesses=witnesses, skin=self._skin))
+        return place_body_on_masks(claim, SilhouetteObjective(samples=witnesses, skin=self._skin))
 
-    def _moved(self, pose: BodyPose, camera: Camera, refit: Refit) -> BodyPose:
+    def _place(self, pose: BodyPose, camera: Camera, placement: BodyPlacement) -> BodyPose:
         rest = self._skin.shaped.joints[0]
-        there = moved_pelvis(
+        there = move_pelvis(
             rest + pose.root_translation,
             camera.center_world,
             rotation_matrices(pose.root_rotation),
-            refit.nearer,
-            refit.shift_m,
+            placement.distance_divisor,
+            placement.pelvis_shift_m,
         )
         return replace(pose, root_translation=there - rest)

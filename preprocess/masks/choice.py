@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from preprocess.masks.segmenter import OURS, segmenter_name
+from preprocess.masks.segmenter import DEFAULT_SEGMENTER, segmenter_name
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaskChoice:
+class MaskOrigin:
     """Where the masks come from: a file or folder, a segmenter, or else the alpha channel.
 
     Attributes:
@@ -18,20 +18,20 @@ class MaskChoice:
 
     path: Path | None = None
     segmenter: str | None = None
-    named: bool = False
+    is_explicit: bool = False
 
     @property
-    def alpha(self) -> bool:
+    def uses_alpha_channel(self) -> bool:
         """Whether the pictures' own alpha channel is the mask."""
         return self.path is None and self.segmenter is None
 
     @property
-    def fallback(self) -> bool:
+    def is_fallback(self) -> bool:
         """Whether masks are estimated only because there are no others."""
-        return self.segmenter is not None and not self.named
+        return self.segmenter is not None and not self.is_explicit
 
 
-def choose_masks(given: Path | None, found: Path | None, *, has_alpha: bool) -> MaskChoice:
+def choose_mask_origin(requested: Path | None, found: Path | None, *, has_alpha: bool) -> MaskOrigin:
     """Takes what the user named; else a file that was found, the alpha channel, or an estimate.
 
     Args:
@@ -39,11 +39,11 @@ def choose_masks(given: Path | None, found: Path | None, *, has_alpha: bool) -> 
         found: Masks that lie in the capture folder or beside the video.
         has_alpha: Whether the pictures' alpha channel cuts the person out; an opaque one does not.
     """
-    segmenter = segmenter_name(given)
+    segmenter = segmenter_name(requested)
     if segmenter is not None:
-        return MaskChoice(segmenter=segmenter, named=True)
-    if given is not None:
-        return MaskChoice(path=given, named=True)
+        return MaskOrigin(segmenter=segmenter, is_explicit=True)
+    if requested is not None:
+        return MaskOrigin(path=requested, is_explicit=True)
     if found is not None:
-        return MaskChoice(path=found)
-    return MaskChoice() if has_alpha else MaskChoice(segmenter=OURS)
+        return MaskOrigin(path=found)
+    return MaskOrigin() if has_alpha else MaskOrigin(segmenter=DEFAULT_SEGMENTER)

@@ -8,26 +8,26 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 from PIL import Image, ImageOps
 
-from capture.camera import same_shape
-from capture.errors import BadInput
-from capture.images import IMAGE_SUFFIXES, cuts_out, natural_key
-from capture.source import Source
+from capture.camera import same_aspect_ratio
+from capture.errors import InputError
+from capture.images import IMAGE_SUFFIXES, has_cutout_alpha, natural_sort_key
+from capture.source import FrameSource
 from capture.video import VIDEO_SUFFIXES
-from preprocess.content import read_content
-from preprocess.masks.one_file import coded_masks, is_tracked, video_of_masks
-from preprocess.masks.polarity import are_numbers, check_are_masks, is_turned, show_background
+from preprocess.content import read_untrusted_file
+from preprocess.masks.one_file import open_rle_masks, is_phalp_tracks, open_mask_video
+from preprocess.masks.polarity import are_object_ids, check_are_masks, is_inverted, shows_background
 from preprocess.npz import read_npz
 
-NOT_TRACKS = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+MALFORMED_TRACK_ERRORS = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
 """What a file raises that is nearly one of tracks."""
 
-CODED = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
+RLE_SUFFIXES = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
 """Endings of files that may hold run-length codes."""
 
-SAMPLED = 9
+POLARITY_SAMPLES = 9
 """How many masks are looked at to find out which side is the person."""
 
-Reader = Callable[[int], Float32[np.ndarray, "height width"]]
+MaskReader = Callable[[int], Float32[np.ndarray, "height width"]]
 """From a row to the mask as it is stored."""
 
 
@@ -46,7 +46,7 @@ class Masks:
         self,
         path: Path,
         count: int,
-        read: Reader,
+        read: MaskReader,
         *,
         invert: bool | None,
         names: tuple[str, ...] | None = None,
@@ -54,7 +54,7 @@ class Masks:
         """Looks at a few of the masks that `read` gives as they are stored.
 
         Raises:
-            BadInput: If none of them can be read, they are no masks or, with `invert` None, cannot
+            InputError: If none of them can be read, they are no masks or, with `invert` None, cannot
                 be told from the background.
         """
         self.path = path
@@ -62,16 +62,16 @@ class Masks:
         self.names = names
         self._read = read
         self._doubts = invert is None
-        rows = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int))
+        rows = np.unique(np.linspace(0, count - 1, POLARITY_SAMPLES).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
-        self._numbers = are_numbers(samples)
-        samples = [self._meant(sample) for sample in samples]
+        self._numbers = are_object_ids(samples)
+        samples = [self._binarize_ids(sample) for sample in samples]
         check_are_masks(samples, path)
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
-        self.inverted = show_background(samples, path) if invert is None else invert
+        self.inverted = shows_background(samples, path) if invert is None else invert
 
-    def _meant(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
+    def _binarize_ids(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
         """The same as alpha, where the files hold objects' numbers."""
         return (stored > 0.0).astype(np.float32) if self._numbers else stored
 
@@ -79,13 +79,13 @@ class Masks:
         """The mask in one row, scaled to a picture's size.
 
         Raises:
-            BadInput: If it cannot be read, is not of the picture's shape, or is the other way round
+            InputError: If it cannot be read, is not of the picture's shape, or is the other way round
                 than most (nobody having said which way they are).
         """
-        stored = self._meant(self._read(row))
+        stored = self._binarize_ids(self._read(row))
         height, width = stored.shape
-        if not same_shape((width, height), size_px):
-            raise BadInput(
+        if not same_aspect_ratio((width, height), size_px):
+            raise InputError(
                 f"Mask {row} in {self.path} has {width}x{height} px, its picture "
                 f"{size_px[0]}x{size_px[1]}; expected the same shape. Was one of them cropped "
                 "or rotated?"
@@ -96,8 +96,8 @@ class Masks:
                 stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             )
         alpha = np.float32(1.0) - stored if self.inverted else stored
-        if self._doubts and is_turned(alpha):
-            raise BadInput(
+        if self._doubts and is_inverted(alpha):
+            raise InputError(
                 f"mask {row} in {self.path} covers most of the picture and of its rim, unlike the "
                 "others; is it the wrong way round?"
             )
@@ -113,28 +113,28 @@ def open_masks(path: Path, *, invert: bool | None = None, person: str | None = N
         person: Whose masks, in a file of several people's tracks; None for who was seen most.
 
     Raises:
-        BadInput: If there are none, if they are all empty, or if it cannot be seen which side is
+        InputError: If there are none, if they are all empty, or if it cannot be seen which side is
             the person.
     """
     if not path.exists():
-        raise BadInput(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
+        raise InputError(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
     if path.is_dir():
-        return _folder_of_masks(path, invert)
-    count, read = _file_of_masks(path, person)
+        return _open_folder(path, invert)
+    count, read = _open_file(path, person)
     return Masks(path, count, read, invert=invert)
 
 
-def _folder_of_masks(path: Path, invert: bool | None) -> Masks:
+def _open_folder(path: Path, invert: bool | None) -> Masks:
     suffixes = IMAGE_SUFFIXES | {".npy"}
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes]
-    files = sorted((file for file in files if not file.name.startswith(".")), key=natural_key)
+    files = sorted((file for file in files if not file.name.startswith(".")), key=natural_sort_key)
     if not files:
-        raise BadInput(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
+        raise InputError(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
     names = tuple(file.stem for file in files)
     return Masks(path, len(files), lambda row: read_mask(files[row]), invert=invert, names=names)
 
 
-def masks_in_poses(path: Path, source: Source, *, person: str | None = None) -> Masks | None:
+def open_tracker_masks(path: Path, source: FrameSource, *, person: str | None = None) -> Masks | None:
     """The masks that a tracker keeps beside its poses (PHALP), if they fit the video; else None.
 
     Args:
@@ -144,93 +144,93 @@ def masks_in_poses(path: Path, source: Source, *, person: str | None = None) -> 
     """
     if path.suffix.lower() not in (".pkl", ".pickle"):
         return None
-    if not is_tracked(content := read_content(path)):
+    if not is_phalp_tracks(content := read_untrusted_file(path)):
         return None
     try:
-        coded = coded_masks(content, path, person)
+        coded = open_rle_masks(content, path, person)
         if coded is None or coded[0] != source.frames_in_file:
             return None
         count, decode = coded
         if not any(decode(row).any() for row in range(count)):
             return None
-        masks = Masks(path, count, lambda row: _as_alpha(decode(row), path), invert=False)
-    except (BadInput, *NOT_TRACKS):
+        masks = Masks(path, count, lambda row: _to_alpha(decode(row), path), invert=False)
+    except (InputError, *MALFORMED_TRACK_ERRORS):
         return None
-    return masks if same_shape(masks.size_px, source.size_px) else None
+    return masks if same_aspect_ratio(masks.size_px, source.size_px) else None
 
 
-def _coded(path: Path, person: str | None) -> tuple[int, Reader] | None:
-    """What `coded_masks` finds in a file.
+def _open_rle(path: Path, person: str | None) -> tuple[int, MaskReader] | None:
+    """What `open_rle_masks` finds in a file.
 
     Raises:
-        BadInput: If it nearly is such a file.
+        InputError: If it nearly is such a file.
     """
     try:
-        return coded_masks(read_content(path), path, person)
-    except NOT_TRACKS as cause:
-        raise BadInput(f"{path} holds tracks whose masks cannot be read ({cause}).") from cause
+        return open_rle_masks(read_untrusted_file(path), path, person)
+    except MALFORMED_TRACK_ERRORS as cause:
+        raise InputError(f"{path} holds tracks whose masks cannot be read ({cause}).") from cause
 
 
-def _file_of_masks(path: Path, person: str | None) -> tuple[int, Reader]:
+def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        count, read = video_of_masks(path)
-        return count, lambda row: _as_alpha(read(row), path)
-    if path.suffix.lower() in CODED and not (path.suffix.lower() == ".npy" and _is_plain(path)):
-        coded = _coded(path, person)
+        count, read = open_mask_video(path)
+        return count, lambda row: _to_alpha(read(row), path)
+    if path.suffix.lower() in RLE_SUFFIXES and not (path.suffix.lower() == ".npy" and _is_numeric_npy(path)):
+        coded = _open_rle(path, person)
         if coded is None:
-            raise BadInput(f"{path} holds no masks: no run-length codes, one or more a frame.")
+            raise InputError(f"{path} holds no masks: no run-length codes, one or more a frame.")
         count, decode = coded
-        return count, lambda row: _as_alpha(decode(row), path)
+        return count, lambda row: _to_alpha(decode(row), path)
     if path.suffix.lower() == ".npy":
-        stack = _load(path)
+        stack = _load_npy(path)
     elif path.suffix.lower() == ".npz":
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
     else:
-        raise BadInput(
+        raise InputError(
             f"{path} holds no masks that can be read; expected a folder of pictures, a video, an "
             ".npz or .npy (N, height, width), or COCO's run-length codes (.json, .npy, .pkl)."
         )
     if stack is None or stack.ndim != 3 or not stack.size:
-        raise BadInput(f"{path} holds no array of masks (N, height, width).")
-    return len(stack), lambda row: _as_alpha(stack[row], path)
+        raise InputError(f"{path} holds no array of masks (N, height, width).")
+    return len(stack), lambda row: _to_alpha(stack[row], path)
 
 
-def _is_plain(path: Path) -> bool:
+def _is_numeric_npy(path: Path) -> bool:
     """Whether an .npy holds anything but objects; a damaged one is left to who reads it."""
     try:
-        _load(path)
-    except BadInput as cause:
+        _load_npy(path)
+    except InputError as cause:
         return "bject" not in str(cause)
     return True
 
 
-def _load(path: Path) -> Shaped[np.ndarray, "..."]:
+def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     try:
         return np.load(path, allow_pickle=False, mmap_mode="r")
     except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
-        raise BadInput(f"{path} is no readable .npy of numbers ({cause}).") from cause
+        raise InputError(f"{path} is no readable .npy of numbers ({cause}).") from cause
 
 
 def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
     """One mask as it is stored, in [0, 1].
 
     Raises:
-        BadInput: If it cannot be decoded, or is not complete.
+        InputError: If it cannot be decoded, or is not complete.
     """
     if path.suffix.lower() == ".npy":
-        return _as_alpha(np.asarray(_load(path)), path)
+        return _to_alpha(np.asarray(_load_npy(path)), path)
     try:
         with Image.open(path) as picture:
             picture.load()
             ImageOps.exif_transpose(picture, in_place=True)
-            channel = _channel(picture)
+            channel = _mask_channel(picture)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
-        raise BadInput(f"{path} is no mask that can be decoded ({cause}).") from cause
-    return _as_alpha(channel, path)
+        raise InputError(f"{path} is no mask that can be decoded ({cause}).") from cause
+    return _to_alpha(channel, path)
 
 
-def _channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
+def _mask_channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
     """The one channel that holds the mask: objects' numbers, the alpha channel, or brightness."""
     if picture.mode == "P":
         colours = np.array(picture.getpalette()).reshape(-1, 3)
@@ -239,20 +239,20 @@ def _channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
         picture = picture.convert("L")
     if picture.mode in ("LA", "RGBA"):
         alpha = np.asarray(picture)[..., -1]
-        if cuts_out(alpha):
+        if has_cutout_alpha(alpha):
             return alpha
     if picture.mode in ("LA", "RGBA", "RGB", "CMYK", "YCbCr"):
         picture = picture.convert("L")
     return np.asarray(picture)
 
 
-def _as_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:
+def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:
     """Stored numbers as alpha; a mask of nothing but 0 and 1 needs no scaling."""
     stored = np.squeeze(np.asarray(stored))
     if stored.ndim != 2 or stored.dtype.kind not in "biuf":
-        raise BadInput(f"A mask in {path} has the shape {stored.shape}; expected height x width.")
+        raise InputError(f"A mask in {path} has the shape {stored.shape}; expected height x width.")
     if not np.isfinite(stored).all():
-        raise BadInput(f"A mask in {path} holds NaN; expected numbers from 0 to 1, or to 255.")
+        raise InputError(f"A mask in {path} holds NaN; expected numbers from 0 to 1, or to 255.")
     return np.clip(stored.astype(np.float32) / _full_scale(stored), 0.0, 1.0)
 
 
@@ -265,13 +265,13 @@ def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
     return np.float32(65535.0 if stored.dtype == np.uint16 else 255.0)
 
 
-def _readable(read: Reader, rows: list[int]) -> list[Float32[np.ndarray, "height width"]]:
+def _readable(read: MaskReader, rows: list[int]) -> list[Float32[np.ndarray, "height width"]]:
     """Those of the masks that can be read, if any can."""
     masks, refused = [], []
     for row in rows:
         try:
             masks.append(read(row))
-        except BadInput as cause:
+        except InputError as cause:
             refused.append(cause)
     if not masks:
         raise refused[0]

@@ -7,20 +7,20 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from capture.images import list_images
-from capture.pace import Pace
-from preprocess.growing_poses import LOOK_EVERY_S, PATIENCE_S
+from capture.pace import PacingClock
+from preprocess.growing_poses import POLL_INTERVAL_S, MAX_WAIT_S
 from preprocess.masks.files import Masks, read_mask
 
 
-class _OtherWay(BadInput):
+class _InvertedMask(InputError):
     """A mask that is the other way round than those before it: waiting does not help."""
 
 
 @final
-class GrowingMasks:
+class LiveMasks:
     """The masks of a live source: a folder of pictures, written one after the other.
 
     A mask belongs to the picture of the same name; of a camera, whose pictures have none, to the
@@ -29,7 +29,7 @@ class GrowingMasks:
     """
 
     def __init__(
-        self, path: Path, pace: Pace, *, invert: bool | None, patience_s: float = PATIENCE_S
+        self, path: Path, pace: PacingClock, *, invert: bool | None, patience_s: float = MAX_WAIT_S
     ) -> None:
         """Nothing is read yet.
 
@@ -44,27 +44,27 @@ class GrowingMasks:
         self._by_number: dict[int, Path] = {}
         self._ways: list[bool] = []
 
-    def of(self, frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    def wait_for_mask(self, frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         """The mask of a frame, scaled to a picture's size; waits for it.
 
         Raises:
-            BadInput: If it did not come in time, cannot be read, is of another shape, or the other
+            InputError: If it did not come in time, cannot be read, is of another shape, or the other
                 way round than most.
         """
         deadline = (self._pace.now() if frame.due_s is None else frame.due_s) + self._patience_s
         while True:
             try:
-                path = self._find(frame)
+                path = self._find_file(frame)
                 if path is not None:
                     return self._read(path, size_px)
-                trouble = BadInput(f"no mask within {self._patience_s:g} s")
-            except _OtherWay:
+                trouble = InputError(f"no mask within {self._patience_s:g} s")
+            except _InvertedMask:
                 raise
-            except BadInput as cause:  # perhaps it is half written
+            except InputError as cause:  # perhaps it is half written
                 trouble = cause
-            if self._pace.now() >= deadline or self._pace.ended:
+            if self._pace.now() >= deadline or self._pace.stopped:
                 raise trouble
-            self._pace.until(min(deadline, self._pace.now() + LOOK_EVERY_S))
+            self._pace.wait_until(min(deadline, self._pace.now() + POLL_INTERVAL_S))
 
     def _read(self, path: Path, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         stored = read_mask(path)
@@ -72,28 +72,28 @@ class GrowingMasks:
             return Masks(path, 1, lambda row: stored, invert=self._invert).alpha(0, size_px)
         if not stored.any():  # it tells nothing of the others either
             return np.zeros(size_px[::-1], dtype=np.float32)
-        before = self._most()
+        before = self._majority_inverted()
         try:
             turned = Masks(path, 1, lambda row: stored, invert=None).inverted
-        except BadInput:  # full, or undecidable, or no mask at all, which is said below
+        except InputError:  # full, or undecidable, or no mask at all, which is said below
             if before is None:
                 raise
             return Masks(path, 1, lambda row: stored, invert=before).alpha(0, size_px)
         alpha = Masks(path, 1, lambda row: stored, invert=turned).alpha(0, size_px)
         self._ways.append(turned)
-        if turned != self._most():
-            raise _OtherWay(f"{path.name} is the other way round than most masks so far")
+        if turned != self._majority_inverted():
+            raise _InvertedMask(f"{path.name} is the other way round than most masks so far")
         return alpha
 
-    def _most(self) -> bool | None:
+    def _majority_inverted(self) -> bool | None:
         """Whether the person is dark in most masks so far; None if there was none."""
         if not self._ways:
             return None
         dark = 2 * sum(self._ways) - len(self._ways)
         return dark > 0 if dark else self._ways[0]
 
-    def _find(self, frame: Frame) -> Path | None:
-        found = self._known(frame)
+    def _find_file(self, frame: Frame) -> Path | None:
+        found = self._known_file(frame)
         if found is None and self._path.is_dir():
             self._by_name, self._by_number = {}, {}
             for path in list_images(self._path):
@@ -101,10 +101,10 @@ class GrowingMasks:
                 numbers = re.findall(r"\d+", path.stem)
                 if numbers:
                     self._by_number[int(numbers[-1])] = path
-            found = self._known(frame)
+            found = self._known_file(frame)
         return found
 
-    def _known(self, frame: Frame) -> Path | None:
+    def _known_file(self, frame: Frame) -> Path | None:
         if frame.name is not None:
             return self._by_name.get(frame.name)
         return self._by_number.get(frame.index)

@@ -6,19 +6,19 @@ from jaxtyping import Bool, Float
 
 from capture.camera import Camera
 
-HEAD = 15
+HEAD_JOINT = 15
 """The head's joint."""
 
-HEAD_M, HAIR_M = 0.3, 0.06
+HEAD_RADIUS_M, HAIR_BAND_M = 0.3, 0.06
 """So near to the head's middle, outside the shell at least so much is in doubt; what is found there
 does not make a cut less trusted."""
 
-KNOT_M = 0.025
+MIN_HAIR_WIDTH_M = 0.025
 """What is so wide in all directions is a knot or a bun, however little the shell knows of it; what
 is narrower may be a leak."""
 
 
-def near_head(
+def head_region(
     skin: Float[np.ndarray, "points 3"], camera: Camera, px_per_m: float
 ) -> Bool[np.ndarray, "height width"]:
     """The pixels that may be hair.
@@ -31,11 +31,11 @@ def near_head(
     x, y = camera.project(skin.mean(axis=0, keepdims=True))[0]
     width, height = camera.size_px
     across, down = np.arange(width) + 0.5 - x, np.arange(height) + 0.5 - y
-    return across**2 + (down**2)[:, None] < (HEAD_M * px_per_m) ** 2
+    return across**2 + (down**2)[:, None] < (HEAD_RADIUS_M * px_per_m) ** 2
 
 
-def knots(
-    beyond: Bool[np.ndarray, "height width"], px_per_m: float
+def solid_hair(
+    protruding: Bool[np.ndarray, "height width"], px_per_m: float
 ) -> Bool[np.ndarray, "height width"]:
     """Of hair outside the shell what stands off in one piece, and the pixels beside it.
 
@@ -43,6 +43,6 @@ def knots(
         beyond: The pixels of hair outside the shell.
         px_per_m: What a metre is in the picture, at the body.
     """
-    wide = np.ones((max(3, int(KNOT_M * px_per_m) | 1),) * 2, np.uint8)
-    solid = cv2.morphologyEx(beyond.astype(np.uint8), cv2.MORPH_OPEN, wide)
+    wide = np.ones((max(3, int(MIN_HAIR_WIDTH_M * px_per_m) | 1),) * 2, np.uint8)
+    solid = cv2.morphologyEx(protruding.astype(np.uint8), cv2.MORPH_OPEN, wide)
     return cv2.dilate(solid, np.ones((3, 3), np.uint8)) > 0

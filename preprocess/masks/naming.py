@@ -4,10 +4,10 @@ import re
 from collections.abc import Sequence
 
 from capture.images import list_images
-from capture.source import Source
+from capture.source import FrameSource
 
 
-def rows_by_name(names: Sequence[str], source: Source) -> dict[int, int] | None:
+def associate_by_name(names: Sequence[str], source: FrameSource) -> dict[int, int] | None:
     """The masks' rows by their frames' numbers; None where names do not tell.
 
     In a folder of pictures a mask belongs to the picture of its name, or of its number. In a video
@@ -23,8 +23,8 @@ def rows_by_name(names: Sequence[str], source: Source) -> dict[int, int] | None:
         return None
     if source.path.is_dir():
         pictures = [file.stem for file in list_images(source.path)]
-        return _matched(names, pictures) or _matched(_numbers(names), _numbers(pictures))
-    numbers, total = _numbers(names), source.frames_in_file
+        return _match_names(names, pictures) or _match_names(_unique_numbers(names), _unique_numbers(pictures))
+    numbers, total = _unique_numbers(names), source.frames_in_file
     if numbers is None:
         return None
     first = 0 if min(numbers) == 0 else 1 if max(numbers) == total else None
@@ -35,7 +35,7 @@ def rows_by_name(names: Sequence[str], source: Source) -> dict[int, int] | None:
     return {number - first: row for row, number in enumerate(numbers)}
 
 
-def _matched(
+def _match_names(
     masks: Sequence[str | int] | None, pictures: Sequence[str | int] | None
 ) -> dict[int, int] | None:
     """Rows by frames, if every mask has its own picture."""
@@ -46,7 +46,7 @@ def _matched(
     return rows if len(rows) == len(masks) else None
 
 
-def _numbers(names: Sequence[str]) -> list[int] | None:
+def _unique_numbers(names: Sequence[str]) -> list[int] | None:
     """The last number in each name; None unless all have one of their own."""
     found = [re.findall(r"\d+", name) for name in names]
     if not found or not all(found):

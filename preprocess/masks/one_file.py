@@ -8,37 +8,37 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
 
-from capture.errors import BadInput
-from capture.images import natural_key
+from capture.errors import InputError
+from capture.images import natural_sort_key
 from capture.quiet import silence_opencv
-from capture.selection import Selection
+from capture.selection import FrameSelection
 from capture.video import VideoFile
 
-MAX_PIXELS = 1 << 28
+MAX_RLE_PIXELS = 1 << 28
 """Of one run-length coded mask."""
 
-MOST_FRAMES = 1_000_000
+MAX_TRACK_FRAMES = 1_000_000
 """That a file of tracks may name."""
 
-BLACK, WHITE = 16.0, 239.0
+VIDEO_BLACK, VIDEO_WHITE = 16.0, 239.0
 """Compressed videos ring around edges: what is darker is 0, what is brighter 1."""
 
-Read = Callable[[int], Shaped[np.ndarray, "height width"]]
+RawMaskReader = Callable[[int], Shaped[np.ndarray, "height width"]]
 
 
-def video_of_masks(path: Path) -> tuple[int, Read]:
+def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
     """How many frames a video has, and what reads the brightness of one.
 
     Raises:
-        BadInput: If it cannot be opened.
+        InputError: If it cannot be opened.
     """
-    source = VideoFile(path, Selection())
-    film = _Film(path)
+    source = VideoFile(path, FrameSelection())
+    film = _MaskVideo(path)
     return source.frames_in_file, film.read
 
 
-class _Film:
-    """Frames of a video by number; cheap in ascending order, which is how they are asked for."""
+class _MaskVideo:
+    """EvaluationFrames of a video by number; cheap in ascending order, which is how they are asked for."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -50,7 +50,7 @@ class _Film:
         """The mask in one frame.
 
         Raises:
-            BadInput: If it cannot be decoded.
+            InputError: If it cannot be decoded.
         """
         if row == self._at and self._last is not None:
             return self._last
@@ -59,17 +59,17 @@ class _Film:
             self._capture, self._at = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), -1
         while self._at < row:
             if not self._capture.grab():
-                raise BadInput(f"Frame {row} of the masks {self._path} cannot be decoded.")
+                raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
             self._at += 1
         ok, picture = self._capture.retrieve()
         if not ok:
-            raise BadInput(f"Frame {row} of the masks {self._path} cannot be decoded.")
+            raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
         grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float32)
-        self._last = np.clip((grey - np.float32(BLACK)) / np.float32(WHITE - BLACK), 0.0, 1.0)
+        self._last = np.clip((grey - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0)
         return self._last
 
 
-def coded_masks(content: Any, path: Path, person: str | None = None) -> tuple[int, Read] | None:
+def open_rle_masks(content: Any, path: Path, person: str | None = None) -> tuple[int, RawMaskReader] | None:
     """How many run-length coded masks there are, and what decodes one; None if there are none.
 
     A list with one a frame (TRAM's masks.npy; an empty entry is an empty mask), a dictionary of
@@ -81,7 +81,7 @@ def coded_masks(content: Any, path: Path, person: str | None = None) -> tuple[in
         path: For messages.
         person: Whose, in a file of tracks; None for who was seen most.
     """
-    frames = _of_one_person(content, person) if is_tracked(content) else _by_frame(content)
+    frames = _track_rle(content, person) if is_phalp_tracks(content) else _frame_rle(content)
     if not frames or not any(frames):
         return None
     first = next(codes for codes in frames if codes)[0]
@@ -89,21 +89,21 @@ def coded_masks(content: Any, path: Path, person: str | None = None) -> tuple[in
     def read(row: int) -> UInt8[np.ndarray, "height width"]:
         codes = frames[row] or [{**first, "counts": None}]
         try:
-            return np.bitwise_or.reduce([decoded(code) for code in codes])
+            return np.bitwise_or.reduce([decode_rle(code) for code in codes])
         except (ValueError, KeyError, TypeError, IndexError, OverflowError) as cause:
-            raise BadInput(f"Mask {row} in {path} is no run-length code ({cause}).") from cause
+            raise InputError(f"Mask {row} in {path} is no run-length code ({cause}).") from cause
 
     return len(frames), read
 
 
-def is_tracked(content: Any) -> bool:
+def is_phalp_tracks(content: Any) -> bool:
     """Whether these are PHALP's tracks with masks: {picture: {tid, mask, …}}, lists in parallel."""
     if not isinstance(content, dict) or not content:
         return False
     return all(isinstance(one, dict) and {"tid", "mask"} <= one.keys() for one in content.values())
 
 
-def _of_one_person(content: Any, person: str | None) -> list[list[dict[str, Any]]]:
+def _track_rle(content: Any, person: str | None) -> list[list[dict[str, Any]]]:
     """The masks of one track; a frame in which it was only guessed has none."""
     seen: dict[str, dict[int, Any]] = {}
     last = -1
@@ -114,42 +114,42 @@ def _of_one_person(content: Any, person: str | None) -> list[list[dict[str, Any]
         for who, mask, lost in zip(frame["tid"], frame["mask"], guessed, strict=True):
             if not lost:
                 seen.setdefault(str(int(who)), {})[number] = mask
-    if not 0 <= last < MOST_FRAMES:
+    if not 0 <= last < MAX_TRACK_FRAMES:
         return []
     most = max(seen, key=lambda who: len(seen[who]), default="")
     rows = seen.get(most if person is None else person, {})
-    return [_codes(rows.get(number)) for number in range(last + 1)]
+    return [_as_rle_list(rows.get(number)) for number in range(last + 1)]
 
 
-def _by_frame(content: Any) -> list[list[dict[str, Any]]] | None:
+def _frame_rle(content: Any) -> list[list[dict[str, Any]]] | None:
     if isinstance(content, dict) and {"images", "annotations"} <= content.keys():
-        images = sorted(content["images"], key=lambda image: natural_key(Path(image["file_name"])))
+        images = sorted(content["images"], key=lambda image: natural_sort_key(Path(image["file_name"])))
         found: dict[Any, list[Any]] = {image["id"]: [] for image in images}
         for one in content["annotations"]:
             found.setdefault(one["image_id"], []).append(one["segmentation"])
-        return [_codes(codes) for codes in found.values()]
-    if isinstance(content, dict) and not _is_code(content):
-        names = sorted(content, key=lambda name: natural_key(Path(str(name))))
+        return [_as_rle_list(codes) for codes in found.values()]
+    if isinstance(content, dict) and not _is_rle(content):
+        names = sorted(content, key=lambda name: natural_sort_key(Path(str(name))))
         listed = [content[name] for name in names]
     elif isinstance(content, list):
         listed = content
     else:
         return None
-    if not all(_is_code(one) or one is None or isinstance(one, list) for one in listed):
+    if not all(_is_rle(one) or one is None or isinstance(one, list) for one in listed):
         return None
-    return [_codes(one) for one in listed]
+    return [_as_rle_list(one) for one in listed]
 
 
-def _codes(one: Any) -> list[dict[str, Any]]:
-    listed = [one] if _is_code(one) else (one or [])
-    return [code for code in listed if _is_code(code)]
+def _as_rle_list(one: Any) -> list[dict[str, Any]]:
+    listed = [one] if _is_rle(one) else (one or [])
+    return [code for code in listed if _is_rle(code)]
 
 
-def _is_code(thing: Any) -> bool:
+def _is_rle(thing: Any) -> bool:
     return isinstance(thing, dict) and {"size", "counts"} <= thing.keys()
 
 
-def decoded(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
+def decode_rle(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
     """A mask of COCO's run-length code: lengths of runs of 0 and 1, down the columns.
 
     `counts` is a list, or the text in which each length is written in groups of five bits, the
@@ -160,11 +160,11 @@ def decoded(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
         ValueError: If the runs do not fill the picture.
     """
     height, width = (int(side) for side in code["size"])
-    if not 0 < height * width <= MAX_PIXELS:
+    if not 0 < height * width <= MAX_RLE_PIXELS:
         raise ValueError(f"a size of {height}x{width}")
     counts = [height * width] if code["counts"] is None else code["counts"]
     if isinstance(counts, str | bytes):
-        counts = _lengths(counts.encode("latin1") if isinstance(counts, str) else counts)
+        counts = _run_lengths(counts.encode("latin1") if isinstance(counts, str) else counts)
     lengths = np.asarray(counts, dtype=np.int64).reshape(-1)
     if (lengths < 0).any() or lengths.sum() != height * width:
         raise ValueError(f"runs that do not fill {height}x{width} pixels")
@@ -172,7 +172,7 @@ def decoded(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
     return ones.reshape(width, height).T.astype(np.uint8)
 
 
-def _lengths(text: bytes) -> list[int]:
+def _run_lengths(text: bytes) -> list[int]:
     lengths: list[int] = []
     value = shift = 0
     for byte in text:

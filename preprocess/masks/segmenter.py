@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from preprocess.body import ShapedBody
 from preprocess.pose import BodyPose
 
-PREFIX = "segmenter:"
-OURS = "grabcut"
-GROUP = "instant_avatar.segmenters"
+SEGMENTER_PREFIX = "segmenter:"
+DEFAULT_SEGMENTER = "grabcut"
+ENTRY_POINT_GROUP = "instant_avatar.segmenters"
 """Entry points of other packages: NAME = "module:make", where make(shaped) gives a Segmenter."""
 
 
@@ -36,34 +36,34 @@ class Segmenter(Protocol):
         ...
 
 
-Maker = Callable[[ShapedBody], Segmenter]
+SegmenterFactory = Callable[[ShapedBody], Segmenter]
 
 
 def segmenter_name(masks: object) -> str | None:
     """What follows `segmenter:` in --masks; None if it names a file or nothing."""
     text = str(masks)
-    return text.removeprefix(PREFIX) if text.startswith(PREFIX) else None
+    return text.removeprefix(SEGMENTER_PREFIX) if text.startswith(SEGMENTER_PREFIX) else None
 
 
 def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
     """Our own segmenter, or that of an installed package.
 
     Raises:
-        BadInput: If no package brings one of that name, or it cannot be loaded.
+        InputError: If no package brings one of that name, or it cannot be loaded.
     """
-    if name == OURS:
-        from preprocess.masks.grabcut import GrabCut
+    if name == DEFAULT_SEGMENTER:
+        from preprocess.masks.grabcut import GrabCutSegmenter
 
-        return GrabCut(shaped)
-    brought = {point.name: point for point in entry_points(group=GROUP)}
+        return GrabCutSegmenter(shaped)
+    brought = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
     if name not in brought:
-        raise BadInput(
-            f"--masks {PREFIX}{name}: there is no such segmenter; installed are "
-            f"{', '.join([OURS, *brought])}. Others come with packages that have an entry point in "
-            f"the group {GROUP!r} (docs/formats.md)."
+        raise InputError(
+            f"--masks {SEGMENTER_PREFIX}{name}: there is no such segmenter; installed are "
+            f"{', '.join([DEFAULT_SEGMENTER, *brought])}. Others come with packages that have an entry point in "
+            f"the group {ENTRY_POINT_GROUP!r} (docs/formats.md)."
         )
     try:
-        make: Maker = brought[name].load()
+        make: SegmenterFactory = brought[name].load()
         return make(shaped)
     except Exception as cause:  # somebody else's code
-        raise BadInput(f"The segmenter {name!r} could not be loaded: {cause}.") from cause
+        raise InputError(f"The segmenter {name!r} could not be loaded: {cause}.") from cause

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.pickles.inert import (
     Array,
     Encoded,
@@ -17,7 +17,7 @@ from preprocess.pickles.inert import (
     array_of,
     dtype_of,
 )
-from preprocess.pickles.unpickle import FetchStorage, HoldsCode, unpickled
+from preprocess.pickles.unpickle import FetchStorage, UnsafePickleError, load_inert
 
 MAX_BYTES = 1 << 30
 """Larger files are refused (SMPL with 300 betas takes a quarter of it)."""
@@ -36,44 +36,44 @@ def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[n
     and scipy's csc matrices (made dense).
 
     Raises:
-        BadInput: If the file is too large, is no pickle of a dictionary, holds anything that would
+        InputError: If the file is too large, is no pickle of a dictionary, holds anything that would
             have to be executed, or if a wanted entry is no array.
     """
-    content = guarded(path, lambda: unpickled(bounded_bytes(path)))
+    content = explain_failures(path, lambda: load_inert(read_limited(path)))
     if not isinstance(content, dict):
-        raise BadInput(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
+        raise InputError(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
     arrays = {}
     for key in keys:
         if dict.__contains__(content, key):
             try:
                 arrays[key] = array_of(dict.__getitem__(content, key))
             except Exception as cause:  # the records hold whatever the file says
-                raise BadInput(f"`{key}` in {path} is no readable array ({cause}).") from cause
+                raise InputError(f"`{key}` in {path} is no readable array ({cause}).") from cause
     return arrays
 
 
-def plain_pickle(data: bytes, fetch: FetchStorage | None = None) -> Any:
+def load_plain_pickle(data: bytes, fetch: FetchStorage | None = None) -> Any:
     """What a pickle holds as dictionaries, lists, numbers, texts and numpy arrays.
 
     Raises:
-        HoldsCode: If it names anything that is not on the list.
+        UnsafePickleError: If it names anything that is not on the list.
         Exception: Of any kind, if it is damaged or too large.
     """
-    return _Plain().of(unpickled(data, fetch))
+    return _Plain().of(load_inert(data, fetch))
 
 
-def guarded(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
+def explain_failures(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
     """What `read` gives, or what is wrong with the file, in words.
 
     Raises:
-        BadInput: If the file asks to run something, or `read` fails in any other way.
+        InputError: If the file asks to run something, or `read` fails in any other way.
     """
     try:
         return read()
-    except (BadInput, PermissionError):  # a command says who may not read what
+    except (InputError, PermissionError):  # a command says who may not read what
         raise
-    except HoldsCode as found:
-        raise BadInput(
+    except UnsafePickleError as found:
+        raise InputError(
             f"{path} is a pickle that asks to run {found}; it was refused and nothing was run. "
             "A body or pose file holds arrays only: get it from its authors again, or convert it "
             "to .npz."
@@ -81,18 +81,18 @@ def guarded(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
     except Exception as cause:  # a broken pickle may fail in any way: see the pickle documentation
         # a KeyError's text is the byte or name that was not expected, and tells nobody anything
         why = "it holds something else" if isinstance(cause, KeyError) else cause
-        raise BadInput(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
+        raise InputError(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
 
 
-def bounded_bytes(path: Path) -> bytes:
+def read_limited(path: Path) -> bytes:
     """The bytes of a file, unless there are too many.
 
     Raises:
-        BadInput: If it is too large.
+        InputError: If it is too large.
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise BadInput(
+        raise InputError(
             f"{path} has {size >> 20} MiB; pickles of more than {MAX_BYTES >> 20} MiB are not read."
         )
     return path.read_bytes()

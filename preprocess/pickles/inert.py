@@ -86,7 +86,7 @@ class Variable(Inert):
     """chumpy.ch.Ch: a leaf `x`."""
 
 
-class Selection(Inert):
+class ChumpySelect(Inert):
     """chumpy.reordering.Select: `a[idxs]`."""
 
 
@@ -164,7 +164,7 @@ ALLOWED: dict[tuple[str, str], type] = {
     },
     ("joblib.numpy_pickle", "NumpyArrayWrapper"): WrappedArray,
     ("chumpy.ch", "Ch"): Variable,
-    ("chumpy.reordering", "Select"): Selection,
+    ("chumpy.reordering", "Select"): ChumpySelect,
     ("chumpy.reordering", "transpose"): Transposition,
     ("scipy.sparse.csc", "csc_matrix"): SparseColumns,
     ("scipy.sparse._csc", "csc_matrix"): SparseColumns,
@@ -218,7 +218,7 @@ def array_of(thing: Any, nesting: int = 0) -> Shaped[np.ndarray, "..."]:
             return array_of(thing.arguments[0], nesting + 1)
         case Variable():
             return array_of(thing.state["x"], nesting + 1)
-        case Selection():
+        case ChumpySelect():
             chosen = array_of(thing.state["a"], nesting + 1).ravel()[
                 array_of(thing.state["idxs"], nesting + 1).ravel()
             ]

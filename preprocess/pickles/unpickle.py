@@ -31,7 +31,7 @@ FetchStorage = Callable[[str, int], bytes]
 """From a storage's name and its length in bytes to its numbers."""
 
 
-class HoldsCode(Exception):  # noqa: N818 - a finding, not a fault of ours
+class UnsafePickleError(Exception):  # noqa: N818 - a finding, not a fault of ours
     """The pickle names something that is not on the list."""
 
 
@@ -61,7 +61,7 @@ class InertUnpickler(_PythonUnpickler):
         """What stands for a global; nothing is ever imported."""
         allowed = ALLOWED.get((module_name, global_name))
         if allowed is None:
-            raise HoldsCode(f"{module_name}.{global_name}")
+            raise UnsafePickleError(f"{module_name}.{global_name}")
         return allowed
 
     def persistent_load(self, pid: Any) -> Any:
@@ -128,11 +128,11 @@ def _number_of(kind: Any) -> str:
     raise pickle.UnpicklingError("a storage of an unknown kind")
 
 
-def unpickled(data: bytes, fetch: FetchStorage | None = None) -> Any:
+def load_inert(data: bytes, fetch: FetchStorage | None = None) -> Any:
     """What a pickle holds, in dictionaries, lists and inert records.
 
     Raises:
-        HoldsCode: If it names anything that is not on the list.
+        UnsafePickleError: If it names anything that is not on the list.
         Exception: Of any kind, if it is damaged.
     """
     content = InertUnpickler(io.BytesIO(data), fetch).load()

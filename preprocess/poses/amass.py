@@ -1,6 +1,6 @@
 """Motion capture to drive an avatar: AMASS (SMPL+H, SMPL-X) and AIST++.
 
-Layout, AMASS: .npz with poses (N, 156) = root, 21 body joints, hands; trans (N, 3), betas (16,),
+TableLayout, AMASS: .npz with poses (N, 156) = root, 21 body joints, hands; trans (N, 3), betas (16,),
 gender, mocap_framerate; newer `*_stageii.npz`: root_orient (N, 3), pose_body (N, 63), trans, betas,
 mocap_frame_rate, surface_model_type. World with z up. AIST++: pickle with smpl_poses (N, 72) or
 (N, 24, 3), smpl_scaling (1,), smpl_trans (N, 3) in units of the scaling, 60 rows a second.
@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.poses.track import People, track
+from preprocess.poses.track import MotionByPerson, build_motion
 
-AIST_RATE = 60.0
+AIST_FPS = 60.0
 """Of all AIST++ motions, by their documentation."""
-OF_SMPLX = 165
+SMPLX_ROW_SIZE = 165
 """Numbers a row that only SMPL-X has: 55 joints."""
 
 
-def tracks(content: Any, driving: bool = False) -> People | None:
+def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """The motion of the file; None if it is neither."""
     if not isinstance(content, dict):
         return None
@@ -34,15 +34,15 @@ def tracks(content: Any, driving: bool = False) -> People | None:
         return None
     model = str(content.get("surface_model_type", "smpl"))
     numbers = sum(np.asarray(part).size for part in parts) / max(1, len(content["trans"]))
-    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == OF_SMPLX
-    motion = track(
+    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == SMPLX_ROW_SIZE
+    motion = build_motion(
         parts,
         content["trans"],
         betas=np.asarray(content["betas"], dtype=np.float64).reshape(-1)[:10]
         if "betas" in content
         else None,
         times_s=_times(len(np.asarray(content["trans"])), _rate(content)),
-        model="smplx" if is_smplx else "smpl",
+        body_model="smplx" if is_smplx else "smpl",
         space="world",
     )
     return {"0": motion}
@@ -54,8 +54,8 @@ def _aist(content: dict[str, Any]) -> Any:
     if not np.isfinite(scaling) or scaling <= 0.0:
         raise ValueError(f"`smpl_scaling` of {scaling}")
     poses = np.asarray(content["smpl_poses"], dtype=np.float64).reshape(len(places), -1)
-    times_s = _times(len(places), AIST_RATE)
-    return track([poses], places / scaling, times_s=times_s, space="world")
+    times_s = _times(len(places), AIST_FPS)
+    return build_motion([poses], places / scaling, times_s=times_s, space="world")
 
 
 def _rate(content: dict[str, Any]) -> float | None:

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from preprocess.pose import Motion
-from preprocess.rotations import between
+from preprocess.rotations import slerp
 
-LONGEST_GAP = 12
+MAX_GAP_FRAMES = 12
 """Missing frames in a row that are filled in; a person does a lot in a second half of 24."""
 
 
-def bridged(motion: Motion, longest: int = LONGEST_GAP) -> Motion:
+def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
     """The motion with short gaps filled in: slerp for rotations, straight lines for places.
 
     A gap is a run of frames without a valid row between two frames with one; longer gaps stay.
@@ -27,11 +27,11 @@ def bridged(motion: Motion, longest: int = LONGEST_GAP) -> Motion:
         return motion  # nobody knows where the cameras of the missing frames stood
     numbers = motion.frames if motion.frames is not None else np.arange(len(motion))
     good = np.flatnonzero(motion.valid)
-    before = good[:-1][(np.diff(numbers[good]) > 1) & (np.diff(numbers[good]) <= longest + 1)]
+    before = good[:-1][(np.diff(numbers[good]) > 1) & (np.diff(numbers[good]) <= max_gap + 1)]
     if not len(before):
         return motion
     filled = [
-        _filled(motion, numbers, int(row), int(good[np.searchsorted(good, row) + 1]))
+        _fill_gap(motion, numbers, int(row), int(good[np.searchsorted(good, row) + 1]))
         for row in before
     ]
     new = np.concatenate([part[0] for part in filled])
@@ -55,11 +55,11 @@ def bridged(motion: Motion, longest: int = LONGEST_GAP) -> Motion:
         valid=merged(motion.valid, np.ones(len(new), dtype=bool)),
         frames=merged(numbers, new) if motion.frames is not None else None,
         times_s=times_s,
-        bridged=merged(np.zeros(len(numbers), dtype=bool), np.ones(len(new), dtype=bool)),
+        interpolated=merged(np.zeros(len(numbers), dtype=bool), np.ones(len(new), dtype=bool)),
     )
 
 
-def _filled(
+def _fill_gap(
     motion: Motion, numbers: Int[np.ndarray, "poses"], row: int, after: int
 ) -> tuple[Int[np.ndarray, "gap"], Float[np.ndarray, "gap 24 3"], Float[np.ndarray, "gap 3"]]:
     """Frame numbers, rotations and places between two rows."""
@@ -72,4 +72,4 @@ def _filled(
     places = motion.root_translations[row] + shares[:, None] * (
         motion.root_translations[after] - motion.root_translations[row]
     )
-    return new, between(first, last, shares), places
+    return new, slerp(first, last, shares), places

@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from capture.errors import BadInput
-from preprocess.capture_folder import poses_in
-from preprocess.content import read_content
+from capture.errors import InputError
+from preprocess.capture_folder import resolve_pose_path
+from preprocess.content import read_untrusted_file
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion
 from preprocess.poses import (
@@ -24,32 +24,32 @@ from preprocess.poses import (
     vibe,
     wham,
 )
-from preprocess.poses.bridge import LONGEST_GAP, bridged
-from preprocess.poses.track import People
-from preprocess.poses.unknown import described
+from preprocess.poses.bridge import MAX_GAP_FRAMES, fill_gaps
+from preprocess.poses.track import MotionByPerson
+from preprocess.poses.unknown import describe_unknown_content
 
-ADAPTERS: dict[str, Callable[[Any, bool], People | None]] = {
-    "PHALP (4D-Humans)": phalp.tracks,
-    "WHAM": wham.tracks,
-    "VIBE": vibe.tracks,
-    "GVHMR": gvhmr.tracks,
-    "PromptHMR": prompthmr.tracks,
-    "TRAM": tram.tracks,
-    "ROMP or BEV": romp.tracks,
-    "EasyMocap": easymocap.tracks,
-    "SLAHMR or 3DPW": slahmr.tracks,
-    "AMASS or AIST++": amass.tracks,
+TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
+    "PHALP (4D-Humans)": phalp.parse_people,
+    "WHAM": wham.parse_people,
+    "VIBE": vibe.parse_people,
+    "GVHMR": gvhmr.parse_people,
+    "PromptHMR": prompthmr.parse_people,
+    "TRAM": tram.parse_people,
+    "ROMP or BEV": romp.parse_people,
+    "EasyMocap": easymocap.parse_people,
+    "SLAHMR or 3DPW": slahmr.parse_people,
+    "AMASS or AIST++": amass.parse_people,
 }
 """Trackers by name, in the order in which they are asked whether a file is theirs."""
 
-REFUSED = (
+MALFORMED_FILE_ERRORS = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError,
 )  # fmt: skip
 """What adapters raise for a file that is nearly theirs: they read it as if it were whole."""
 
 
 def read_poses(
-    path: Path, *, default_model: str = "body24", person: str | None = None, driving: bool = False
+    path: Path, *, default_model: str = "body24", person: str | None = None, prefer_world: bool = False
 ) -> Motion:
     """Poses from a file, or a folder of files, of any tracker that is known (docs/formats.md).
 
@@ -64,69 +64,69 @@ def read_poses(
         driving: Whether they shall move an avatar: then in the world rather than in a camera.
 
     Raises:
-        BadInput: If there is no such file, it holds no poses that are known, or nobody of that
+        InputError: If there is no such file, it holds no poses that are known, or nobody of that
             name.
     """
-    path = poses_in(path)
+    path = resolve_pose_path(path)
     if path.suffix.lower() == ".jsonl":
         return read_motion(path, default_model=default_model)
-    content = read_content(path)
-    tool, people = _recognised(content, path, default_model, driving)
-    motion = _chosen(people, person, path)
+    content = read_untrusted_file(path)
+    tool, people = _recognize(content, path, default_model, prefer_world)
+    motion = _select_person(people, person, path)
     if tool is None:
         return motion
-    motion = bridged(motion)
+    motion = fill_gaps(motion)
     note = motion.note
-    if motion.bridged is not None:
+    if motion.interpolated is not None:
         said = (
-            f"{int(motion.bridged.sum())} poses that {tool} had lost were filled in between their "
-            f"neighbours (gaps of up to {LONGEST_GAP} frames)."
+            f"{int(motion.interpolated.sum())} poses that {tool} had lost were filled in between their "
+            f"neighbours (gaps of up to {MAX_GAP_FRAMES} frames)."
         )
         note = said if note is None else f"{note} {said}"
     return replace(motion, note=note)
 
 
-def _recognised(
+def _recognize(
     content: Any, path: Path, default_model: str, driving: bool
-) -> tuple[str | None, People]:
+) -> tuple[str | None, MotionByPerson]:
     """Whose file it is (None: in the house's own keys), and the people in it."""
-    for tool, tracks in ADAPTERS.items():
+    for tool, tracks in TRACKERS.items():
         try:
             people = tracks(content, driving)
-        except BadInput:
+        except InputError:
             raise
-        except REFUSED as cause:
-            raise BadInput(
+        except MALFORMED_FILE_ERRORS as cause:
+            raise InputError(
                 f"{path} looks like a file of {tool}, but what it holds cannot be used: "
                 f"{type(cause).__name__} {cause}. Is it complete?"
             ) from cause
         if people:
             return tool, people
-    people = native.tracks(content, path, default_model)
+    people = native.parse_people(content, path, default_model)
     if people is not None:
         return None, people
     try:
-        people = frames.tracks(content, path, default_model)
-    except BadInput:
+        people = frames.parse_people(content, path, default_model)
+    except InputError:
         raise
-    except REFUSED as cause:
-        raise BadInput(
+    except MALFORMED_FILE_ERRORS as cause:
+        raise InputError(
             f"{path} holds a pose a frame that do not fit together ({cause})."
         ) from cause
     if people is None:
-        raise BadInput(
-            f"{path} holds no poses that are known: {described(content)} Expected global_orient, "
-            f"body_pose and transl (or poses and trans), or a file of {', '.join(ADAPTERS)}; see "
+        raise InputError(
+            f"{path} holds no poses that are known: {describe_unknown_content(content)} Expected global_orient, "
+            f"body_pose and transl (or poses and trans), or a file of {', '.join(TRACKERS)}; see "
             "docs/formats.md."
         )
     return "its tracker", people
 
 
-def _chosen(people: People, person: str | None, path: Path) -> Motion:
+def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Motion:
     """The person that is wanted, or the one with most poses."""
     if person is not None and person not in people:
-        raise BadInput(
-            f"{path} holds nobody called {person!r} (--person); it holds {_named(people)}."
+        raise InputError(
+            f"{path} holds nobody called {person!r} (--person); it holds {_list_people(people)}."
         )
     name = person or max(people, key=lambda known: int(people[known].valid.sum()))
     motion = people[name]
@@ -135,11 +135,11 @@ def _chosen(people: People, person: str | None, path: Path) -> Motion:
     others = {known: held for known, held in people.items() if known != name}
     note = (
         f"{path.name} holds {len(people)} people; {name} was taken, who has most poses "
-        f"({int(motion.valid.sum())}). The others: {_named(others)}. --person ID takes another."
+        f"({int(motion.valid.sum())}). The others: {_list_people(others)}. --person ID takes another."
     )
     return replace(motion, note=note)
 
 
-def _named(people: People) -> str:
+def _list_people(people: MotionByPerson) -> str:
     listed = [f"{name} ({int(held.valid.sum())} poses)" for name, held in people.items()]
     return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "")

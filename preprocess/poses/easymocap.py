@@ -1,6 +1,6 @@
 """EasyMocap and ZJU-MoCap: a json a frame, and a rotation about the origin, not the pelvis.
 
-Layout: a folder of `000000.json` …, each a list of {id, Rh (1, 3), Th (1, 3), poses (1, 72) whose
+TableLayout: a folder of `000000.json` …, each a list of {id, Rh (1, 3), Th (1, 3), poses (1, 72) whose
 first three are 0 (or 63, 69, 87 numbers), shapes (1, 10)}, or {annots: that list}. ZJU-MoCap's
 `new_params/0.npy` hold one of these each. World: the calibrated cameras' (extri.yml).
 V = R(Rh) LBS(poses) + Th. (github.com/zju3dv/EasyMocap, easymocap/mytools/file_utils.py.)
@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.poses.names import numbers_of
-from preprocess.poses.track import People, stacked, track
+from preprocess.poses.names import frame_numbers_from_names
+from preprocess.poses.track import MotionByPerson, stack_rows, build_motion
 
-NEEDED = {"Rh", "Th", "poses"}
+REQUIRED_KEYS = {"Rh", "Th", "poses"}
 
 
-def tracks(content: Any, driving: bool = False) -> People | None:
+def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """The people of the folder; None if it is none of EasyMocap's."""
     files = content if isinstance(content, dict) else {"0": content}
-    if files.keys() >= NEEDED:
+    if files.keys() >= REQUIRED_KEYS:
         files = {"0": content}
     frames = {name: _people_of(held) for name, held in files.items()}
     if not frames or any(people is None for people in frames.values()):
         return None
     found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
-    for number, people in zip(numbers_of(frames), frames.values(), strict=True):
+    for number, people in zip(frame_numbers_from_names(frames), frames.values(), strict=True):
         for person in people or ():
             name = str(person.get("id", person.get("personID", 0)))
             found.setdefault(name, []).append((number, person))
@@ -38,7 +38,7 @@ def _people_of(held: Any) -> list[dict[str, Any]] | None:
         held = held["annots"]
     listed = [held] if isinstance(held, dict) else held
     if not isinstance(listed, list) or not all(
-        isinstance(person, dict) and person.keys() >= NEEDED for person in listed
+        isinstance(person, dict) and person.keys() >= REQUIRED_KEYS for person in listed
     ):
         return None
     return listed
@@ -46,10 +46,10 @@ def _people_of(held: Any) -> list[dict[str, Any]] | None:
 
 def _person(rows: list[tuple[int, dict[str, Any]]]) -> Any:
     people = [person for _, person in rows]
-    return track(
-        [stacked([np.reshape(p["Rh"], 3) for p in people]), stacked([_body(p) for p in people])],
-        stacked([np.reshape(p["Th"], 3) for p in people]),
-        betas=stacked([np.reshape(p["shapes"], -1)[:10] for p in people])
+    return build_motion(
+        [stack_rows([np.reshape(p["Rh"], 3) for p in people]), stack_rows([_body(p) for p in people])],
+        stack_rows([np.reshape(p["Th"], 3) for p in people]),
+        betas=stack_rows([np.reshape(p["shapes"], -1)[:10] for p in people])
         if all("shapes" in person for person in people)
         else None,
         frames=[number for number, _ in rows],

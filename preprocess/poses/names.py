@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 
 
-def numbers_of(names: Iterable[str]) -> list[int]:
+def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
     """The last number in each name; the place in order where a name has none, or two have one."""
     listed = list(names)
     found = [re.findall(r"\d+", name.rsplit(".", 1)[0].rsplit("/", 1)[-1]) for name in listed]

@@ -1,6 +1,6 @@
 """4D-Humans and PHALP: rotation matrices of everybody in each frame, in a camera of 5,000 px.
 
-Layout: a joblib file {picture: {time, tid, tracked_ids, tracked_time, size, camera, smpl, …}}; the
+TableLayout: a joblib file {picture: {time, tid, tracked_ids, tracked_time, size, camera, smpl, …}}; the
 lists run in parallel, `smpl[k]` = {global_orient (1, 3, 3), body_pose (23, 3, 3), betas (10,)},
 `camera[k]` = (3,), metres for a focal length of 5,000 px on a padded square of 256 px. A track that
 was not detected in a frame is in its lists as a guess: `tracked_time[k]` > 0.
@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from preprocess.pose import Lens
-from preprocess.poses.track import People, stacked, track
+from preprocess.pose import RelativeFocalLength
+from preprocess.poses.track import MotionByPerson, stack_rows, build_motion
 
-LENS = Lens(share=5000.0 / 256.0)
+PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
 
 
-def tracks(content: Any, driving: bool = False) -> People | None:
+def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """The people of the file; None if it is none of PHALP's."""
     if not isinstance(content, dict) or not content:
         return None
@@ -37,13 +37,13 @@ def tracks(content: Any, driving: bool = False) -> People | None:
 
 def _person(rows: list[tuple[int, Any, Any]]) -> Any:
     poses = [smpl for _, smpl, _ in rows]
-    return track(
+    return build_motion(
         [
-            stacked([np.reshape(pose["global_orient"], (1, 3, 3)) for pose in poses]),
-            stacked([np.reshape(pose["body_pose"], (-1, 3, 3)) for pose in poses]),
+            stack_rows([np.reshape(pose["global_orient"], (1, 3, 3)) for pose in poses]),
+            stack_rows([np.reshape(pose["body_pose"], (-1, 3, 3)) for pose in poses]),
         ],
-        stacked([np.reshape(camera, 3) for _, _, camera in rows]),
-        betas=stacked([np.reshape(pose["betas"], -1) for pose in poses]),
+        stack_rows([np.reshape(camera, 3) for _, _, camera in rows]),
+        betas=stack_rows([np.reshape(pose["betas"], -1) for pose in poses]),
         frames=[number for number, _, _ in rows],
-        lens=LENS,
+        assumed_focal=PHALP_FOCAL,
     )

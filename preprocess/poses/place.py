@@ -11,19 +11,19 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from preprocess.body import ShapedBody
-from preprocess.camera_file import CameraTrack, tracker_intrinsic
+from preprocess.camera_file import CameraTrack, tracker_intrinsic_matrix
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import Motion
-from preprocess.rotations import axis_angles
+from preprocess.rotations import axis_angles_from_matrices
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
 """Where SMPL-X's neutral mean shape has its pelvis at rest, metres (its joint regressor's)."""
 
-SAME_FOCAL = 0.01
+FOCAL_TOLERANCE = 0.01
 """Focal lengths and principal points nearer than this share are one."""
 
 
-def placed(
+def place_in_camera_world(
     motion: Motion, shaped: ShapedBody, cameras: CameraTrack, *, cameras_given: bool
 ) -> Motion:
     """The motion as SMPL's: about the body's pelvis, in the world of the cameras.
@@ -34,29 +34,29 @@ def placed(
         cameras: Of the frames' size.
         cameras_given: Whether the user gave them; if not, a file's own cameras count.
     """
-    motion = about_pelvis(motion, shaped.joints)
+    motion = anchor_at_pelvis(motion, shaped.joints)
     if motion.space == "camera":
-        motion = _refocused(motion, shaped, cameras[0])
-        if cameras.moves or not np.allclose(cameras[0].camera_from_world, np.eye(4)):
+        motion = _refocus_motion(motion, shaped, cameras[0])
+        if cameras.is_moving or not np.allclose(cameras[0].camera_from_world, np.eye(4)):
             worlds = [
                 _rigid_inverse(_camera_of(motion, row, cameras)) for row in range(len(motion))
             ]
-            motion = moved(motion, np.stack(worlds), shaped.joints[0])
+            motion = transform_motion(motion, np.stack(worlds), shaped.joints[0])
         return replace(motion, space="world")
     if motion.camera_from_world is not None and not cameras_given:
-        moved_in = moved(motion, motion.camera_from_world, shaped.joints[0])
+        moved_in = transform_motion(motion, motion.camera_from_world, shaped.joints[0])
         return replace(moved_in, camera_from_world=None)
     return motion
 
 
-def about_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motion:
+def anchor_at_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motion:
     """The same poses with `root_translations` as SMPL has them, for a body's rest joints.
 
     world = R (x - a) + t is R (x - J0) + J0 + t' with t' = t + R (J0 - a) - J0.
     """
     pelvis = joints[0]
     if motion.anchor == "pelvis":
-        if motion.model != "smplx":
+        if motion.body_model != "smplx":
             return motion
         shifted = motion.root_translations + (SMPLX_PELVIS - pelvis)
         return replace(motion, root_translations=shifted)
@@ -69,7 +69,7 @@ def about_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motion:
     )
 
 
-def moved(
+def transform_motion(
     motion: Motion, a_from_b: Float[np.ndarray, "poses 4 4"], pelvis: Float[np.ndarray, "3"]
 ) -> Motion:
     """The same poses in another world, x' = A x + b a row: t' = A (J0 + t) + b - J0."""
@@ -77,12 +77,12 @@ def moved(
     at = np.einsum("nab,nb->na", turn, pelvis + motion.root_translations) + shift
     return replace(
         motion,
-        root_rotations=axis_angles(turn @ rotation_matrices(motion.root_rotations)),
+        root_rotations=axis_angles_from_matrices(turn @ rotation_matrices(motion.root_rotations)),
         root_translations=at - pelvis,
     )
 
 
-def refocused(
+def refocus_translation(
     joints: Float[np.ndarray, "24 3"],
     intrinsic: Float[np.ndarray, "3 3"],
     camera: Camera,
@@ -108,22 +108,22 @@ def refocused(
     return solved - middle
 
 
-def _refocused(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motion:
+def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motion:
     """The motion as the true camera sees it, if the tracker took another focal length."""
-    intrinsic = tracker_intrinsic(motion, camera.size_px)
-    if intrinsic is None or _same(intrinsic, camera):
+    intrinsic = tracker_intrinsic_matrix(motion, camera.size_px)
+    if intrinsic is None or _same_intrinsics(intrinsic, camera):
         return motion
     shifted = motion.root_translations.copy()
     for row in np.flatnonzero(motion.valid):
         joints = shaped.with_pose(motion[int(row)]).joints()
         if (joints[:, 2] > 0.0).all():
-            shifted[row] += refocused(joints, intrinsic, camera)
+            shifted[row] += refocus_translation(joints, intrinsic, camera)
     return replace(motion, root_translations=shifted)
 
 
-def _same(intrinsic: Float[np.ndarray, "3 3"], camera: Camera) -> bool:
+def _same_intrinsics(intrinsic: Float[np.ndarray, "3 3"], camera: Camera) -> bool:
     off = np.abs(intrinsic - camera.intrinsic)[:2]
-    return bool((off <= SAME_FOCAL * max(camera.focal_px)).all())
+    return bool((off <= FOCAL_TOLERANCE * max(camera.focal_px)).all())
 
 
 def _camera_of(motion: Motion, row: int, cameras: CameraTrack) -> Float[np.ndarray, "4 4"]:

@@ -1,6 +1,6 @@
 """ROMP and BEV (simple-romp): all people of each frame, with or without tracks.
 
-Layout: `video_results.npz` with `results` {picture: {smpl_thetas (P, 72), smpl_betas (P, 10 or 11),
+TableLayout: `video_results.npz` with `results` {picture: {smpl_thetas (P, 72), smpl_betas (P, 10 or 11),
 cam (P, 3), cam_trans (P, 3), pj2d, pj2d_org, …}} and, tracked with -t, `sequence_results` {track:
 {frame_id: […], smpl_thetas: […], …}}; or a folder of one .npz a frame, each with its `results`.
 (github.com/Arthur151/ROMP, simple_romp: romp/main.py, bev/main.py, romp/utils.py.)
@@ -11,27 +11,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.pose import Lens
-from preprocess.poses.names import numbers_of
-from preprocess.poses.track import People, stacked, track
+from preprocess.pose import RelativeFocalLength
+from preprocess.poses.names import frame_numbers_from_names
+from preprocess.poses.track import MotionByPerson, stack_rows, build_motion
 
-FOV_60 = Lens(share=443.4 / 512.0)
+PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
 """The camera of their perspective fit: 60 degrees over the padded square."""
 
-WEAK = Lens(share=1.0)
+WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
 """The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 
-WHOLE = "video_results.npz"
+VIDEO_RESULTS = "video_results.npz"
 
-JUMP_M = 1.0
+MAX_STEP_M = 1.0
 """From frame to frame nobody is expected to move farther; without track numbers that tells."""
 
 
-def tracks(content: Any, driving: bool = False) -> People | None:
+def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """The people of the file; None if it is none of ROMP's."""
     if not isinstance(content, dict):
         return None
-    content = content.get(WHOLE, content)  # a folder with everything in it
+    content = content.get(VIDEO_RESULTS, content)  # a folder with everything in it
     sequence = content.get("sequence_results")
     if isinstance(sequence, dict) and sequence:
         return {
@@ -41,12 +41,12 @@ def tracks(content: Any, driving: bool = False) -> People | None:
         }
     results = content.get("results")
     if isinstance(results, dict) and "smpl_thetas" in results:
-        return _linked([results], [0])
+        return _link_people([results], [0])
     if isinstance(results, dict) and results:
-        return _linked(list(results.values()), range(len(results)))
+        return _link_people(list(results.values()), range(len(results)))
     if content and all(_is_frame(part) for part in content.values()):
         frames = [part["results"] for part in content.values()]
-        return _linked(frames, numbers_of(content))
+        return _link_people(frames, frame_numbers_from_names(content))
     return None
 
 
@@ -56,23 +56,23 @@ def _is_frame(part: Any) -> bool:
 
 
 def _person(rows: dict[str, Any], frames: Any) -> Any:
-    thetas, places = stacked(list(rows["smpl_thetas"])), stacked(list(rows["cam_trans"]))
-    betas = stacked(list(rows["smpl_betas"]))
+    thetas, places = stack_rows(list(rows["smpl_thetas"])), stack_rows(list(rows["cam_trans"]))
+    betas = stack_rows(list(rows["smpl_betas"]))
     is_bev = betas.shape[-1] == 11
-    lens = FOV_60
+    lens = PERSPECTIVE_FOCAL
     if not is_bev and "cam" in rows:
-        scales = stacked(list(rows["cam"]))[:, 0]
+        scales = stack_rows(list(rows["cam"]))[:, 0]
         if np.allclose(places[:, 2] * scales, 2.0, rtol=1e-3):
-            lens = WEAK
-    return track(
-        [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
+            lens = WEAK_PERSPECTIVE_FOCAL
+    return build_motion(
+        [thetas], places, betas=betas[:, :10], frames=frames, assumed_focal=lens,
         lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed
         anchor="hips" if is_bev else "pelvis",
     )  # fmt: skip
 
 
-def _linked(frames: list[dict[str, Any]], numbers: Any) -> People:
-    """People of each frame joined with those of the frames before: by number, else by place."""
+def _link_people(frames: list[dict[str, Any]], numbers: Any) -> MotionByPerson:
+    """MotionByPerson of each frame joined with those of the frames before: by number, else by place."""
     people: dict[str, dict[str, Any]] = {}
     last: dict[str, Float[np.ndarray, 3]] = {}
     for number, frame in zip(numbers, frames, strict=True):
@@ -83,7 +83,7 @@ def _linked(frames: list[dict[str, Any]], numbers: Any) -> People:
             if names is not None:
                 name = str(int(np.asarray(names).reshape(-1)[row]))
             else:
-                name = _nearest(place, last, taken) or str(len(people))
+                name = _nearest_person(place, last, taken) or str(len(people))
             taken.add(name)
             person = people.setdefault(name, {"frame_id": []})
             person["frame_id"].append(number)
@@ -94,7 +94,7 @@ def _linked(frames: list[dict[str, Any]], numbers: Any) -> People:
     return {name: _person(rows, rows["frame_id"]) for name, rows in people.items()}
 
 
-def _nearest(
+def _nearest_person(
     place: Float[np.ndarray, "3"], last: dict[str, Float[np.ndarray, "3"]], taken: set[str]
 ) -> str | None:
     """Who was nearest before; depth counts a third, for it is the least certain."""
@@ -104,4 +104,4 @@ def _nearest(
         if name not in taken
     }
     name = min(gaps, key=lambda known: gaps[known], default=None)
-    return name if name is not None and gaps[name] < JUMP_M else None
+    return name if name is not None and gaps[name] < MAX_STEP_M else None

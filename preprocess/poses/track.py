@@ -5,26 +5,26 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from preprocess.pose import Anchor, Lens, Motion, Space
-from preprocess.rotations import joint_rotations
+from preprocess.pose import RootAnchor, RelativeFocalLength, Motion, PoseSpace
+from preprocess.rotations import stack_axis_angles
 
-People = dict[str, Motion]
+MotionByPerson = dict[str, Motion]
 """By the name that the file gives each, in the file's order."""
 
 
-def track(
+def build_motion(
     rotations: list[Any],
-    places: Any,
+    translations: Any,
     *,
     betas: Any = None,
     frames: Any = None,
     times_s: Float[np.ndarray, "poses"] | None = None,
     lost: Any = None,
-    model: str = "smpl",
-    space: Space = "camera",
-    anchor: Anchor = "pelvis",
+    body_model: str = "smpl",
+    space: PoseSpace = "camera",
+    anchor: RootAnchor = "pelvis",
     intrinsic: Any = None,
-    lens: Lens | None = None,
+    assumed_focal: RelativeFocalLength | None = None,
     note: str | None = None,
 ) -> Motion:
     """Poses of one person, rows in the order of their frames.
@@ -41,8 +41,8 @@ def track(
     Raises:
         ValueError: If the parts do not fit together.
     """
-    turned = joint_rotations(rotations)
-    placed = np.asarray(places, dtype=np.float64).reshape(len(turned), 3)
+    turned = stack_axis_angles(rotations)
+    placed = np.asarray(translations, dtype=np.float64).reshape(len(turned), 3)
     order = np.arange(len(turned))
     if frames is not None:
         frames, order = np.unique(_numbers(frames, len(turned)), return_index=True)
@@ -58,19 +58,19 @@ def track(
         root_translations=placed,
         joint_rotations=turned[:, 1:],
         valid=valid,
-        betas=_shape(betas),
-        model=model,
+        betas=_median_betas(betas),
+        body_model=body_model,
         frames=frames,
         times_s=None if times_s is None else times_s[order],
-        intrinsic=_camera(intrinsic),
-        lens=lens,
+        intrinsic=_median_intrinsic(intrinsic),
+        assumed_focal=assumed_focal,
         anchor=anchor,
         space=space,
         note=note,
     )
 
 
-def stacked(rows: list[Any]) -> Float[np.ndarray, "poses *rest"]:
+def stack_rows(rows: list[Any]) -> Float[np.ndarray, "poses *rest"]:
     """One array of a list of arrays of one shape.
 
     Raises:
@@ -86,7 +86,7 @@ def _numbers(frames: Any, count: int) -> Int[np.ndarray, "poses"]:
     return np.round(numbers).astype(np.int64)
 
 
-def _shape(betas: Any) -> Float[np.ndarray, "betas"]:
+def _median_betas(betas: Any) -> Float[np.ndarray, "betas"]:
     if betas is None:
         return np.zeros(0)
     rows = np.asarray(betas, dtype=np.float64)
@@ -95,7 +95,7 @@ def _shape(betas: Any) -> Float[np.ndarray, "betas"]:
     return np.median(rows, axis=0) if len(rows) else np.zeros(0)
 
 
-def _camera(intrinsic: Any) -> Float[np.ndarray, "3 3"] | None:
+def _median_intrinsic(intrinsic: Any) -> Float[np.ndarray, "3 3"] | None:
     if intrinsic is None:
         return None
     matrix = np.asarray(intrinsic, dtype=np.float64)

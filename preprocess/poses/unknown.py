@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-BY_KEYS = (
+ADVICE_BY_KEYS = (
     (
         {"mhr_model_params", "shape_params", "body_pose_params"},
         "it is SAM 3D Body's, whose poses move another body (MHR); bring them to SMPL first "
@@ -27,7 +27,7 @@ BY_KEYS = (
 )
 """Keys of which one is enough, and what is to be said then."""
 
-BY_NUMBERS = {
+ADVICE_BY_ROW_SIZE = {
     322: "(N, 322) is Motion-X's: write root_orient = [:, :3], pose_body = [:, 3:66] and trans = "
     "[:, 309:312] to an .npz.",
     263: "(N, 263) is HumanML3D's, which has no rotations of SMPL.",
@@ -37,13 +37,13 @@ BY_NUMBERS = {
 """Arrays by how many numbers a row has."""
 
 
-def described(content: Any) -> str:
+def describe_unknown_content(content: Any) -> str:
     """What a file holds, and what could be done about it; a sentence."""
     if isinstance(content, np.ndarray):
-        known = BY_NUMBERS.get(content.shape[-1]) if content.ndim == 2 else None
+        known = ADVICE_BY_ROW_SIZE.get(content.shape[-1]) if content.ndim == 2 else None
         return known or f"it is an array of the shape {content.shape}."
     keys = _keys(content)
-    for some, words in BY_KEYS:
+    for some, words in ADVICE_BY_KEYS:
         if some & set(keys):
             return words
     if isinstance(content, dict):
@@ -60,7 +60,7 @@ def _keys(content: Any) -> list[str]:
         return []
     keys = [str(key) for key in content]
     first = next(iter(content.values()), None)
-    known = {key for some, _ in BY_KEYS for key in some}
+    known = {key for some, _ in ADVICE_BY_KEYS for key in some}
     return _keys(first) if isinstance(first, dict) and not known & set(keys) and (
         known & set(_keys(first))
     ) else keys  # fmt: skip

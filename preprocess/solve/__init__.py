@@ -1,3 +1,3 @@
 """Where a moving camera stood: solved from its pictures alone, checked, and made metric."""
 
-from preprocess.solve.solved import Solved as Solved
+from preprocess.solve.solved import CameraSolution as CameraSolution

@@ -5,23 +5,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from preprocess.solve.model import Model
+from preprocess.solve.model import SparseModel
 
-MOST_TILT_DEG = 20.0
-"""Between the floor's normal and the first guess of up."""
-NEAR = 0.01
+MAX_TILT_DEG = 20.0
+"""ResectionResult the floor's normal and the first guess of up."""
+PLANE_TOLERANCE = 0.01
 """Points this near belong to a plane; in median distances of points from cameras."""
-LEAST_POINTS = 40
-LEAST_SHARE = 0.05
+MIN_POINTS = 40
+MIN_INLIER_FRACTION = 0.05
 """Of the points below the cameras that the floor must hold."""
-MOST_BELOW = 0.05
+MAX_FRACTION_BELOW = 0.05
 """Of the points, how many may lie below a floor."""
-TRIES = 2000
-LEAST_VIEWS = 3
+RANSAC_ITERATIONS = 2000
+MIN_VIEWS = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Floor:
+class FloorPlane:
     """A plane: normal · x + offset = 0, the normal pointing up to the cameras.
 
     Attributes:
@@ -34,18 +34,18 @@ class Floor:
     offset: float
     points: int
 
-    def heights(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places"]:
+    def heights_above(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places"]:
         """How far above it places are."""
         return places @ self.normal + self.offset
 
 
-def up_of_cameras(model: Model) -> Float[np.ndarray, "3"]:
+def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
     """Up as the cameras hold their pictures: minus the mean of their y axes."""
     up = -model.camera_from_world[:, 1, :3].mean(axis=0)
     return up / np.linalg.norm(up)
 
 
-def find_floor(model: Model, up: Float[np.ndarray, "3"], seed: int = 0) -> Floor | None:
+def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"], seed: int = 0) -> FloorPlane | None:
     """The largest plane below the cameras that is nearly level and has next to nothing below it.
 
     RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over what is near.
@@ -55,31 +55,31 @@ def find_floor(model: Model, up: Float[np.ndarray, "3"], seed: int = 0) -> Floor
         up: A first guess.
         seed: Of the draws.
     """
-    views = np.bincount(model.seen_point, minlength=len(model.points))
-    points = model.points[views >= LEAST_VIEWS]
-    centers = model.centers()
-    distance = np.linalg.norm(model.points[model.seen_point] - centers[model.seen_by], axis=1)
+    views = np.bincount(model.observation_point, minlength=len(model.points))
+    points = model.points[views >= MIN_VIEWS]
+    centers = model.camera_centers()
+    distance = np.linalg.norm(model.points[model.observation_point] - centers[model.observation_camera], axis=1)
     if not len(points):
         return None
-    near = NEAR * float(np.median(distance))
+    near = PLANE_TOLERANCE * float(np.median(distance))
     lowest = float((centers @ up).min())
     points = points[points @ up < lowest]
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     rng = np.random.default_rng(seed)
-    best, most = None, max(LEAST_POINTS, LEAST_SHARE * len(points))
-    for _ in range(TRIES):
-        plane = _through(points[rng.choice(len(points), 3, replace=False)], up)
+    best, most = None, max(MIN_POINTS, MIN_INLIER_FRACTION * len(points))
+    for _ in range(RANSAC_ITERATIONS):
+        plane = _plane_through(points[rng.choice(len(points), 3, replace=False)], up)
         if plane is None:
             continue
         heights = points @ plane[0] + plane[1]
         inside = np.abs(heights) < near
-        if inside.sum() > most and (heights < -3.0 * near).mean() < MOST_BELOW:
+        if inside.sum() > most and (heights < -3.0 * near).mean() < MAX_FRACTION_BELOW:
             best, most = inside, float(inside.sum())
-    return None if best is None else _refined(points, best, up, near)
+    return None if best is None else _refine_plane(points, best, up, near)
 
 
-def _through(
+def _plane_through(
     three: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "3"], float] | None:
     """The plane through three points, if it is nearly level."""
@@ -88,17 +88,17 @@ def _through(
     if length < 1e-12:
         return None
     normal = normal / length * (1.0 if normal @ up > 0.0 else -1.0)
-    if normal @ up < np.cos(np.radians(MOST_TILT_DEG)):
+    if normal @ up < np.cos(np.radians(MAX_TILT_DEG)):
         return None
     return normal, -float(normal @ three[0])
 
 
-def _refined(
+def _refine_plane(
     points: Float[np.ndarray, "points 3"],
     inside: Bool[np.ndarray, "points"],
     up: Float[np.ndarray, "3"],
     near: float,
-) -> Floor:
+) -> FloorPlane:
     """Least squares over the points of the plane, three times."""
     normal, offset = up, 0.0
     for _ in range(3):
@@ -107,4 +107,4 @@ def _refined(
         normal = normal if normal @ up > 0.0 else -normal
         offset = -float(normal @ middle)
         inside = np.abs(points @ normal + offset) < near
-    return Floor(normal=normal, offset=offset, points=int(inside.sum()))
+    return FloorPlane(normal=normal, offset=offset, points=int(inside.sum()))

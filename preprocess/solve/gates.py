@@ -11,24 +11,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from preprocess.solve.model import Model
+from preprocess.solve.model import SparseModel
 
-LEAST_REGISTERED = 0.9
-MOST_REPROJECTION_PX = 0.6
-LEAST_OBSERVATIONS = 0.4
+MIN_REGISTERED_FRACTION = 0.9
+MAX_REPROJECTION_PX = 0.6
+MIN_OBSERVATION_RATIO = 0.4
 """Of the median camera's; a camera with fewer may have been placed by a few wrong matches."""
 FOCAL_RANGE = (0.5, 2.0)
-LEAST_ANGLE_DEG = 1.0
+MIN_TRIANGULATION_ANGLE_DEG = 1.0
 """Under which the median point is seen from different places; depth is a guess below it."""
-LEAST_POINTS = 60
+MIN_SPARSE_POINTS = 60
 JUMP_SIGMAS, JUMP_DEG = 6.0, 1.0
 """How far a rotation may be off the mean of its neighbours'."""
-MOST_APART, MOST_TURNED_DEG = 0.01, 1.0
+MAX_MODEL_DISTANCE, MAX_MODEL_ROTATION_DEG = 0.01, 1.0
 """How far two mappers' cameras may differ: in lengths of the path, and by rotation."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate:
+class QualityGate:
     """One figure and its bound.
 
     Attributes:
@@ -43,17 +43,17 @@ class Gate:
     value: float
     bound: float
     passed: bool
-    words: str
+    failure_reason: str
 
 
-def doubtful(model: Model) -> Bool[np.ndarray, "cameras"]:
+def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
     """Cameras that see too few points, or turn unlike their neighbours; better placed otherwise."""
-    counts = np.bincount(model.seen_by, minlength=len(model.frames))
-    few = counts < LEAST_OBSERVATIONS * np.median(counts)
-    return few | _jumps(model)
+    counts = np.bincount(model.observation_camera, minlength=len(model.frames))
+    few = counts < MIN_OBSERVATION_RATIO * np.median(counts)
+    return few | _rotation_jumps(model)
 
 
-def judged(model: Model, keys: int) -> list[Gate]:
+def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     """Every gate that one model can pass by itself.
 
     Args:
@@ -61,38 +61,38 @@ def judged(model: Model, keys: int) -> list[Gate]:
         keys: How many key frames there were.
     """
     registered = len(model.frames) / keys
-    residual = float(np.mean(model.residuals())) if len(model.pixels) else np.inf
+    residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
     angle = _median_angle(model)
     return [
-        Gate(
-            name="registered", value=registered, bound=LEAST_REGISTERED,
-            passed=registered >= LEAST_REGISTERED,
-            words=f"only {len(model.frames)} of {keys} key frames could be placed with certainty",
+        QualityGate(
+            name="registered", value=registered, bound=MIN_REGISTERED_FRACTION,
+            passed=registered >= MIN_REGISTERED_FRACTION,
+            failure_reason=f"only {len(model.frames)} of {keys} key frames could be placed with certainty",
         ),
-        Gate(
-            name="points", value=float(len(model.points)), bound=float(LEAST_POINTS),
-            passed=len(model.points) >= LEAST_POINTS,
-            words=f"only {len(model.points)} points of the surroundings were found",
+        QualityGate(
+            name="points", value=float(len(model.points)), bound=float(MIN_SPARSE_POINTS),
+            passed=len(model.points) >= MIN_SPARSE_POINTS,
+            failure_reason=f"only {len(model.points)} points of the surroundings were found",
         ),
-        Gate(
-            name="reprojection_px", value=residual, bound=MOST_REPROJECTION_PX,
-            passed=residual < MOST_REPROJECTION_PX,
-            words=f"points are seen {residual:.2f} px beside where they should be",
+        QualityGate(
+            name="reprojection_px", value=residual, bound=MAX_REPROJECTION_PX,
+            passed=residual < MAX_REPROJECTION_PX,
+            failure_reason=f"points are seen {residual:.2f} px beside where they should be",
         ),
-        Gate(
+        QualityGate(
             name="focal", value=focal, bound=FOCAL_RANGE[0],
             passed=FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1],
-            words=f"the focal length came out as {focal:.2f} times the longer side",
+            failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),
-        Gate(
-            name="angle_deg", value=angle, bound=LEAST_ANGLE_DEG, passed=angle >= LEAST_ANGLE_DEG,
-            words=f"the camera hardly changes its place (points are seen under {angle:.1f}°)",
+        QualityGate(
+            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG, passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
+            failure_reason=f"the camera hardly changes its place (points are seen under {angle:.1f}°)",
         ),
     ]  # fmt: skip
 
 
-def agreement(one: Model, other: Model) -> Gate:
+def compare_models(one: SparseModel, other: SparseModel) -> QualityGate:
     """Whether two models are the same but for size and place.
 
     Their common cameras' centres, aligned by a similarity, in lengths of the camera's path; and the
@@ -101,23 +101,23 @@ def agreement(one: Model, other: Model) -> Gate:
     common, here, there = np.intersect1d(one.frames, other.frames, return_indices=True)
     words = "the two ways of solving contradict each other"
     if len(common) < 3:
-        return Gate(name="agreement", value=np.inf, bound=MOST_APART, passed=False, words=words)
-    a, b = one.centers()[here], other.centers()[there]
-    scale, turn, shift = similarity(b, a)
+        return QualityGate(name="agreement", value=np.inf, bound=MAX_MODEL_DISTANCE, passed=False, failure_reason=words)
+    a, b = one.camera_centers()[here], other.camera_centers()[there]
+    scale, turn, shift = fit_similarity(b, a)
     path = float(np.linalg.norm(np.diff(a, axis=0), axis=1).sum())
     apart = float(np.sqrt(((scale * b @ turn.T + shift - a) ** 2).sum(axis=1).mean()))
     apart = apart / max(path, 1e-12)
     views = one.camera_from_world[here, :3, :3] @ turn
-    angles = _angles(views, other.camera_from_world[there, :3, :3])
+    angles = _rotation_angles_deg(views, other.camera_from_world[there, :3, :3])
     share = len(common) / max(len(one.frames), len(other.frames))
-    passed = apart < MOST_APART and angles.max() < MOST_TURNED_DEG and share >= LEAST_REGISTERED
-    return Gate(
-        name="agreement", value=apart, bound=MOST_APART, passed=bool(passed),
-        words=f"{words} by {100.0 * apart:.1f} % of the path and {angles.max():.1f} degrees",
+    passed = apart < MAX_MODEL_DISTANCE and angles.max() < MAX_MODEL_ROTATION_DEG and share >= MIN_REGISTERED_FRACTION
+    return QualityGate(
+        name="agreement", value=apart, bound=MAX_MODEL_DISTANCE, passed=bool(passed),
+        failure_reason=f"{words} by {100.0 * apart:.1f} % of the path and {angles.max():.1f} degrees",
     )  # fmt: skip
 
 
-def similarity(
+def fit_similarity(
     source: Float[np.ndarray, "points 3"], target: Float[np.ndarray, "points 3"]
 ) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """Scale, rotation and shift that carry points nearest to others (Umeyama 1991, eq. 40-42)."""
@@ -129,7 +129,7 @@ def similarity(
     return scale, turn, target.mean(axis=0) - scale * turn @ source.mean(axis=0)
 
 
-def _jumps(model: Model) -> Bool[np.ndarray, "cameras"]:
+def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
     """Cameras whose rotation is far off what their neighbours' would be in between."""
     count = len(model.frames)
     jumps = np.zeros(count, dtype=bool)
@@ -148,26 +148,26 @@ def _jumps(model: Model) -> Bool[np.ndarray, "cameras"]:
     return jumps
 
 
-def _median_angle(model: Model) -> float:
+def _median_angle(model: SparseModel) -> float:
     """The median over points of the widest angle under which two cameras see one, in degrees.
 
     The widest of the first with all others: at least half of the true one.
     """
     if not len(model.pixels):
         return 0.0
-    rays = model.points[model.seen_point] - model.centers()[model.seen_by]
+    rays = model.points[model.observation_point] - model.camera_centers()[model.observation_camera]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     first = np.full(len(model.points), -1)
     order = np.arange(len(rays))[::-1]
-    first[model.seen_point[order]] = order
+    first[model.observation_point[order]] = order
     cosine = (rays * rays[first[model.seen_point]]).sum(axis=1)
     least = np.ones(len(model.points))
-    np.minimum.at(least, model.seen_point, cosine)
+    np.minimum.at(least, model.observation_point, cosine)
     seen = first >= 0
     return float(np.degrees(np.arccos(np.clip(np.median(least[seen]), -1.0, 1.0))))
 
 
-def _angles(
+def _rotation_angles_deg(
     a: Float[np.ndarray, "cameras 3 3"], b: Float[np.ndarray, "cameras 3 3"]
 ) -> Float[np.ndarray, "cameras"]:
     """Angles between rotations, in degrees."""

@@ -8,26 +8,26 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from capture.images import list_images
-from capture.source import Source
+from capture.source import FrameSource
 
-MOST_KEYS, ENOUGH_KEYS, APART = 60, 24, 4
+MAX_KEYFRAMES, MIN_TARGET_KEYFRAMES, MIN_KEYFRAME_SPACING = 60, 24, 4
 """Key frames at most; how many are always chosen, if there are so many frames; and of more only one
 in so many: frames between are placed as well as key frames, for a tenth of the time."""
-LEAST_KEYS = 8
-WORK_PX = 960
+MIN_KEYFRAMES = 8
+FEATURE_IMAGE_PX = 960
 """Longer side of the pictures in which features are looked for."""
-MARGIN = 0.015
+PERSON_MARGIN = 0.015
 """How far round the person nothing is looked at, in widths of the picture."""
 
-PersonIn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
+PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
 """Where the person is in a frame, in pixels of another size; None if nobody knows."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KeyFrame:
+class SfmKeyframe:
     """One picture that is solved by features.
 
     Attributes:
@@ -37,17 +37,17 @@ class KeyFrame:
     """
 
     index: int
-    grey: UInt8[np.ndarray, "height width"]
-    person: Bool[np.ndarray, "height width"]
+    gray: UInt8[np.ndarray, "height width"]
+    person_mask: Bool[np.ndarray, "height width"]
 
 
-def work_size(size_px: tuple[int, int]) -> tuple[int, int]:
+def feature_image_size(size_px: tuple[int, int]) -> tuple[int, int]:
     """The size in which pictures are worked on: that of the frames, at most `WORK_PX`."""
-    scale = min(1.0, WORK_PX / max(size_px))
+    scale = min(1.0, FEATURE_IMAGE_PX / max(size_px))
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
-def grey_of(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+def to_grayscale(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
     """A frame's brightness in the size that is worked in."""
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     if frame.size_px == size_px:
@@ -55,12 +55,12 @@ def grey_of(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height
     return cv2.resize(grey, size_px, interpolation=cv2.INTER_AREA)
 
 
-def choose(
-    source: Source, person_in: PersonIn, told: Callable[[float], None], most: int = MOST_KEYS
-) -> Iterator[KeyFrame]:
+def select_keyframes(
+    source: FrameSource, person_in: PersonMaskFn, report_progress: Callable[[float], None], max_keyframes: int = MAX_KEYFRAMES
+) -> Iterator[SfmKeyframe]:
     """The sharpest frame of each of some equal stretches of the video, in order.
 
-    Sharpness is the variance of the picture's Laplacian.
+    SharpnessScore is the variance of the picture's Laplacian.
 
     Args:
         source: The frames.
@@ -69,13 +69,13 @@ def choose(
         most: Key frames at most.
     """
     total = source.frame_count or source.frames_in_file
-    stretches = min(most, total, max(ENOUGH_KEYS, total // APART))
-    size_px = work_size(source.size_px)
-    best: tuple[float, KeyFrame] | None = None
+    stretches = min(max_keyframes, total, max(MIN_TARGET_KEYFRAMES, total // MIN_KEYFRAME_SPACING))
+    size_px = feature_image_size(source.size_px)
+    best: tuple[float, SfmKeyframe] | None = None
     at = 0
     for frame in source.frames():
         place = source.selection.position(frame.index)
-        told(min((place + 1) / total, 1.0))
+        report_progress(min((place + 1) / total, 1.0))
         stretch = min(place * stretches // total, stretches - 1)
         if stretch > at and best is not None:
             yield best[1]
@@ -83,51 +83,51 @@ def choose(
         at = max(at, stretch)
         if "corrupt" in frame.flags:
             continue
-        grey = grey_of(frame, size_px)
+        grey = to_grayscale(frame, size_px)
         sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         if best is not None and sharpness <= best[0]:
             continue
         person = person_in(frame, size_px)
         if person is not None:
-            best = sharpness, KeyFrame(index=frame.index, grey=grey, person=grown(person))
+            best = sharpness, SfmKeyframe(index=frame.index, gray=grey, person_mask=dilate_person(person))
     if best is not None:
         yield best[1]
 
 
-def grown(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def dilate_person(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """The person with a margin all round."""
-    side = 2 * max(1, round(MARGIN * max(person.shape))) + 1
+    side = 2 * max(1, round(PERSON_MARGIN * max(person.shape))) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return cv2.dilate(person.astype(np.uint8), disc) > 0
 
 
-def write_keys(keys: Iterator[KeyFrame], images: Path, masks: Path) -> list[KeyFrame]:
+def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> list[SfmKeyframe]:
     """Writes pictures and masks (0 where nothing is looked at), named by the frames' numbers.
 
     Raises:
-        BadInput: If there are too few.
+        InputError: If there are too few.
     """
     images.mkdir(parents=True)
     masks.mkdir(parents=True)
     kept = []
     for key in keys:
         name = f"{key.index:06d}.png"
-        cv2.imwrite(str(images / name), key.grey)
-        cv2.imwrite(str(masks / f"{name}.png"), np.where(key.person, 0, 255).astype(np.uint8))
+        cv2.imwrite(str(images / name), key.gray)
+        cv2.imwrite(str(masks / f"{name}.png"), np.where(key.person_mask, 0, 255).astype(np.uint8))
         kept.append(key)
-    if len(kept) < LEAST_KEYS:
-        raise BadInput(
-            f"Only {len(kept)} frames can be used to solve cameras; at least {LEAST_KEYS} sharp "
+    if len(kept) < MIN_KEYFRAMES:
+        raise InputError(
+            f"Only {len(kept)} frames can be used to solve cameras; at least {MIN_KEYFRAMES} sharp "
             "ones were expected in which the person is known (a mask, or a pose)."
         )
     return kept
 
 
-def read_keys(images: Path, masks: Path) -> list[KeyFrame]:
-    """What `write_keys` wrote."""
+def read_keyframes(images: Path, masks: Path) -> list[SfmKeyframe]:
+    """What `write_keyframes` wrote."""
     keys = []
     for path in list_images(images):
         grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
         free = np.asarray(cv2.imread(str(masks / f"{path.name}.png"), cv2.IMREAD_GRAYSCALE))
-        keys.append(KeyFrame(index=int(path.stem), grey=grey, person=free == 0))
+        keys.append(SfmKeyframe(index=int(path.stem), gray=grey, person_mask=free == 0))
     return keys

@@ -16,29 +16,29 @@ from typing import Any
 
 import numpy as np
 
-from capture.errors import BadInput
-from preprocess.solve.model import Model
+from capture.errors import InputError
+from preprocess.solve.model import SparseModel
 
-FEATURES = 2048
-OVERLAP = 10
+MAX_FEATURES = 2048
+SEQUENTIAL_OVERLAP = 10
 """Each key frame is matched with so many after it, and with powers of two beyond."""
-ALL_PAIRS = 40
+MAX_EXHAUSTIVE_IMAGES = 40
 """Of so few key frames every pair is matched, which closes loops."""
-MOST_MODELS, MOST_BEGINNINGS = 2, 50
+MAX_MODELS, MAX_INITIAL_PAIRS = 2, 50
 """How often the incremental mapper begins anew, and with how many pairs at most: pictures without
 parallax would keep it busy for minutes."""
-LEAST_MATCHES = 15
-SAME_FOCAL = 0.01
+MIN_MATCHES = 15
+STATED_FOCAL_TOLERANCE = 0.01
 """A stated focal length as near as this to the solved one is the true one."""
-AT_ONCE = 4
+IMAGES_PER_THREAD = 4
 """Pictures that each thread looks at before progress is told."""
 
-Told = Callable[[float], None]
+ProgressFn = Callable[[float], None]
 """Called now and then with how much of a stage is done, in [0, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Workbench:
+class ColmapWorkspace:
     """Key frames on disk and the database that features and matches go to.
 
     Attributes:
@@ -56,20 +56,20 @@ class Workbench:
     threads: int
 
 
-def check_installed() -> None:
+def require_pycolmap() -> None:
     """Whether cameras can be solved here.
 
     Raises:
-        BadInput: If pycolmap is missing.
+        InputError: If pycolmap is missing.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise BadInput(
+        raise InputError(
             "--cameras solve needs pycolmap, which is not installed: pip install pycolmap. Or give "
             "the cameras that another program has solved (docs/formats.md)."
         )
 
 
-def extract(bench: Workbench, told: Told) -> None:
+def extract_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
     """Finds SIFT features (Lowe 2004) outside the masked parts."""
     colmap = _colmap()
     width, height = _size(bench)
@@ -82,8 +82,8 @@ def extract(bench: Workbench, told: Told) -> None:
         reader.default_focal_length_factor = 0.85
     options.num_threads, options.use_gpu = bench.threads, False
     options.max_image_size = max(width, height)
-    options.sift.max_num_features = FEATURES
-    names, step = _names(bench), AT_ONCE * bench.threads
+    options.sift.max_num_features = MAX_FEATURES
+    names, step = _names(bench), IMAGES_PER_THREAD * bench.threads
     with colmap.Database.open(bench.database):  # makes it
         pass
     colmap.import_images(
@@ -99,25 +99,25 @@ def extract(bench: Workbench, told: Told) -> None:
         )  # fmt: skip
 
 
-def match(bench: Workbench, told: Told) -> None:
+def match_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
     """Matches features between pictures that were taken one soon after the other."""
     colmap = _colmap()
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = 1, False
     count = len(_names(bench))
     told(0.0)
-    if count <= ALL_PAIRS:
+    if count <= MAX_EXHAUSTIVE_IMAGES:
         colmap.match_exhaustive(bench.database, matching_options=options, device=colmap.Device.cpu)
         return
     pairing = colmap.SequentialPairingOptions()
-    pairing.overlap, pairing.num_threads = OVERLAP, 1
+    pairing.overlap, pairing.num_threads = SEQUENTIAL_OVERLAP, 1
     colmap.match_sequential(
         bench.database, matching_options=options, pairing_options=pairing,
         device=colmap.Device.cpu,
     )  # fmt: skip
 
 
-def parallax(database: Path) -> tuple[int, float]:
+def parallax_fraction(database: Path) -> tuple[int, float]:
     """How many pairs match, and what share no homography explains: 0 of a camera that only turns.
 
     A plane, too, is seen by homographies; neither says where the camera was.
@@ -126,12 +126,12 @@ def parallax(database: Path) -> tuple[int, float]:
     flat = colmap.TwoViewGeometryConfiguration
     with colmap.Database.open(database) as base:
         found = base.read_two_view_geometries()[1]
-    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= LEAST_MATCHES]
+    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= MIN_MATCHES]
     plain = {int(flat.PLANAR), int(flat.PANORAMIC), int(flat.PLANAR_OR_PANORAMIC)}
     return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
 
 
-def map_globally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | None:
+def map_global(bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn) -> SparseModel | None:
     """All cameras at once; None if it fails."""
     colmap = _colmap()
     options = colmap.GlobalPipelineOptions()
@@ -141,16 +141,16 @@ def map_globally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | 
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     told(0.0)
     found = colmap.global_mapping(bench.database, bench.images, out, options=options)
-    return _largest(found, bench.focal_px)
+    return _largest_model(found, bench.focal_px)
 
 
-def map_incrementally(bench: Workbench, out: Path, seed: int, told: Told) -> Model | None:
+def map_incremental(bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn) -> SparseModel | None:
     """One camera after the other; None if it fails."""
     colmap = _colmap()
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
-    options.min_model_size, options.max_num_models = 3, MOST_MODELS
-    options.init_num_trials, options.extract_colors = MOST_BEGINNINGS, False
+    options.min_model_size, options.max_num_models = 3, MAX_MODELS
+    options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
     total, done = len(_names(bench)), 0
 
     def next_image() -> None:
@@ -162,7 +162,7 @@ def map_incrementally(bench: Workbench, out: Path, seed: int, told: Told) -> Mod
     found = colmap.incremental_mapping(
         bench.database, bench.images, out, options=options, next_image_callback=next_image
     )
-    return _largest(found, bench.focal_px)
+    return _largest_model(found, bench.focal_px)
 
 
 def _colmap() -> Any:
@@ -173,29 +173,29 @@ def _colmap() -> Any:
     return pycolmap
 
 
-def _names(bench: Workbench) -> list[str]:
+def _names(bench: ColmapWorkspace) -> list[str]:
     return sorted(path.name for path in bench.images.iterdir())
 
 
-def _size(bench: Workbench) -> tuple[int, int]:
+def _size(bench: ColmapWorkspace) -> tuple[int, int]:
     from PIL import Image
 
     with Image.open(bench.images / _names(bench)[0]) as picture:
         return picture.size
 
 
-def _largest(models: dict[int, Any], stated_px: float | None) -> Model | None:
+def _largest_model(models: dict[int, Any], stated_px: float | None) -> SparseModel | None:
     """The model with most cameras, in plain numbers; with the stated lens, if that may be."""
     if not models:
         return None
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     lens = next(iter(best.cameras.values()))
-    if stated_px is not None and abs(lens.params[0] / stated_px - 1.0) < SAME_FOCAL:
-        _settle(best, stated_px)
-    return _plain(best)
+    if stated_px is not None and abs(lens.params[0] / stated_px - 1.0) < STATED_FOCAL_TOLERANCE:
+        _adjust_to_focal(best, stated_px)
+    return _to_sparse_model(best)
 
 
-def _settle(found: Any, focal_px: float) -> None:
+def _adjust_to_focal(found: Any, focal_px: float) -> None:
     """Moves cameras and points until all is seen by a lens of a known focal length."""
     colmap = _colmap()
     for lens in found.cameras.values():
@@ -206,7 +206,7 @@ def _settle(found: Any, focal_px: float) -> None:
     colmap.bundle_adjustment(found, options)
 
 
-def _plain(found: Any) -> Model:
+def _to_sparse_model(found: Any) -> SparseModel:
     images = {
         int(Path(found.image(number).name).stem): found.image(number)
         for number in found.reg_image_ids()
@@ -225,7 +225,7 @@ def _plain(found: Any) -> Model:
         transforms[row, :3] = images[frame].cam_from_world().matrix()
     lens = found.camera(images[frames[0]].camera_id)
     focal, x, y, bend = (float(value) for value in lens.params)
-    return Model(
+    return SparseModel(
         frames=np.array(frames),
         camera_from_world=transforms,
         focal_px=focal,
@@ -233,7 +233,7 @@ def _plain(found: Any) -> Model:
         bend=bend,
         size_px=(int(lens.width), int(lens.height)),
         points=np.array([found.points3D[number].xyz for number in ids]).reshape(-1, 3),
-        seen_by=np.array(seen_by, dtype=np.int64),
-        seen_point=np.array(seen_point, dtype=np.int64),
+        observation_camera=np.array(seen_by, dtype=np.int64),
+        observation_point=np.array(seen_point, dtype=np.int64),
         pixels=np.array(pixels, dtype=np.float64).reshape(-1, 2),
     )

@@ -10,7 +10,7 @@ from capture.camera import Camera
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Model:
+class SparseModel:
     """What structure from motion found.
 
     Attributes:
@@ -32,8 +32,8 @@ class Model:
     bend: float
     size_px: tuple[int, int]
     points: Float[np.ndarray, "points 3"]
-    seen_by: Int[np.ndarray, "observations"]
-    seen_point: Int[np.ndarray, "observations"]
+    observation_camera: Int[np.ndarray, "observations"]
+    observation_point: Int[np.ndarray, "observations"]
     pixels: Float[np.ndarray, "observations 2"]
 
     def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
@@ -46,35 +46,35 @@ class Model:
             distortion=(self.bend, 0.0, 0.0, 0.0) if self.bend else (),
         )
 
-    def centers(self) -> Float[np.ndarray, "cameras 3"]:
+    def camera_centers(self) -> Float[np.ndarray, "cameras 3"]:
         """Where the cameras stand."""
         turned, moved = self.camera_from_world[:, :3, :3], self.camera_from_world[:, :3, 3]
         return -np.einsum("cba,cb->ca", turned, moved)
 
-    def residuals(self) -> Float[np.ndarray, "observations"]:
+    def reprojection_errors_px(self) -> Float[np.ndarray, "observations"]:
         """How far from each observation its point is projected, in pixels."""
         off = np.zeros(len(self.pixels))
         for row, transform in enumerate(self.camera_from_world):
-            mine = self.seen_by == row
+            mine = self.observation_camera == row
             if mine.any():
-                drawn = self.camera(transform).project(self.points[self.seen_point[mine]])
+                drawn = self.camera(transform).project(self.points[self.observation_point[mine]])
                 off[mine] = np.linalg.norm(drawn - self.pixels[mine], axis=1)
         return off
 
-    def seen_in(self, row: int) -> Int[np.ndarray, "seen"]:
+    def observations_of_camera(self, row: int) -> Int[np.ndarray, "seen"]:
         """The observations of one camera."""
-        return np.flatnonzero(self.seen_by == row)
+        return np.flatnonzero(self.observation_camera == row)
 
-    def without(self, doubtful: Bool[np.ndarray, "cameras"]) -> "Model":
+    def without_cameras(self, doubtful: Bool[np.ndarray, "cameras"]) -> "SparseModel":
         """The same without some of the cameras, and what only they saw."""
-        kept = ~doubtful[self.seen_by]
+        kept = ~doubtful[self.observation_camera]
         row_of = np.cumsum(~doubtful) - 1
         return replace(
             self,
             frames=self.frames[~doubtful],
             camera_from_world=self.camera_from_world[~doubtful],
-            seen_by=row_of[self.seen_by[kept]],
-            seen_point=self.seen_point[kept],
+            observation_camera=row_of[self.observation_camera[kept]],
+            observation_point=self.observation_point[kept],
             pixels=self.pixels[kept],
         )
 
@@ -83,7 +83,7 @@ class Model:
         np.savez(path, allow_pickle=False, **vars(self))
 
     @classmethod
-    def load(cls, path: Path) -> "Model":
+    def load(cls, path: Path) -> "SparseModel":
         """What `save` wrote."""
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files if key != "allow_pickle"}

@@ -6,27 +6,27 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from capture.source import Source
+from capture.errors import InputError
+from capture.source import FrameSource
 from preprocess.body import ShapedBody
 from preprocess.camera_file import CameraTrack
-from preprocess.doctor.claim import Claim
+from preprocess.doctor.claim import CaptureGeometry
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import Motion
-from preprocess.poses.place import moved, placed
-from preprocess.solve.floor import Floor, find_floor, up_of_cameras
-from preprocess.solve.scale import SOLE_M, Scale, Standing, metric_scale
-from preprocess.solve.solved import KEY, MISSING, PLACED, Solved
-from preprocess.solve.world import metric_cameras
+from preprocess.poses.place import transform_motion, place_in_camera_world
+from preprocess.solve.floor import FloorPlane, fit_floor_plane, mean_camera_up
+from preprocess.solve.scale import SOLE_THICKNESS_M, MetricScale, PersonInCameras, estimate_metric_scale
+from preprocess.solve.solved import KEY, MISSING, PLACED, CameraSolution
+from preprocess.solve.world import to_metric_world
 
-FEET = (7, 8, 10, 11)
+FOOT_JOINTS = (7, 8, 10, 11)
 """Ankles and feet among SMPL's joints."""
-MOST_LEAN_DEG = 30.0
-"""Between up as the cameras are held and up as the person stands."""
+MAX_LEAN_DEG = 30.0
+"""ResectionResult up as the cameras are held and up as the person stands."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Placed:
+class MetricPlacement:
     """A capture in a world of metres, y up, the floor at 0.
 
     Attributes:
@@ -38,13 +38,13 @@ class Placed:
 
     cameras: CameraTrack
     motion: Motion
-    scale: Scale
+    scale: MetricScale
     floor_points: int
 
 
-def place_in_world(
-    solved: Solved, motion: Motion, seen_by: Camera | None, shaped: ShapedBody, source: Source
-) -> Placed:
+def place_in_metric_world(
+    solved: CameraSolution, motion: Motion, tracker_camera: Camera | None, shaped: ShapedBody, source: FrameSource
+) -> MetricPlacement:
     """Cameras in metres and the poses in their world.
 
     Args:
@@ -56,61 +56,61 @@ def place_in_world(
         source: The frames.
 
     Raises:
-        BadInput: If nothing tells the size of the world.
+        InputError: If nothing tells the size of the world.
     """
     lens = solved.lens(source.size_px)
-    if seen_by is not None:
-        motion = refocused_to(motion, seen_by, lens, shaped)
-    frames = frames_of(motion, lens, source)
-    usable = motion.valid & (solved.marks[frames] >= PLACED)
-    standing = _standing(solved, motion, frames, np.flatnonzero(usable), shaped)
+    if tracker_camera is not None:
+        motion = refocus_motion(motion, tracker_camera, lens, shaped)
+    frames = frame_indices_of_rows(motion, lens, source)
+    usable = motion.valid & (solved.frame_status[frames] >= PLACED)
+    standing = _person_in_cameras(solved, motion, frames, np.flatnonzero(usable), shaped)
     assert solved.model is not None
-    up = _up(solved, motion, frames, usable)
-    floor = find_floor(solved.model, up)
-    scale = metric_scale(standing, floor)
-    if scale.refused is not None:
-        raise BadInput(f"The cameras were solved, but {scale.refused}.")
-    turned = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelves)
-    person = np.median(turned / scale.metres + standing.centers, axis=0)
-    ground = floor or _under_the_soles(standing, scale.metres, up)
-    transforms = metric_cameras(solved.camera_from_solved, scale.metres, ground, person)
+    up = _estimate_up(solved, motion, frames, usable)
+    floor = fit_floor_plane(solved.model, up)
+    scale = estimate_metric_scale(standing, floor)
+    if scale.rejection_reason is not None:
+        raise InputError(f"The cameras were solved, but {scale.rejection_reason}.")
+    turned = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelvis_positions)
+    person = np.median(turned / scale.metres_per_unit + standing.centers, axis=0)
+    ground = floor or _floor_below_soles(standing, scale.metres_per_unit, up)
+    transforms = to_metric_world(solved.camera_from_solved, scale.metres_per_unit, ground, person)
     cameras = CameraTrack(
         cameras=tuple(replace(lens, camera_from_world=transform) for transform in transforms),
         source="solved from the pictures",
-        missing=frozenset(np.flatnonzero(solved.marks == MISSING).tolist()),
+        frames_without_camera=frozenset(np.flatnonzero(solved.frame_status == MISSING).tolist()),
     )
     worlds = np.linalg.inv(transforms[frames])
-    return Placed(
+    return MetricPlacement(
         cameras=cameras,
-        motion=moved(motion, worlds, shaped.joints[0]),
+        motion=transform_motion(motion, worlds, shaped.joints[0]),
         scale=scale,
         floor_points=ground.points,
     )
 
 
-def refocused_to(motion: Motion, seen_by: Camera, lens: Camera, shaped: ShapedBody) -> Motion:
+def refocus_motion(motion: Motion, tracker_camera: Camera, lens: Camera, shaped: ShapedBody) -> Motion:
     """Camera-frame poses as another lens sees them where the first one did."""
-    there = replace(motion, space="camera", intrinsic=seen_by.intrinsic, lens=None)
+    there = replace(motion, space="camera", intrinsic=tracker_camera.intrinsic, assumed_focal=None)
     one = CameraTrack(cameras=(lens,), source="")
-    return placed(there, shaped, one, cameras_given=True)
+    return place_in_camera_world(there, shaped, one, cameras_given=True)
 
 
-def frames_of(motion: Motion, camera: Camera, source: Source) -> Int[np.ndarray, "poses"]:
+def frame_indices_of_rows(motion: Motion, camera: Camera, source: FrameSource) -> Int[np.ndarray, "poses"]:
     """The frame that each row belongs to."""
-    claim = Claim.of(motion, CameraTrack(cameras=(camera,), source=""), source)
-    numbers = np.nan_to_num(claim.places).round().astype(np.int64)
+    claim = CaptureGeometry.of(motion, CameraTrack(cameras=(camera,), source=""), source)
+    numbers = np.nan_to_num(claim.row_frames).round().astype(np.int64)
     return numbers.clip(0, source.frames_in_file - 1)
 
 
-def _standing(
-    solved: Solved,
+def _person_in_cameras(
+    solved: CameraSolution,
     motion: Motion,
     frames: Int[np.ndarray, "poses"],
     rows: Int[np.ndarray, "usable"],
     shaped: ShapedBody,
-) -> Standing:
+) -> PersonInCameras:
     weights = shaped.body.weights
-    feet = np.flatnonzero(weights[:, FEET].sum(axis=1) > 0.5)
+    feet = np.flatnonzero(weights[:, FOOT_JOINTS].sum(axis=1) > 0.5)
     rest = np.column_stack([shaped.vertices[feet], np.ones(len(feet))])
     soles = []
     for row in rows.tolist():
@@ -119,45 +119,45 @@ def _standing(
         soles.append(np.einsum("vab,vb->va", blended, rest))
     views = solved.camera_from_solved[frames[rows]]
     turned = views[:, :3, :3].transpose(0, 2, 1)
-    return Standing(
+    return PersonInCameras(
         world_from_camera=turned,
         centers=-np.einsum("nab,nb->na", turned, views[:, :3, 3]),
-        pelves=shaped.joints[0] + motion.root_translations[rows],
+        pelvis_positions=shaped.joints[0] + motion.root_translations[rows],
         soles=np.array(soles).reshape(len(rows), len(feet), 3),
     )
 
 
-def _up(
-    solved: Solved,
+def _estimate_up(
+    solved: CameraSolution,
     motion: Motion,
     frames: Int[np.ndarray, "poses"],
     usable: np.ndarray,
 ) -> Float[np.ndarray, "3"]:
     """Up as the person stands, unless the cameras are held quite otherwise."""
     assert solved.model is not None
-    held = up_of_cameras(solved.model)
+    held = mean_camera_up(solved.model)
     if not usable.any():
         return held
     backs = rotation_matrices(motion.root_rotations[usable])[:, :, 1]
     views = solved.camera_from_solved[frames[usable], :3, :3]
     up = np.median(np.einsum("nba,nb->na", views, backs), axis=0)
     length = float(np.linalg.norm(up))
-    if length < 0.5 or up @ held < length * np.cos(np.radians(MOST_LEAN_DEG)):
+    if length < 0.5 or up @ held < length * np.cos(np.radians(MAX_LEAN_DEG)):
         return held
     return up / length
 
 
-def _under_the_soles(standing: Standing, scale: float, up: Float[np.ndarray, "3"]) -> Floor:
+def _floor_below_soles(standing: PersonInCameras, scale: float, up: Float[np.ndarray, "3"]) -> FloorPlane:
     """The level plane on which the lowest sole of most frames stands."""
     turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
-    lowest = ((turned @ up).min(axis=1) - SOLE_M) / scale + standing.centers @ up
-    return Floor(normal=up, offset=-float(np.median(lowest)), points=0)
+    lowest = ((turned @ up).min(axis=1) - SOLE_THICKNESS_M) / scale + standing.centers @ up
+    return FloorPlane(normal=up, offset=-float(np.median(lowest)), points=0)
 
 
-def told(solved: Solved, place: Placed | None, source: Source) -> dict[str, object]:
+def solution_report(solved: CameraSolution, place: MetricPlacement | None, source: FrameSource) -> dict[str, object]:
     """What report.json says of the cameras."""
-    wanted = [i for i in range(len(solved.marks)) if source.selection.wants(i)]
-    marks = solved.marks[wanted]
+    wanted = [i for i in range(len(solved.frame_status)) if source.selection.contains(i)]
+    marks = solved.frame_status[wanted]
     content: dict[str, object] = {
         "verdict": "still" if solved.still else "solved",
         "background_moved": solved.moved,
@@ -179,7 +179,7 @@ def told(solved: Solved, place: Placed | None, source: Source) -> dict[str, obje
         "gates": {gate.name: {"value": gate.value, "bound": gate.bound} for gate in solved.gates},
         "scale": {
             "cues": list(place.scale.cues),
-            "metres_per_unit": place.scale.metres,
+            "metres_per_unit": place.scale.metres_per_unit,
             "by_ground": place.scale.ground,
             "by_place": place.scale.place,
             "spread": place.scale.spread,

@@ -14,23 +14,23 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from capture.camera import Camera
-from capture.source import Source
-from preprocess.solve.keyframes import KeyFrame, grey_of
-from preprocess.solve.model import Model
-from preprocess.solve.tracking import followed
+from capture.source import FrameSource
+from preprocess.solve.keyframes import SfmKeyframe, to_grayscale
+from preprocess.solve.model import SparseModel
+from preprocess.solve.tracking import track_points
 
-LEAST_POINTS = 20
-MOST_POINTS = 600
+MIN_PNP_POINTS = 20
+MAX_PNP_POINTS = 600
 INLIER_PX = 2.0
-LEAST_INLIERS = 0.5
-MOST_HELD = 256
-"""Frames between two key frames that are kept in memory; of longer stretches the middle is left."""
+MIN_INLIER_FRACTION = 0.5
+MAX_BUFFERED_FRAMES = 256
+"""EvaluationFrames between two key frames that are kept in memory; of longer stretches the middle is left."""
 
 Grey = UInt8[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Between:
+class ResectionResult:
     """What following points has found.
 
     Attributes:
@@ -39,13 +39,13 @@ class Between:
             in pixels, they land from where its own camera sees them (median); by its number.
     """
 
-    placed: dict[int, Float[np.ndarray, "4 4"]]
-    bridges: dict[int, float]
+    cameras: dict[int, Float[np.ndarray, "4 4"]]
+    keyframe_errors_px: dict[int, float]
 
 
-def place_between(
-    source: Source, model: Model, keys: list[KeyFrame], told: Callable[[float], None]
-) -> Between:
+def resect_intermediate_frames(
+    source: FrameSource, model: SparseModel, keys: list[SfmKeyframe], told: Callable[[float], None]
+) -> ResectionResult:
     """Cameras for all frames that have none.
 
     Args:
@@ -56,30 +56,30 @@ def place_between(
     """
     own = {key.index: key for key in keys}
     anchors = [
-        _Anchor.of(model, row, own[int(frame)]) for row, frame in enumerate(model.frames.tolist())
+        _KeyframePoints.of(model, row, own[int(frame)]) for row, frame in enumerate(model.frames.tolist())
     ]
     placed: dict[int, np.ndarray] = {}
     bridges: dict[int, float] = {}
     total = max(source.frame_count or source.frames_in_file, 1)
-    for before, after, stretch in _stretches(source, anchors, model.size_px):
+    for before, after, stretch in _frames_between_keyframes(source, anchors, model.size_px):
         if stretch:
             told(min(source.selection.position(stretch[-1][0]) / total, 1.0))
-        seen = _Sightings()
+        seen = _PointTracks()
         if before is not None:
             ends = stretch if after is None else [*stretch, (after.frame, after.grey)]
             before.follow(ends, seen)
         if before is not None and after is not None:
-            bridges[after.frame] = seen.miss(after.frame, after.camera)
+            bridges[after.frame] = seen.median_error_px(after.frame, after.camera)
         if after is not None:
             after.follow(stretch[::-1], seen)
         for frame, _ in stretch:
-            found = resected(*seen.of(frame), (before or after).camera)  # type: ignore[union-attr]
+            found = resect_camera(*seen.of(frame), (before or after).camera)  # type: ignore[union-attr]
             if found is not None:
                 placed[frame] = found
-    return Between(placed=placed, bridges=bridges)
+    return ResectionResult(cameras=placed, keyframe_errors_px=bridges)
 
 
-def resected(
+def resect_camera(
     points: Float[np.ndarray, "points 3"], pixels: Float[np.ndarray, "points 2"], lens: Camera
 ) -> Float[np.ndarray, "4 4"] | None:
     """The camera that sees known points where they were seen; None if most contradict it.
@@ -89,7 +89,7 @@ def resected(
         pixels: Where each was seen; some may be wrong.
         lens: With the focal length, and where the camera may be.
     """
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_PNP_POINTS:
         return None
     bend = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))
     cv2.setRNGSeed(0)
@@ -98,7 +98,7 @@ def resected(
         confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     inliers = np.zeros(0, np.int64) if kept is None else np.asarray(kept)[:, 0].astype(np.int64)
-    if not ok or len(inliers) < max(LEAST_POINTS, LEAST_INLIERS * len(points)):
+    if not ok or len(inliers) < max(MIN_PNP_POINTS, MIN_INLIER_FRACTION * len(points)):
         return None
     for reach in (INLIER_PX, 0.5 * INLIER_PX, 0.0):  # the last round leaves out what is half right
         turn, shift = cv2.solvePnPRefineLM(
@@ -106,14 +106,14 @@ def resected(
         )
         drawn = np.asarray(cv2.projectPoints(points, turn, shift, lens.intrinsic, bend)[0])
         near = np.flatnonzero(np.linalg.norm(drawn[:, 0] - pixels, axis=1) < reach)
-        inliers = near if len(near) >= LEAST_POINTS else inliers
+        inliers = near if len(near) >= MIN_PNP_POINTS else inliers
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     return transform
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Anchor:
+class _KeyframePoints:
     """A key frame with its camera and the points it sees."""
 
     frame: int
@@ -123,16 +123,16 @@ class _Anchor:
     pixels: Float[np.ndarray, "points 2"]
 
     @classmethod
-    def of(cls, model: Model, row: int, key: KeyFrame) -> "_Anchor":
-        seen = model.seen_in(row)
-        lengths = np.bincount(model.seen_point, minlength=len(model.points))
-        longest = np.argsort(-lengths[model.seen_point[seen]], kind="stable")[:MOST_POINTS]
+    def of(cls, model: SparseModel, row: int, key: SfmKeyframe) -> "_Anchor":
+        seen = model.observations_of_camera(row)
+        lengths = np.bincount(model.observation_point, minlength=len(model.points))
+        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[:MAX_PNP_POINTS]
         seen = seen[longest]
         return cls(
             frame=key.index,
-            grey=key.grey,
+            grey=key.gray,
             camera=model.camera(model.camera_from_world[row]),
-            points=model.points[model.seen_point[seen]],
+            points=model.points[model.observation_point[seen]],
             pixels=model.pixels[seen],
         )
 
@@ -141,13 +141,13 @@ class _Anchor:
         guess, alive = self.pixels.copy(), np.ones(len(self.pixels), dtype=bool)
         for frame, grey in pictures:
             rows = np.flatnonzero(alive)
-            there, found = followed(self.grey, grey, self.pixels[rows], guess[rows])
+            there, found = track_points(self.grey, grey, self.pixels[rows], guess[rows])
             guess[rows[found]] = there[found]
             alive[rows[~found]] = False
             seen.add(frame, self.points[rows[found]], there[found])
 
 
-class _Sightings:
+class _PointTracks:
     """Which points were seen where, by the frame's number."""
 
     def __init__(self) -> None:
@@ -162,28 +162,28 @@ class _Sightings:
             return np.zeros((0, 3)), np.zeros((0, 2))
         return np.concatenate([p for p, _ in parts]), np.concatenate([q for _, q in parts])
 
-    def miss(self, frame: int, camera: Camera) -> float:
+    def median_error_px(self, frame: int, camera: Camera) -> float:
         points, pixels = self.of(frame)
-        if len(points) < LEAST_POINTS:
+        if len(points) < MIN_PNP_POINTS:
             return float("nan")
         return float(np.median(np.linalg.norm(camera.project(points) - pixels, axis=1)))
 
 
-def _stretches(
-    source: Source, anchors: list[_Anchor], size_px: tuple[int, int]
-) -> Iterator[tuple[_Anchor | None, _Anchor | None, list[tuple[int, Grey]]]]:
+def _frames_between_keyframes(
+    source: FrameSource, anchors: list[_KeyframePoints], size_px: tuple[int, int]
+) -> Iterator[tuple[_KeyframePoints | None, _KeyframePoints | None, list[tuple[int, Grey]]]]:
     """The frames between two neighbouring key frames, and before the first and after the last."""
     waiting, stretch = list(anchors), []
-    before: _Anchor | None = None
+    before: _KeyframePoints | None = None
     for frame in source.frames():
         while waiting and frame.index >= waiting[0].frame:
             after = waiting.pop(0)
             yield before, after, stretch
             before, stretch = after, []
         if (before is None or frame.index != before.frame) and "corrupt" not in frame.flags:
-            stretch.append((frame.index, grey_of(frame, size_px)))
-            if len(stretch) > MOST_HELD:
-                del stretch[MOST_HELD // 2]
+            stretch.append((frame.index, to_grayscale(frame, size_px)))
+            if len(stretch) > MAX_BUFFERED_FRAMES:
+                del stretch[MAX_BUFFERED_FRAMES // 2]
     yield before, None, stretch
     for after in waiting:  # the video ended before they came
         yield before, after, []

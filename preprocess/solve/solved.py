@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from capture.atomic_files import write_text
+from capture.atomic_files import write_text_atomically
 from capture.camera import Camera
-from preprocess.solve.gates import Gate
-from preprocess.solve.model import Model
+from preprocess.solve.gates import QualityGate
+from preprocess.solve.model import SparseModel
 
 MISSING, INTERPOLATED, PLACED, KEY = range(4)
 """What a frame's camera is: none, between its neighbours', by known points, or a key frame's."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Solved:
+class CameraSolution:
     """Cameras in a world of unknown size, or the news that the camera stood still.
 
     Attributes:
@@ -34,37 +34,37 @@ class Solved:
 
     still: bool
     moved: float
-    gates: tuple[Gate, ...]
-    model: Model | None
+    gates: tuple[QualityGate, ...]
+    model: SparseModel | None
     camera_from_solved: Float[np.ndarray, "frames 4 4"]
-    marks: Int[np.ndarray, "frames"]
+    frame_status: Int[np.ndarray, "frames"]
     keys: int
     costs: dict[str, Any]
 
     def lens(self, size_px: tuple[int, int]) -> Camera:
         """The lens, for pictures of the frames' size."""
         assert self.model is not None
-        return self.model.camera(np.eye(4)).resized(size_px)
+        return self.model.camera(np.eye(4)).resize(size_px)
 
     def save(self, folder: Path) -> None:
         """Writes it as `solved.json`, `solved.npz` and `model.npz`."""
         if self.model is not None:
             self.model.save(folder / "model.npz")
         np.savez(
-            folder / "solved.npz", camera_from_solved=self.camera_from_solved, marks=self.marks
+            folder / "solved.npz", camera_from_solved=self.camera_from_solved, marks=self.frame_status
         )
         content = {
             "still": self.still, "moved": self.moved, "keys": self.keys, "costs": self.costs,
             "gates": [asdict(gate) for gate in self.gates],
         }  # fmt: skip
-        write_text(folder / "solved.json", json.dumps(content, indent=1))  # last: the rest is there
+        write_text_atomically(folder / "solved.json", json.dumps(content, indent=1))  # last: the rest is there
 
     @classmethod
-    def load(cls, folder: Path) -> "Solved":
+    def load(cls, folder: Path) -> "CameraSolution":
         """What `save` wrote."""
         content = json.loads((folder / "solved.json").read_text(encoding="utf-8"))
         with np.load(folder / "solved.npz", allow_pickle=False) as file:
             cameras, marks = file["camera_from_solved"], file["marks"]
-        gates = tuple(Gate(**gate) for gate in content.pop("gates"))
-        model = None if content["still"] else Model.load(folder / "model.npz")
+        gates = tuple(QualityGate(**gate) for gate in content.pop("gates"))
+        model = None if content["still"] else SparseModel.load(folder / "model.npz")
         return cls(gates=gates, model=model, camera_from_solved=cameras, marks=marks, **content)

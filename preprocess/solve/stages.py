@@ -8,17 +8,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, final
 
-from capture.atomic_files import write_text
+from capture.atomic_files import write_text_atomically
 from capture.memory import peak_memory_mb
 
-NOTES = "stages.json"
+STAGES_FILE = "stages.json"
 """What the folder's stages have cost, by name."""
-Told = Callable[[str, float], None]
+StageProgressFn = Callable[[str, float], None]
 """Called now and then with a stage's name and how much of it is done, in [0, 1]."""
 
 
 @final
-class Stages:
+class StageCache:
     """Names the parts of the work, times them, and remembers which are done.
 
     A stage writes to a name that passes (`.part`); its result takes its own name when it is whole.
@@ -28,16 +28,16 @@ class Stages:
         costs: Of each finished stage: wall and core seconds, also from an earlier process.
     """
 
-    def __init__(self, folder: Path, told: Told) -> None:
+    def __init__(self, folder: Path, told: StageProgressFn) -> None:
         """Takes up what lies in the folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self._told = folder, told
-        self._notes = folder / NOTES
+        self._notes = folder / STAGES_FILE
         self.costs: dict[str, dict[str, float]] = {}
         if self._notes.exists():
             self.costs = json.loads(self._notes.read_text(encoding="utf-8"))
 
-    def result(self, name: str, make: Callable[[Path, Callable[[float], None]], None]) -> Path:
+    def run_or_reuse(self, name: str, make: Callable[[Path, Callable[[float], None]], None]) -> Path:
         """The file or folder of a stage, made if it is not there yet.
 
         Args:
@@ -49,7 +49,7 @@ class Stages:
             return path
         part = self.folder / f"part.{name}"
         for old in (part, path):
-            _removed(old)
+            _remove(old)
         with self._timed(name):
             make(part, lambda share: self._told(name, share))
             part.rename(path)
@@ -66,7 +66,7 @@ class Stages:
             "cpu_seconds": time.process_time() - core,
             "peak_memory_mb": peak_memory_mb(),
         }
-        write_text(self._notes, json.dumps(self.costs, indent=1))
+        write_text_atomically(self._notes, json.dumps(self.costs, indent=1))
 
     def totals(self) -> dict[str, Any]:
         """Of all stages, for the report."""
@@ -79,7 +79,7 @@ class Stages:
         }
 
 
-def _removed(path: Path) -> None:
+def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)
     else:

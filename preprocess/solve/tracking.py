@@ -6,15 +6,15 @@ from jaxtyping import Bool, Float, UInt8
 
 WINDOW = (17, 17)
 LEVELS, LEVELS_WITH_GUESS = 4, 3
-FORTH_AND_BACK_PX = 0.7
+MAX_ROUND_TRIP_PX = 0.7
 """A point that does not come back to where it came from was lost."""
 
-Picture = UInt8[np.ndarray, "height width"]
+GrayImage = UInt8[np.ndarray, "height width"]
 
 
-def followed(
-    start: Picture,
-    picture: Picture,
+def track_points(
+    start: GrayImage,
+    picture: GrayImage,
     pixels: Float[np.ndarray, "points 2"],
     guess: Float[np.ndarray, "points 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, "points"]]:
@@ -29,15 +29,15 @@ def followed(
     if not len(pixels):
         return pixels.copy(), np.zeros(0, dtype=bool)
     levels = LEVELS if guess is None else LEVELS_WITH_GUESS
-    there, found = _flow(start, picture, pixels, pixels if guess is None else guess, levels)
-    back, again = _flow(picture, start, there, pixels, levels)
+    there, found = _optical_flow(start, picture, pixels, pixels if guess is None else guess, levels)
+    back, again = _optical_flow(picture, start, there, pixels, levels)
     height, width = picture.shape
     inside = ((there > 0.0) & (there < (width, height))).all(axis=1)
-    same = np.linalg.norm(back - pixels, axis=1) < FORTH_AND_BACK_PX
+    same = np.linalg.norm(back - pixels, axis=1) < MAX_ROUND_TRIP_PX
     return there, found & again & same & inside
 
 
-def corners(picture: Picture, free: Bool[np.ndarray, "height width"], most: int) -> np.ndarray:
+def detect_corners(picture: GrayImage, free: Bool[np.ndarray, "height width"], most: int) -> np.ndarray:
     """Points that can be followed, evenly spread (Shi & Tomasi 1994)."""
     spacing = max(4.0, 0.01 * max(picture.shape))
     found = cv2.goodFeaturesToTrack(picture, most, 0.01, spacing, mask=free.astype(np.uint8))
@@ -46,9 +46,9 @@ def corners(picture: Picture, free: Bool[np.ndarray, "height width"], most: int)
     return found.reshape(-1, 2).astype(np.float64) + 0.5
 
 
-def _flow(
-    start: Picture,
-    picture: Picture,
+def _optical_flow(
+    start: GrayImage,
+    picture: GrayImage,
     pixels: Float[np.ndarray, "points 2"],
     guess: Float[np.ndarray, "points 2"],
     levels: int,

@@ -6,10 +6,10 @@ z points from the person to the first camera, so that who faces it has SMPL's ow
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.solve.floor import Floor
+from preprocess.solve.floor import FloorPlane
 
 
-def world_axes(
+def upright_axes(
     up: Float[np.ndarray, "3"], towards_camera: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
     """Rotation from the solved world into one with y along `up`."""
@@ -20,10 +20,10 @@ def world_axes(
     return np.stack([np.cross(up, z), up, z])
 
 
-def metric_cameras(
+def to_metric_world(
     camera_from_solved: Float[np.ndarray, "cameras 4 4"],
     scale: float,
-    floor: Floor,
+    floor: FloorPlane,
     person: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "cameras 4 4"]:
     """The same cameras in the metric world.
@@ -36,8 +36,8 @@ def metric_cameras(
     """
     turned, moved = camera_from_solved[:, :3, :3], camera_from_solved[:, :3, 3]
     centers = -np.einsum("cba,cb->ca", turned, moved)
-    axes = world_axes(floor.normal, centers[0] - person)
-    origin = person - floor.normal * float(floor.heights(person[None])[0])
+    axes = upright_axes(floor.normal, centers[0] - person)
+    origin = person - floor.normal * float(floor.heights_above(person[None])[0])
     there = scale * (centers - origin) @ axes.T
     found = np.tile(np.eye(4), (len(centers), 1, 1))
     found[:, :3, :3] = turned @ axes.T

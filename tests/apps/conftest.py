@@ -10,12 +10,12 @@ import pytest
 
 from apps import ingest, play
 from apps.learning import deliver, learn, snapshot
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
-from apps.studio.writer import ShootConfig, shoot
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
+from apps.studio.writer import ShootConfig, film_capture
 from avatar import fit, warm
 from avatar.rig import Rig
-from capture.atomic_files import write_text
+from capture.atomic_files import write_text_atomically
 from export import bake, tuning
 from export.build import ExportReport
 
@@ -51,15 +51,15 @@ FEW_STEPS = 10
 
 @pytest.fixture(scope="session", autouse=True)
 def briefly_tuned():
-    """Bricks are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
+    """BrickTable are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
 
     What these are worth is seen in tests of `export` and of `avatar`.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bake, "TUNED", 4)
-        patch.setattr(tuning, "TUNED_PX", 128)
-        patch.setattr(tuning, "JUDGED_PX", 128)
-        patch.setattr(fit, "CORRECTIONS", 4)
+        patch.setattr(bake, "FINE_TUNING_PICTURES", 4)
+        patch.setattr(tuning, "TRAINING_PX", 128)
+        patch.setattr(tuning, "VALIDATION_PX", 128)
+        patch.setattr(fit, "CORRECTIONS_PER_FRAME", 4)
         yield
 
 
@@ -67,7 +67,7 @@ def briefly_tuned():
 def film(tmp_path_factory) -> Path:
     """A capture folder: 24 frames of 64 px."""
     folder = tmp_path_factory.mktemp("film") / "capture"
-    shoot(folder, ShootConfig(frames=24, size=64, background="plain"))
+    film_capture(folder, ShootConfig(frames=24, size=64, background="plain"))
     return folder
 
 
@@ -82,7 +82,7 @@ def run(film, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def rig(film) -> Rig:
     """The rig of the actor, whom all of these films are about."""
-    return Rig.of(open_recording(RecordingPaths(video=film)).shaped)
+    return Rig.from_shaped_body(open_capture(CaptureInputs(video=film)).shaped)
 
 
 @pytest.fixture
@@ -128,14 +128,14 @@ def without_baking(monkeypatch) -> None:
     """
 
     def export_nothing(avatar, path, *, views, metrics, hasty, fine_tuned, progress):
-        write_text(path, "stand-in")
+        write_text_atomically(path, "stand-in")
         return ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
-            largest_difference=0.0, tuning=None, warnings=(),
+            largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
         )  # fmt: skip
 
     monkeypatch.setattr(snapshot, "export_avatar", export_nothing)
-    monkeypatch.setattr(deliver, "failure_of", lambda report: None)
+    monkeypatch.setattr(deliver, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(deliver, "novel", lambda player: "data:,")
     monkeypatch.setattr(deliver.Player, "load", lambda path: None)
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from avatar import checkpoint
-from preprocess.body_file import load_body
-from preprocess.fit.stature import height_of
-from preprocess.person_file import read_person
+from preprocess.body_file import load_body_model
+from preprocess.fit.stature import body_height_m
+from preprocess.person_file import read_shaped_body
 
 GIVEN = "--no-refine-poses"
 """What is shown here is not how poses are refined; fits of held-out frames take a while."""
@@ -27,16 +27,16 @@ def test_another_video_is_added_and_what_the_first_lost_is_said(
     first = call_ingest(capture, "--out", out, "--frames", "0:12", GIVEN)
     assert first.code == 0
     before = json.loads((out / "report.json").read_text())
-    assert before["extended"] is None
-    assert (out / "checkpoint" / kept_frames.FINISHED).exists()
+    assert before["earlier_videos"] is None
+    assert (out / "checkpoint" / kept_frames.LAST_RUN_FILE).exists()
     outcome = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert outcome.code == 0
     after = json.loads((out / "report.json").read_text())
-    extended = after["extended"]
+    extended = after["earlier_videos"]
     assert extended["frames"] == before["held_out"]["frames"]
     assert extended["psnr_before"] == pytest.approx(before["held_out"]["psnr"], abs=0.05)
-    assert extended["recalled"] == before["frames"]["used"]
-    assert extended["largest_fall"] >= 0.0
+    assert extended["replayed_key_frames"] == before["frames"]["used"]
+    assert extended["largest_drop"] >= 0.0
     assert extended["videos"] == ["capture"]
     assert extended["video_of_frame"] == [1, 1, 1]
     assert extended["used"] == before["frames"]["used"]
@@ -52,12 +52,12 @@ def test_another_video_is_added_and_what_the_first_lost_is_said(
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
     assert after["training"]["steps"] == 2 * before["training"]["steps"]
     # both videos are learnt from, and an interrupted run finds both again
-    kept = kept_frames.KeptFrames.load(out / "checkpoint" / kept_frames.FINISHED)
-    numbers = [frame.index for frame in kept.key_frames]
+    kept = kept_frames.SavedFrames.load(out / "checkpoint" / kept_frames.LAST_RUN_FILE)
+    numbers = [frame.index for frame in kept.replay_frames]
     assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
     again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert again.code == 0
-    assert json.loads((out / "report.json").read_text())["extended"]["frames"] == [9, 10, 11]
+    assert json.loads((out / "report.json").read_text())["earlier_videos"]["frames"] == [9, 10, 11]
 
 
 def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
@@ -66,17 +66,17 @@ def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     out, other = tmp_path / "run", tmp_path / "other"
     shutil.copytree(capture, other)
     assert call_ingest(capture, "--out", out, *FEW).code == 0
-    body = load_body()
-    person = read_person(out / "checkpoint" / "person.npz", body)
+    body = load_body_model()
+    person = read_shaped_body(out / "checkpoint" / "person.npz", body)
     betas = np.zeros(10)
     betas[0] = 3.0
     stated = body.with_shape(betas)
-    assert abs(height_of(stated) - height_of(person)) > 0.02
+    assert abs(body_height_m(stated) - body_height_m(person)) > 0.02
     changed(other / "poses.npz", betas=betas)
     outcome = call_ingest(other, "--out", out, "--resume", *FEW)
     assert outcome.code == 0
-    assert f"state a body of {100 * height_of(stated):.0f} cm" in " ".join(outcome.err.split())
-    kept = read_person(out / "checkpoint" / "person.npz", body)
+    assert f"state a body of {100 * body_height_m(stated):.0f} cm" in " ".join(outcome.err.split())
+    kept = read_shaped_body(out / "checkpoint" / "person.npz", body)
     np.testing.assert_array_equal(kept.vertices, person.vertices)
     trainer, _ = checkpoint.load(out / "checkpoint", torch.device("cpu"))
     np.testing.assert_allclose(trainer.avatar.rig.rest_joints, rig.rest_joints, atol=1e-6)
@@ -105,7 +105,7 @@ def test_an_added_video_of_another_body_is_refused(
 
 def small_body(folder):
     """The embedded body with a vertex less."""
-    body, path = load_body(), folder / "small.npz"
+    body, path = load_body_model(), folder / "small.npz"
     faces = body.faces[(body.faces < len(body.template) - 1).all(axis=1)]
     tree = np.stack([body.parents, np.arange(24)])
     np.savez(

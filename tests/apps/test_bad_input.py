@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from apps import ingest
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
 
 MASK = (64, 64)
 
@@ -132,7 +132,7 @@ def test_endings_in_capitals_are_endings(capture):
         (capture / f"{name}.npz").rename(capture / f"{name}.NPZ")
     (capture / "video.mp4").rename(capture / "My Video.MOV")
     paths = {"poses": capture / "poses.NPZ", "cameras": str(capture / "cameras.NPZ")}
-    recording = open_recording(RecordingPaths(video=capture / "My Video.MOV", **paths))
+    recording = open_capture(CaptureInputs(video=capture / "My Video.MOV", **paths))
     assert recording.cameras.source == "cameras.NPZ"
     assert recording.source.frame_count == 24
 

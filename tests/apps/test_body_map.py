@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from apps.reporting.body_map import BodyMap
-from avatar.coverage import Coverage, Stage
+from apps.reporting.body_map import CoverageMap
+from avatar.coverage import Coverage, VisibilityStage
 
 
 @pytest.fixture(scope="module")
@@ -16,13 +16,13 @@ def coverage(shaped) -> Coverage:
 
 
 @pytest.fixture(scope="module")
-def body_map(shaped, coverage) -> BodyMap:
-    return BodyMap(shaped, coverage)
+def body_map(shaped, coverage) -> CoverageMap:
+    return CoverageMap(shaped, coverage)
 
 
 def see(coverage: Coverage, where: np.ndarray, cosine: float) -> None:
     coverage.cosines[:] = np.where(where, cosine, 0.0)
-    coverage.stages[:] = np.where(where, Stage.SEEN, Stage.AWAY)
+    coverage.stages[:] = np.where(where, VisibilityStage.SEEN, VisibilityStage.FACING_AWAY)
 
 
 def dots(svg: str) -> dict[str, np.ndarray]:

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 
 from apps import check, ingest
-from apps.checking.examine import examined, looks_well
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
-from apps.studio.writer import ShootConfig, shoot
+from apps.checking.examine import check_opened_capture, passes_quick_check
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
+from apps.studio.writer import ShootConfig, film_capture
 from benchmarks import spoils
 from preprocess.pose_file import read_motion
 
 SPOILS = {
-    "frame_offset": spoils.late(4),
-    "frame_rate": spoils.resampled(0.5),
-    "opengl_axes": spoils.opengl_poses,
-    "root_rotation": spoils.turned_pictures(90),
-    "world_frame": spoils.camera_space_twice,
-    "focal": spoils.focal(0.7),
-    "left_right": spoils.exchanged,
-    "root_origin": spoils.about_the_origin,
-    "body_scale": spoils.in_units(1000.0),
-    "mask_polarity": spoils.inverted_masks,
+    "frame_offset": spoils.delay_poses(4),
+    "frame_rate": spoils.resample_poses(0.5),
+    "opengl_axes": spoils.use_opengl_poses,
+    "root_rotation": spoils.rotate_tracker_input(90),
+    "world_frame": spoils.apply_extrinsics_twice,
+    "focal": spoils.scale_focal(0.7),
+    "left_right": spoils.swap_left_right,
+    "root_origin": spoils.root_about_origin,
+    "body_scale": spoils.change_units(1000.0),
+    "mask_polarity": spoils.invert_masks,
 }
 
 
@@ -36,7 +36,7 @@ def dancing(tmp_path_factory) -> Path:
     """A capture folder: 40 frames of 96 px."""
     folder = tmp_path_factory.mktemp("dancing") / "capture"
     config = ShootConfig(frames=40, size=96, motion="dance", background="plain", turns=1.0)
-    shoot(folder, config)
+    film_capture(folder, config)
     return folder
 
 
@@ -84,7 +84,7 @@ def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
 @pytest.mark.slow
 def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
     config = ShootConfig(frames=40, size=96, pose_noise_deg=2.0, pose_noise_cm=1.0, turns=1.0)
-    shoot(tmp_path / "noisy", config)
+    film_capture(tmp_path / "noisy", config)
     _, _, found = call_check(tmp_path / "noisy")
     assert (found["verdict"], found["cause"]) == ("good", None)
 
@@ -99,11 +99,11 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
     folder, out = spoilt(SPOILS[cause]), tmp_path / "mended"
     code, _, found = call_check(folder, "--fix", out)
     assert found["cause"] == cause
-    assert [cure["cause"] for cure in found["cures"]] == [cause]
+    assert [cure["cause"] for cure in found["corrections"]] == [cause]
     assert found["iou"]["now"] + 0.05 < found["iou"]["after_fix"]
     assert found["tried"][0]["cause"] == cause
     assert code == 0
-    assert looks_well(open_recording(RecordingPaths(video=out)))
+    assert passes_quick_check(open_capture(CaptureInputs(video=out)))
     if cause in ("frame_offset", "frame_rate"):
         mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
         assert mended.frames is not None
@@ -122,33 +122,33 @@ def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
 
 
 FILM_SPOILS = {
-    "film_rotation": spoils.rotated_film(1),
-    "film_mirrored": spoils.mirrored_film,
-    "film_crop": spoils.cropped_film(0.05, 0.05, 0.85),
-    "film_offset": spoils.trimmed_film(4),
+    "video_rotation": spoils.rotate_video(1),
+    "undo_video_mirroring": spoils.mirror_video,
+    "video_crop": spoils.crop_video(0.05, 0.05, 0.85),
+    "video_offset": spoils.trim_video(4),
 }
 
 
-@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("film_mirrored",)))
+@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("undo_video_mirroring",)))
 def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
     folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
     code, said, found = call_check(folder, "--fix", out)
     assert code == 0
-    assert [cure["cause"] for cure in found["cures"]] == [cause]
+    assert [cure["cause"] for cure in found["corrections"]] == [cause]
     assert found["iou"]["now"] > 0.75
     assert found["film"]["now"] + 0.05 < found["film"]["after_fix"] > 0.7
     assert "but not with the pictures" in said
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
-    recording = open_recording(RecordingPaths(video=out))
-    examined_again = examined(recording)
+    recording = open_capture(CaptureInputs(video=out))
+    examined_again = check_opened_capture(recording)
     assert examined_again.causes == ()
-    assert examined_again.diagnosis.film.now > found["film"]["after_fix"] - 0.03
-    assert recording.source.frames_in_file == (36 if cause == "film_offset" else 40)
+    assert examined_again.diagnosis.video.now > found["film"]["after_fix"] - 0.03
+    assert recording.source.frames_in_file == (36 if cause == "video_offset" else 40)
 
 
 def narrowed(folder: Path) -> None:
     """Takes 16 columns from each side of film and masks, so that they are no longer square."""
-    spoils.changed_film(folder, lambda pictures: [picture[:, 16:-16] for picture in pictures])
+    spoils.rewrite_video(folder, lambda pictures: [picture[:, 16:-16] for picture in pictures])
     for path in (folder / "masks").iterdir():
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert mask is not None
@@ -161,22 +161,22 @@ def narrowed(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path, call_check):
-    folder, out = spoilt(narrowed, spoils.rotated_film(3)), tmp_path / "corrected"
+    folder, out = spoilt(narrowed, spoils.rotate_video(3)), tmp_path / "corrected"
     code, said, found = call_check(folder, "--fix", out)
     assert code == 0
     assert "expected the same shape" in found["refused"]
-    assert [cure["cause"] for cure in found["cures"]] == ["film_rotation"]
+    assert [cure["cause"] for cure in found["corrections"]] == ["video_rotation"]
     assert "rotated by 90° clockwise" in said
-    recording = open_recording(RecordingPaths(video=out))
+    recording = open_capture(CaptureInputs(video=out))
     assert recording.source.size_px == (64, 96)
-    assert looks_well(recording)
+    assert passes_quick_check(recording)
 
 
 @pytest.mark.slow
 def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_path, call_check):
-    folder, out = spoilt(spoils.second_person), tmp_path / "corrected"
+    folder, out = spoilt(spoils.add_second_person), tmp_path / "corrected"
     _, _, found = call_check(folder, "--fix", out)
-    assert [cure["cause"] for cure in found["cures"]] == ["second_person"]
+    assert [cure["cause"] for cure in found["corrections"]] == ["add_second_person"]
     assert found["iou"]["after_fix"] > 0.75
     masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (out / "masks").iterdir()]
     masks = [mask for mask in masks if mask is not None and mask.any()]
@@ -187,16 +187,16 @@ def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_pat
 
 @pytest.mark.slow
 def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call_check):
-    _, _, found = call_check(spoilt(spoils.unnumbered_end(22)))
+    _, _, found = call_check(spoilt(spoils.keep_last_poses(22)))
     assert found["cause"] == "frame_offset"
-    assert "18 frames too early" in found["cures"][0]["words"]
+    assert "18 frames too early" in found["corrections"][0]["words"]
     assert found["iou"]["after_fix"] > 0.75
 
 
 @pytest.mark.slow
 def test_a_world_with_z_up_is_one_mistake_however_it_was_converted(spoilt, call_check):
-    _, _, found = call_check(spoilt(spoils.z_up_about_the_origin))
-    assert [cure["cause"] for cure in found["cures"]] == ["root_rotation"]
+    _, _, found = call_check(spoilt(spoils.use_z_up_poses_without_pelvis))
+    assert [cure["cause"] for cure in found["corrections"]] == ["root_rotation"]
     assert found["iou"]["after_fix"] > 0.8
 
 
@@ -236,15 +236,15 @@ def test_the_command_that_corrects_can_be_pasted(spoilt, call_check, tmp_path, m
     assert words[4:6] == ["--no-mask-invert", "--fix"]
     assert words[6] == f"{folder}-corrected"
     assert check.main(words[1:]) == 0
-    assert looks_well(open_recording(RecordingPaths(video=tmp_path / "my film-corrected")))
+    assert passes_quick_check(open_capture(CaptureInputs(video=tmp_path / "my film-corrected")))
 
 
 @pytest.mark.slow
 def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
-    code, said, found = call_check(spoilt(spoils.opengl_poses, spoils.late(-5)))
+    code, said, found = call_check(spoilt(spoils.use_opengl_poses, spoils.delay_poses(-5)))
     assert code == 2
     assert found["verdict"] == "unusable"
-    assert {cure["cause"] for cure in found["cures"]} == {"opengl_axes", "frame_offset"}
+    assert {cure["cause"] for cure in found["corrections"]} == {"opengl_axes", "frame_offset"}
     assert found["iou"]["after_fix"] > 0.75
     assert "OpenGL" in said
     assert "--fix" in said
@@ -252,7 +252,7 @@ def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt,
 
 @pytest.mark.slow
 def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
-    _, _, found = call_check(spoilt(spoils.camera_forgotten))
+    _, _, found = call_check(spoilt(spoils.reset_extrinsics))
     assert found["cause"] == "world_frame"
     assert found["iou"]["after_fix"] > 0.75
 
@@ -263,7 +263,7 @@ def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check)
     assert "No mistake" in said
     assert not (tmp_path / "mended").exists()
     (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("keep")
+    (tmp_path / "full" / "mine.txt").write_text_atomically("keep")
     code, said, _ = call_check(dancing, "--fix", tmp_path / "full")
     assert code == 2
     assert "--fix" in said
@@ -294,21 +294,21 @@ def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
     assert said.count("1 of 40 poses") == 1
     assert code == 0
     assert found["verdict"] == "warn"
-    assert any("1 of 40 poses" in odd for odd in found["odd"])
-    assert any("jump 2 times (20, 22)" in odd for odd in found["odd"])
+    assert any("1 of 40 poses" in odd for odd in found["anomalies"])
+    assert any("jump 2 times (20, 22)" in odd for odd in found["anomalies"])
 
 
 def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, spoilt):
-    assert looks_well(open_recording(RecordingPaths(video=dancing)))
-    assert not looks_well(open_recording(RecordingPaths(video=spoilt(spoils.late(1)))))
+    assert passes_quick_check(open_capture(CaptureInputs(video=dancing)))
+    assert not passes_quick_check(open_capture(CaptureInputs(video=spoilt(spoils.delay_poses(1)))))
 
 
 def test_a_glance_notices_a_mirrored_film(spoilt):
-    assert not looks_well(open_recording(RecordingPaths(video=spoilt(spoils.mirrored_film))))
+    assert not passes_quick_check(open_capture(CaptureInputs(video=spoilt(spoils.mirror_video))))
 
 
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
-    folder = spoilt(spoils.focal(0.4))
+    folder = spoilt(spoils.scale_focal(0.4))
     assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "the focal length is too short" in said
@@ -318,7 +318,7 @@ def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tm
 
 @pytest.mark.slow
 def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
-    folder = spoilt(spoils.resampled(0.5))
+    folder = spoilt(spoils.resample_poses(0.5))
     assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "There are 20 poses, but 40 frames" in said
@@ -327,13 +327,13 @@ def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path):
-    outcome = call_ingest(spoilt(spoils.late(-9)), "--force", "--out", tmp_path / "run")
+    outcome = call_ingest(spoilt(spoils.delay_poses(-9)), "--force", "--out", tmp_path / "run")
     assert outcome.code == 0
     assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
 
 
 @pytest.mark.slow
 def test_ingest_warns_of_late_poses_and_goes_on(spoilt, call_ingest, without_baking, tmp_path):
-    outcome = call_ingest(spoilt(spoils.late(2)), "--out", tmp_path / "run")
+    outcome = call_ingest(spoilt(spoils.delay_poses(2)), "--out", tmp_path / "run")
     assert outcome.code == 0
     assert "the poses come 2 frames too late" in " ".join(outcome.err.split())

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from apps.playing import encoders
-from apps.playing.background import background
-from apps.playing.clip import check_clip, encoder_of, write_clip
-from capture.errors import BadInput
+from apps.playing.background import background_compositor
+from apps.playing.clip import check_clip_path, choose_encoder, write_clip
+from capture.errors import InputError
 
 needs_av = pytest.mark.skipif(
     importlib.util.find_spec("av") is None, reason="the extra [video] is not installed"
@@ -24,7 +24,7 @@ def library(request, monkeypatch):
         if importlib.util.find_spec("av") is None:
             pytest.skip("the extra [video] is not installed")
     else:
-        monkeypatch.setattr(encoders, "_has_av", lambda codec: False)
+        monkeypatch.setattr(encoders, "_pyav_has", lambda codec: False)
     return request.param
 
 
@@ -40,7 +40,7 @@ def disc(count, *, height=60, width=80):
 
 
 def written(path, pictures, *, blend, fps=25.0):
-    return write_clip(path, pictures, fps=fps, blend=blend, encoder=encoder_of(path, blend))
+    return write_clip(path, pictures, fps=fps, blend=blend, encoder=choose_encoder(path, blend))
 
 
 def shown(path):
@@ -55,7 +55,7 @@ def shown(path):
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
 @pytest.mark.parametrize("color", ["#808080", "#4080c0", "#c8d2dc"])
 def test_a_video_has_the_colours_that_were_drawn(tmp_path, library, suffix, color):
-    path, blend = tmp_path / f"clip{suffix}", background(color)
+    path, blend = tmp_path / f"clip{suffix}", background_compositor(color)
     assert written(path, disc(6), blend=blend) == 6
     frames, fps = shown(path)
     assert len(frames) == 6
@@ -70,7 +70,7 @@ def test_a_video_has_the_colours_that_were_drawn(tmp_path, library, suffix, colo
 def test_odd_sizes_and_odd_rates_are_written(tmp_path, library, suffix):
     path = tmp_path / f"clip{suffix}"
     pictures = disc(5, height=61, width=79)
-    assert written(path, pictures, blend=background("black"), fps=23.976) == 5
+    assert written(path, pictures, blend=background_compositor("black"), fps=23.976) == 5
     frames, fps = shown(path)
     assert frames[0].shape == (62, 80, 3)
     assert fps == pytest.approx(23.976, rel=1e-3)
@@ -82,8 +82,8 @@ def test_with_the_extra_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
 
     for name, codec, word in (("a.mp4", "h264", "everywhere"), ("a.webm", "vp9", "browsers")):
         path = tmp_path / name
-        assert word in encoder_of(path, background("white")).said
-        written(path, disc(3), blend=background("white"))
+        assert word in choose_encoder(path, background_compositor("white")).description
+        written(path, disc(3), blend=background_compositor("white"))
         with av.open(str(path)) as file:
             stream = file.streams.video[0]
             assert stream.codec_context.name == codec
@@ -111,17 +111,17 @@ def test_a_webm_keeps_soft_alpha(tmp_path):
 
 
 def test_without_the_extra_it_is_said_what_is_written(monkeypatch, tmp_path):
-    monkeypatch.setattr(encoders, "_has_av", lambda codec: False)
-    white = background("white")
-    assert "VP8" in encoder_of(tmp_path / "a.webm", white).said
+    monkeypatch.setattr(encoders, "_pyav_has", lambda codec: False)
+    white = background_compositor("white")
+    assert "VP8" in choose_encoder(tmp_path / "a.webm", white).description
     monkeypatch.setattr(encoders, "_opencv_has", lambda code: False)
-    assert "browsers do not play it" in encoder_of(tmp_path / "a.mp4", white).said
+    assert "browsers do not play it" in choose_encoder(tmp_path / "a.mp4", white).description
     monkeypatch.setattr(encoders, "_opencv_has", lambda code: code == "avc1")
-    assert "H.264" in encoder_of(tmp_path / "a.mp4", white).said
-    with pytest.raises(BadInput, match=r"\[video\]"):
-        encoder_of(tmp_path / "a.webm", None)
-    with pytest.raises(BadInput, match="no transparency"):
-        encoder_of(tmp_path / "a.mp4", None)
+    assert "H.264" in choose_encoder(tmp_path / "a.mp4", white).description
+    with pytest.raises(InputError, match=r"\[video\]"):
+        choose_encoder(tmp_path / "a.webm", None)
+    with pytest.raises(InputError, match="no transparency"):
+        choose_encoder(tmp_path / "a.mp4", None)
 
 
 def frames_in(path):
@@ -155,7 +155,7 @@ def test_a_gif_is_clear_where_nothing_is_and_keeps_its_pace(tmp_path):
 
 def test_a_gif_shows_what_was_drawn(tmp_path, rng):
     """A palette for each picture: smooth shades stay within a few steps."""
-    path, blend = tmp_path / "a.gif", background("white")
+    path, blend = tmp_path / "a.gif", background_compositor("white")
     ramp = np.linspace(0, 255, 80)[None, :, None] * np.ones((60, 1, 1))
     smooth = np.concatenate([ramp, 255 - ramp, np.full_like(ramp, 90), np.full_like(ramp, 255)], 2)
     written(path, iter([smooth.astype(np.uint8)] * 2), blend=blend)
@@ -165,7 +165,7 @@ def test_a_gif_shows_what_was_drawn(tmp_path, rng):
 
 def test_a_png_is_one_picture_exactly(tmp_path):
     (picture,) = disc(1)
-    for blend, expected in ((None, picture), (background("teal"), background("teal")(picture))):
+    for blend, expected in ((None, picture), (background_compositor("teal"), background_compositor("teal")(picture))):
         path = tmp_path / "a.png"
         assert written(path, disc(1), blend=blend) == 1
         with Image.open(path) as image:
@@ -174,9 +174,9 @@ def test_a_png_is_one_picture_exactly(tmp_path):
 
 def test_nothing_but_frames_is_replaced(tmp_path):
     out = tmp_path / "frames"
-    write_clip(out, disc(1), fps=30.0, blend=None, encoder=encoder_of(out, None))
-    check_clip(out, [], overwrite=False)
+    write_clip(out, disc(1), fps=30.0, blend=None, encoder=choose_encoder(out, None))
+    check_clip_path(out, [], overwrite=False)
     (out / "0001.png").write_bytes(b"mine")
     for overwrite in (False, True):
-        with pytest.raises(BadInput, match=r"holds 0001\.png"):
-            check_clip(out, [], overwrite=overwrite)
+        with pytest.raises(InputError, match=r"holds 0001\.png"):
+            check_clip_path(out, [], overwrite=overwrite)

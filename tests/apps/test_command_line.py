@@ -67,7 +67,7 @@ def test_masks_cannot_be_dark_and_bright(program, capsys):
 def test_auto_trains_on_the_cpu_even_if_torch_sees_a_gpu(monkeypatch):
     import torch
 
-    from apps.terminal.device import device_for
+    from apps.terminal.device import resolve_device
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [device_for(name).type for name in ("auto", "cpu", "cuda")] == ["cpu", "cpu", "cuda"]
+    assert [resolve_device(name).type for name in ("auto", "cpu", "cuda")] == ["cpu", "cpu", "cuda"]

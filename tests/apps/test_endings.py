@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.playing.background import background
-from apps.terminal.console import MOST_WARNINGS, Console, duration
-from apps.terminal.exit_codes import Stop, exit_code
-from apps.terminal.interrupt import asked_to_stop
-from capture.errors import BadInput
+from apps.playing.background import background_compositor
+from apps.terminal.console import MAX_PRINTED_WARNINGS, Console, format_duration
+from apps.terminal.exit_codes import CommandExit, run_command
+from apps.terminal.interrupt import stop_on_interrupt
+from capture.errors import InputError
 from capture.images import read_image
 
 
@@ -29,7 +29,7 @@ def raising(error):
 @pytest.mark.parametrize(
     ("error", "code", "word"),
     [
-        (BadInput("3 poses for 4 frames"), 2, "3 poses for 4 frames"),
+        (InputError("3 poses for 4 frames"), 2, "3 poses for 4 frames"),
         (OSError(errno.ENOSPC, "No space left on device"), 3, "full"),
         (OSError(errno.EDQUOT, "Disk quota exceeded"), 3, "full"),
         (OSError(errno.EBUSY, "Device or resource busy"), 3, "busy"),
@@ -39,11 +39,11 @@ def raising(error):
         (OSError(errno.ELOOP, "Too many levels of symbolic links", "a"), 2, "Name another place"),
         (MemoryError(), 3, "memory"),
         (KeyboardInterrupt(), 130, "Ctrl-C"),
-        (Stop("too [blurred]", 1), 1, "too [blurred]"),
+        (CommandExit("too [blurred]", 1), 1, "too [blurred]"),
     ],
 )
 def test_each_failure_has_its_number_and_one_message(error, code, word, capsys):
-    assert exit_code("ia-test", raising(error)) == code
+    assert run_command("ia-test", raising(error)) == code
     said = capsys.readouterr().err
     assert said.startswith("ia-test: ")
     assert word in said
@@ -53,14 +53,14 @@ def test_each_failure_has_its_number_and_one_message(error, code, word, capsys):
 def test_what_is_added_on_the_way_is_said(capsys):
     error = OSError(errno.ENOSPC, "No space left on device")
     error.add_note("The checkpoint is kept.")
-    assert exit_code("ia-test", raising(error)) == 3
+    assert run_command("ia-test", raising(error)) == 3
     assert "The checkpoint is kept." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError(), RuntimeError("shape"), OSError(5, "EIO")])
 def test_our_own_faults_keep_their_traceback(error):
     with pytest.raises(type(error)):
-        exit_code("ia-test", raising(error))
+        run_command("ia-test", raising(error))
 
 
 def test_what_an_import_makes_of_ctrl_c_is_still_ctrl_c(capsys):
@@ -71,24 +71,24 @@ def test_what_an_import_makes_of_ctrl_c_is_still_ctrl_c(capsys):
             raise ImportError("initialization failed") from None
 
     before = signal.getsignal(signal.SIGINT)
-    assert exit_code("ia-test", half_imported) == 130
+    assert run_command("ia-test", half_imported) == 130
     assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
     assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_machine_that_asks_for_an_end_is_answered_like_ctrl_c(capsys):
     before = signal.getsignal(signal.SIGTERM)
-    assert exit_code("ia-test", lambda: signal.raise_signal(signal.SIGTERM) or 0) == 130
+    assert run_command("ia-test", lambda: signal.raise_signal(signal.SIGTERM) or 0) == 130
     assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
     assert signal.getsignal(signal.SIGTERM) is before
     said = Console(RichConsole(file=io.StringIO()))
 
     def saves():
-        with asked_to_stop(said) as stop:
+        with stop_on_interrupt(said) as stop:
             signal.raise_signal(signal.SIGTERM)
             return 130 if stop.is_set() else 0
 
-    assert exit_code("ia-test", saves) == 130
+    assert run_command("ia-test", saves) == 130
 
 
 def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
@@ -152,24 +152,24 @@ def test_work_goes_on_when_nobody_listens_any_more():
 def test_warnings_are_said_once_and_not_for_ever():
     said = io.StringIO()
     console = Console(RichConsole(file=said, soft_wrap=True))
-    for number in range(MOST_WARNINGS + 3):
-        console.warn(f"frame {number} [bold]")
-        console.warn(f"frame {number} [bold]")
-    console.count_the_rest()
-    assert said.getvalue().count("frame") == MOST_WARNINGS
+    for number in range(MAX_PRINTED_WARNINGS + 3):
+        console.warning(f"frame {number} [bold]")
+        console.warning(f"frame {number} [bold]")
+    console.summarize_warnings()
+    assert said.getvalue().count("frame") == MAX_PRINTED_WARNINGS
     assert "and 3 more" in said.getvalue()
     assert "[bold]" in said.getvalue()
-    assert len(console.warnings) == MOST_WARNINGS + 3
+    assert len(console.warnings) == MAX_PRINTED_WARNINGS + 3
 
 
 def test_a_log_gets_plain_lines_and_few(monkeypatch):
     said = io.StringIO()
     console = Console(RichConsole(file=said))
-    with console.bar("learning", 60.0) as bar:
+    with console.progress("learning", 60.0) as bar:
         for step in range(100):
-            bar.move(float(step), f"step {step}")
+            bar.update(float(step), f"step {step}")
         monkeypatch.setattr("apps.terminal.console.LOG_EVERY_S", 0.0)
-        bar.move(60.0, "the end")
+        bar.update(60.0, "the end")
     assert said.getvalue() == "learning\nlearning: the end\n"
 
 
@@ -177,12 +177,12 @@ def test_a_count_says_how_long_the_rest_takes(monkeypatch):
     """A quarter is done after ten seconds, so thirty are left."""
     now, said = [100.0], io.StringIO()
     monkeypatch.setattr("apps.terminal.console.time.perf_counter", lambda: now[0])
-    with Console(RichConsole(file=said)).bar("scoring 12 held-out frames", 12.0) as bar:
-        bar.count(1)  # too early to say
+    with Console(RichConsole(file=said)).progress("scoring 12 held-out frames", 12.0) as bar:
+        bar.set_count(1)  # too early to say
         now[0] += 10.0
-        bar.count(3)
+        bar.set_count(3)
         now[0] += 30.0
-        bar.count(12)
+        bar.set_count(12)
     assert said.getvalue().splitlines() == [
         "scoring 12 held-out frames",
         "scoring 12 held-out frames: 3 of 12, about 30 s left",
@@ -193,8 +193,8 @@ def test_a_count_says_how_long_the_rest_takes(monkeypatch):
 def test_a_long_note_leaves_a_bar_its_name():
     said = io.StringIO()
     rich = RichConsole(file=said, force_terminal=True, width=100, color_system=None)
-    with Console(rich).bar("writing the package", 1.0) as bar:
-        bar.move(0.4, "40% " + 200 * "x")
+    with Console(rich).progress("writing the package", 1.0) as bar:
+        bar.update(0.4, "40% " + 200 * "x")
     assert "writing the package" in said.getvalue()
     assert "40%" in said.getvalue()
 
@@ -204,19 +204,19 @@ def test_a_long_note_leaves_a_bar_its_name():
     [(0.2, "1 s"), (8.4, "8 s"), (43.0, "45 s"), (89.0, "90 s"), (130.0, "2 min")],
 )
 def test_durations_as_people_say_them(seconds, said):
-    assert duration(seconds) == said
+    assert format_duration(seconds) == said
 
 
 def test_colours_and_pictures_stand_behind_an_avatar(tmp_path, rng):
     rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
     rgba[0, :, 3], rgba[1, :, 3] = 0, 255
-    on_blue = background("rgb(10, 20, 250)")(rgba)
+    on_blue = background_compositor("rgb(10, 20, 250)")(rgba)
     assert (on_blue[0] == [10, 20, 250]).all()
     np.testing.assert_array_equal(on_blue[1], rgba[1, :, :3])
     from PIL import Image
 
     path = tmp_path / "wall.png"
     Image.fromarray(rng.integers(0, 256, (6, 20, 3), dtype=np.uint8)).save(path)
-    on_wall = background(str(path))(rgba)
+    on_wall = background_compositor(str(path))(rgba)
     np.testing.assert_array_equal(on_wall[0], read_image(path)[0][0, 6:14])
     np.testing.assert_array_equal(on_wall[1], rgba[1, :, :3])

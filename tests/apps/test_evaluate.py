@@ -9,13 +9,13 @@ import pytest
 
 from apps import evaluate, ingest
 from apps.evaluating import judge, protocol
-from apps.evaluating.rows import Evaluation, FrameScore, Row, scored
-from apps.evaluating.table import table
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
+from apps.evaluating.rows import AvatarEvaluation, FrameScore, ScoreRow, score_frame
+from apps.evaluating.table import markdown_table
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
 from apps.terminal.console import Console
 from apps.terminal.exit_codes import INTERRUPTED
-from avatar.hold import truth_on_white
+from avatar.hold import ground_truth_on_white
 from tests.apps.conftest import Outcome
 
 
@@ -33,7 +33,7 @@ def call_evaluate(capsys):
 
 def rows_of(path):
     (avatar,) = json.loads(path.read_text())["avatars"]
-    return {(row["drawn_by"], row["poses"]): row for row in avatar["rows"]}
+    return {(row["renderer"], row["poses"]): row for row in avatar["rows"]}
 
 
 def test_a_runs_own_table_says_what_its_report_says(run, call_evaluate, tmp_path):
@@ -73,7 +73,7 @@ def dataset(film, call_ingest, tmp_path, monkeypatch):
     """Two subjects in the paper's layout, with shorter lists."""
     lists = {protocol.TRAIN_POSES: np.s_[0:16:2], protocol.TEST_POSES: np.s_[16:24:3]}
     subjects = tuple(
-        protocol.Subject(
+        protocol.DatasetSubject(
             name=name, train="0:16:2", test="16:24:3", paper={"psnr": 29.65, "ssim": 0.973}
         )
         for name in ("female-3-casual", "male-3-casual")
@@ -148,15 +148,15 @@ def test_the_papers_lists_are_as_long_as_the_paper_says():
 
 
 def test_a_box_is_scored_without_the_white_around_it(film):
-    (seen, *_) = open_recording(RecordingPaths(video=film)).observations()
-    truth = truth_on_white(seen)
+    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
+    truth = ground_truth_on_white(seen)
     wrong = np.dstack([np.clip(truth - 0.1, 0.0, 1.0), np.ones(truth.shape[:2])]).astype(np.float32)
-    score = scored(seen, lambda: wrong)
+    score = score_frame(seen, lambda: wrong)
     rows, columns = np.nonzero(seen.alpha > 0.5)
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     error = ((wrong[..., :3] - truth)[box].astype(float) ** 2).mean()
     assert score.psnr_box == pytest.approx(-10.0 * np.log10(error), abs=1e-4)
-    perfect = scored(seen, lambda: np.dstack([truth, np.ones(truth.shape[:2], np.float32)]))
+    perfect = score_frame(seen, lambda: np.dstack([truth, np.ones(truth.shape[:2], np.float32)]))
     assert perfect.psnr_box == np.inf
     assert perfect.ssim == pytest.approx(1.0)
 
@@ -167,10 +167,10 @@ def test_a_table_is_markdown_and_its_means_are_means():
             frame=0, psnr=psnr, psnr_mask=20.0, psnr_box=25.0, ssim=0.9, cpu_ms=np.inf,
             blur=0.01, overlap=0.9,
         )  # fmt: skip
-        row = Row(drawn_by="renderer", poses="given", scores=[score])
-        return Evaluation(name=name, capture="c", size=(8, 8), rows=[row])
+        row = ScoreRow(renderer="renderer", poses="given", scores=[score])
+        return AvatarEvaluation(name=name, capture="c", size=(8, 8), rows=[row])
 
-    lines = table([avatar("one", 30.0), avatar("other", 33.0)]).splitlines()
+    lines = markdown_table([avatar("one", 30.0), avatar("other", 33.0)]).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert len(set(map(len, lines))) == 1
     cells = [cell.strip() for cell in lines[-1].split("|")]
@@ -179,7 +179,7 @@ def test_a_table_is_markdown_and_its_means_are_means():
 
 
 def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):
-    seen = list(open_recording(RecordingPaths(video=film)).observations())[:3]
+    seen = list(open_capture(CaptureInputs(video=film)).observations())[:3]
     stop, console = threading.Event(), Console()
 
     def stopped_in_the_second():
@@ -188,9 +188,9 @@ def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):
         yield from seen[1:]
 
     players = {"hq": judge.Player.load(run / "avatar.iavatar")}
-    found = judge.Judge(None, players, fits=True)
-    with console.bar("scoring", 3.0) as bar:
-        found.look(stopped_in_the_second(), bar, stop)
+    found = judge.AvatarScorer(None, players, fit_poses=True)
+    with console.progress("scoring", 3.0) as bar:
+        found.score_frames(stopped_in_the_second(), bar, stop)
     assert [len(row.scores) for row in found.rows] == [0]
 
 
@@ -201,7 +201,7 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
     report = place / "out" / "run" / "report.json"
     content = json.loads(report.read_text())
     content["command"] |= {"video": "capture", "out": "out/run"}
-    report.write_text(json.dumps(content))
+    report.write_text_atomically(json.dumps(content))
     monkeypatch.chdir(tmp_path)
     ended = call_evaluate(place / "out" / "run", "--no-fitted", "--no-player")
     assert ended.code == 0, ended.err

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from apps import export
-from export.player import Player, verify
+from export.player import Player, verify_package
 from preprocess.pose_file import read_motion
 
 
@@ -25,7 +25,7 @@ def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_pa
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     code, said = call_export(run, "--out", tmp_path / "now.iavatar")
     assert code == 0, said.err
-    assert all(likeness.alike for likeness in verify(tmp_path / "now.iavatar"))
+    assert all(likeness.matches for likeness in verify_package(tmp_path / "now.iavatar"))
     golden = Player.load(tmp_path / "now.iavatar").manifest.golden[0]
     shown = Player.load(tmp_path / "now.iavatar").render(golden.pose, golden.camera)
     assert 0.03 < (shown[..., 3] > 127).mean() < 0.5
@@ -33,7 +33,7 @@ def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_pa
 
 
 def test_the_whole_person_is_in_the_views(rig):
-    for _, camera in export.views(rig):
+    for _, camera in export.synthetic_views(rig):
         seen = camera.project(rig.seeds.astype(float))
         assert (seen > 0).all()
         assert (seen < np.array(camera.size_px)).all()

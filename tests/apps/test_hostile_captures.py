@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.hostile import CAP_MB, batches
+from benchmarks.hostile import MAX_MEMORY_MB, batches
 from benchmarks.hostile_seeds import make_seeds
 
 
@@ -13,4 +13,4 @@ def test_every_reader_reads_or_refuses_whatever_it_is_given(tmp_path):
     assert len(found) == 240
     assert {each["kind"] for each in found} >= {"poses", "masks", "cameras", "bodies", "captures"}
     assert [each for each in found if each["ended"] not in ("read", "refused")] == []
-    assert max(each["mb"] for each in found) < CAP_MB
+    assert max(each["mb"] for each in found) < MAX_MEMORY_MB

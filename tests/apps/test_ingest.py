@@ -14,11 +14,11 @@ import torch
 
 from apps.learning import deliver, learn
 from apps.learning.run_folder import RunFolder
-from apps.reporting.failure import failure_of
+from apps.reporting.failure import diagnose_failure
 from avatar import checkpoint
-from avatar.advice import EVERYTHING
-from capture.atomic_files import write_text
-from capture.file_list import NAME as LIST
+from avatar.advice import SEEN_COMPLETELY
+from capture.atomic_files import write_text_atomically
+from capture.file_list import LIST_NAME as LIST
 from export.player import Player
 
 KEYS = {
@@ -90,8 +90,8 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
     """The package and the report are there; the exit code is not 0."""
-    monkeypatch.setattr(deliver, "failure_of", failure_of)
-    score = learn.score
+    monkeypatch.setattr(deliver, "diagnose_failure", diagnose_failure)
+    score = learn.score_frame
 
     def as_of_a_room(avatar, held):
         return replace(score(avatar, held), psnr=6.88, blur=math.inf, overlap=0.2)
@@ -138,7 +138,7 @@ def test_an_actor_who_turns_twice_is_seen_from_all_sides(report):
     coverage = report["coverage"]
     assert coverage["seen"] > 0.95
     assert coverage["well"] < coverage["seen"]
-    assert coverage["advice"] == EVERYTHING
+    assert coverage["advice"] == SEEN_COMPLETELY
     assert len(coverage["parts"]) == 14
     assert coverage["parts"]["torso"]["back"] > 0.95
 
@@ -176,18 +176,18 @@ def test_nothing_is_written_outside_the_run(capture, call_ingest, without_baking
 
 def test_an_older_run_is_not_lost_by_accident(capture, call_ingest, tmp_path):
     run = RunFolder(path=tmp_path / "run")
-    run.begin(resume=False)
-    write_text(run.report, "{}")
+    run.start_run(resume=False)
+    write_text_atomically(run.report_json, "{}")
     outcome = call_ingest(capture, *FEW, "--out", run.path)
     assert outcome.code == 2
     assert "--overwrite" in outcome.complaint()
-    assert run.report.read_text() == "{}"
+    assert run.report_json.read_text() == "{}"
 
 
 def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path):
     run = RunFolder(path=tmp_path / "run")
-    run.begin(resume=False)
-    write_text(run.report, "{}")
+    run.start_run(resume=False)
+    write_text_atomically(run.report_json, "{}")
     copy = tmp_path / "copy.json"
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", "--overwrite", "--json", copy)
     assert outcome.code == 0
@@ -197,7 +197,7 @@ def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path)
 
 def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
     out = tmp_path / "run"
-    RunFolder(path=out).begin(resume=False)  # as of a run that was killed at its start
+    RunFolder(path=out).start_run(resume=False)  # as of a run that was killed at its start
     assert "no checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
     first = json.loads((out / "report.json").read_text())
     outcome = call_ingest(capture, *FEW, "--out", out, "--resume", steps=15)
@@ -212,7 +212,7 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
 def test_a_full_disk_keeps_the_checkpoint_before(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(learn, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(learn, "CHECKPOINT_INTERVAL_S", 0.0)
     save, written = torch.save, []
 
     def full_after_one(state, file):

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from apps.terminal.packages import LEARNING, SMALL, advice
+from apps.terminal.packages import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -80,13 +80,13 @@ PLAY = [
 
 def test_what_learning_needs_is_an_extra():
     needed = names(PROJECT["dependencies"])
-    assert names(PROJECT["optional-dependencies"]["learn"]) == LEARNING | SMALL
-    assert needed.isdisjoint(LEARNING | SMALL)
+    assert names(PROJECT["optional-dependencies"]["learn"]) == LEARN_PACKAGES | SMALL_PACKAGES
+    assert needed.isdisjoint(LEARN_PACKAGES | SMALL_PACKAGES)
 
 
 def test_playing_checking_and_meshes_need_nothing_of_it(place, film):
     commands = [*PLAY, ["check", str(film), "--sheet", "sheet.png"]]
-    ended = without(LEARNING | SMALL, commands, place)
+    ended = without(LEARN_PACKAGES | SMALL_PACKAGES, commands, place)
     assert [line[0] for line in ended] == ["0"] * len(commands), ended
     assert played(place)
 
@@ -101,7 +101,7 @@ def test_commands_that_need_it_say_what_to_install(place, run, film):
         (["export", "avatar.iavatar", "--to", "ply", "--out", "a.ply"], "pip install trimesh"),
     ]
     before = sorted(place.iterdir())
-    ended = without(LEARNING | SMALL, [words for words, _ in wanted], place)
+    ended = without(LEARN_PACKAGES | SMALL_PACKAGES, [words for words, _ in wanted], place)
     for line, (_, said) in zip(ended, wanted, strict=True):
         first, last = said.split(".*")[0], said.split(".*")[-1].strip()
         assert line.startswith("2 ")
@@ -112,8 +112,8 @@ def test_commands_that_need_it_say_what_to_install(place, run, film):
 
 
 def test_a_module_of_our_own_that_is_missing_is_no_advice():
-    assert advice(ModuleNotFoundError("No module named 'apps.gone'", name="apps.gone")) is None
-    assert "pip install pycolmap" in str(advice(ModuleNotFoundError(name="pycolmap._core")))
+    assert install_advice(ModuleNotFoundError("No module named 'apps.gone'", name="apps.gone")) is None
+    assert "pip install pycolmap" in str(install_advice(ModuleNotFoundError(name="pycolmap._core")))
 
 
 def index_or_skip(folder: Path) -> None:
@@ -151,7 +151,7 @@ def test_an_installation_without_extras_plays(place, tmp_path_factory):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    absent = sorted(LEARNING | SMALL)
+    absent = sorted(LEARN_PACKAGES | SMALL_PACKAGES)
     looked = f"from importlib.util import find_spec; print([*map(find_spec, {absent})])"
     assert call(python, "-c", looked).strip() == str([None] * len(absent))
     for command, *words in PLAY:

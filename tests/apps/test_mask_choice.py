@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
-from capture.decoder import CvDecoder
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
+from capture.decoder import OpenCvDecoder
 from capture.opening import open_source
-from preprocess.live import ALPHA_CAME_LATE
+from preprocess.live import LATE_ALPHA_WARNING
 from preprocess.observation import Observation
 
 FRAMES = 4
@@ -73,7 +73,7 @@ def lower(mask):
 
 def wanted(folder, given, *, live):
     masks = {"given": folder / "mine", "segmenter": Path("segmenter:grabcut")}.get(given)
-    return RecordingPaths(video=folder, masks=masks, live=live, idle_s=1.0)
+    return CaptureInputs(video=folder, masks=masks, live=live, idle_s=1.0)
 
 
 def parts_shown(recording):
@@ -98,12 +98,12 @@ def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live
         "segmenter": (ESTIMATED, (True, True)),
     }[masks]
     there = folder([alpha] * FRAMES, beside="beside" in masks)
-    recording = open_recording(
-        wanted(there, masks.split(",", maxsplit=1)[0], live=live), doubtful=True
+    recording = open_capture(
+        wanted(there, masks.split(",", maxsplit=1)[0], live=live), skip_checks=True
     )
     found = parts_shown(recording)
     assert found == [shown] * FRAMES
-    assert recording.told_of_masks()["masks"] == expected  # after the frames, as the report does
+    assert recording.mask_report()["masks"] == expected  # after the frames, as the report does
     assert any("estimated" in note for note in recording.notes) == (expected == ESTIMATED)
     assert any("alpha channel" in note for note in recording.notes) == (expected == ALPHA)
     assert not recording.source.warnings
@@ -112,22 +112,22 @@ def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live
 @pytest.mark.parametrize("live", [False, True], ids=["recorded", "live"])
 def test_one_opaque_picture_at_the_start_does_not_decide(folder, live):
     there = folder(["opaque", "informative", "none", "informative"], beside=False)
-    recording = open_recording(wanted(there, "none", live=live))
+    recording = open_capture(wanted(there, "none", live=live))
     assert parts_shown(recording) == [None, (True, False), None, (True, False)]
-    assert recording.told_of_masks()["masks"] == ALPHA
+    assert recording.mask_report()["masks"] == ALPHA
 
 
 def test_an_alpha_channel_that_comes_later_is_told(folder, shots):
     """What was there at the start decided; the finished folder is read otherwise."""
     there = folder(["opaque"] * FRAMES, beside=False)
-    recording = open_recording(wanted(there, "none", live=True))
+    recording = open_capture(wanted(there, "none", live=True))
     rgb, mask = shots[2]
     Image.fromarray(np.dstack([rgb, mask])).save(there / "images" / "0002.png")
     assert parts_shown(recording) == [(True, True)] * FRAMES
-    assert recording.source.warnings == [ALPHA_CAME_LATE]
-    assert recording.told_of_masks()["masks"] == ESTIMATED
-    finished = open_recording(wanted(there, "none", live=False))
-    assert finished.told_of_masks()["masks"] == ALPHA
+    assert recording.source.warnings == [LATE_ALPHA_WARNING]
+    assert recording.mask_report()["masks"] == ESTIMATED
+    finished = open_capture(wanted(there, "none", live=False))
+    assert finished.mask_report()["masks"] == ALPHA
 
 
 def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folder, film):
@@ -142,16 +142,16 @@ def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folde
     thread = threading.Timer(0.2, begin)
     thread.start()
     paths = replace(wanted(there, "none", live=True), idle_s=60.0)
-    assert open_recording(paths).told_of_masks()["masks"] == "masks"
+    assert open_capture(paths).mask_report()["masks"] == "masks"
     thread.join()
 
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_videos_alpha_channel_is_told_where_masks_are_estimated(capture, monkeypatch, masked):
     monkeypatch.setattr("capture.decoder.has_alpha_plane", lambda tag: True)
-    monkeypatch.setattr("capture.video.open_decoder", CvDecoder)
+    monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
     if not masked:
         shutil.rmtree(capture / "masks")
-    said = [n for n in open_recording(RecordingPaths(video=capture)).notes if "alpha" in n]
+    said = [n for n in open_capture(CaptureInputs(video=capture)).notes if "alpha" in n]
     assert bool(said) != masked
     assert all(f"ffmpeg -i {capture / 'video.mp4'}" in note for note in said)

@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from apps import check, play
-from apps.checking.examine import looks_well
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
+from apps.checking.examine import passes_quick_check
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.pose_file import read_motion, write_motion
-from preprocess.poses.place import moved
+from preprocess.poses.place import transform_motion
 
 
 @pytest.fixture
@@ -23,14 +23,14 @@ def walk(capture):
 
     Body and camera are moved together, each frame otherwise: pictures stay as they are.
     """
-    still = open_recording(RecordingPaths(video=capture))
+    still = open_capture(CaptureInputs(video=capture))
     frames, camera = len(still.motion), still.cameras[0]
     worlds = np.broadcast_to(np.eye(4), (frames, 4, 4)).copy()
     angles = np.linspace(0.0, 1.5, frames)
     worlds[:, :3, :3] = Rotation.from_rotvec(np.outer(angles, [0.0, 1.0, 0.0])).as_matrix()
     worlds[:, :3, 3] = np.column_stack([angles, 0.2 * angles, -angles])
     (capture / "poses.npz").unlink()
-    write_motion(capture / "poses.npz", moved(still.motion, worlds, still.shaped.joints[0]))
+    write_motion(capture / "poses.npz", transform_motion(still.motion, worlds, still.shaped.joints[0]))
     (capture / "cameras.npz").unlink()
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = [world @ np.linalg.inv(camera.camera_from_world) @ flip for world in worlds]
@@ -43,16 +43,16 @@ def walk(capture):
             for number, pose in enumerate(poses[:-2])
         ],
     }  # fmt: skip
-    (capture / "transforms.json").write_text(json.dumps(content))
+    (capture / "transforms.json").write_text_atomically(json.dumps(content))
     return capture, still
 
 
 def test_each_frame_is_seen_by_its_own_camera(walk):
     folder, still = walk
-    moving = open_recording(RecordingPaths(video=folder))
-    assert moving.cameras.moves
-    assert moving.footprint_m() == pytest.approx(still.footprint_m(), rel=1e-6)
-    assert looks_well(moving)
+    moving = open_capture(CaptureInputs(video=folder))
+    assert moving.cameras.is_moving
+    assert moving.pixel_footprint_m() == pytest.approx(still.footprint_m(), rel=1e-6)
+    assert passes_quick_check(moving)
     for then, now in zip(still.observations(), moving.observations(), strict=True):
         if not isinstance(now, Observation):
             assert (now.index >= 22, now.reason) == (True, "no camera")
@@ -94,7 +94,7 @@ def test_a_player_looks_through_cameras_of_other_programs(run, film, walk, tmp_p
     folder, _ = walk
     package = run / "avatar.iavatar"
     motion = read_motion(folder / "poses.npz")
-    write_motion(tmp_path / "short.npz", motion.taken(np.arange(22)))
+    write_motion(tmp_path / "short.npz", motion.select_rows(np.arange(22)))
     moving = [str(package), "--poses", str(tmp_path / "short.npz"), "--out", str(tmp_path / "a")]
     assert play.main([*moving, "--camera", str(folder / "transforms.json")]) == 0
     before = [str(package), "--poses", str(film / "poses.npz"), "--out", str(tmp_path / "b")]

@@ -103,7 +103,7 @@ def test_a_place_with_other_peoples_files_is_refused(
     line, hoard, film, run, package, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("export.web.runtime.runtime_files", dict)
+    monkeypatch.setattr("export.web.onnxruntime_web.runtime_files", dict)
     before = contents(tmp_path)
     assert called(line, film=film, hoard=hoard, run=run, package=package) == 2
     assert contents(tmp_path) == before
@@ -174,7 +174,7 @@ def test_what_is_written_beside_other_peoples_files_leaves_them(
         assert called(line, film=film, package=package) == 0, capsys.readouterr().err
         assert (hoard / made).is_file()
         assert unchanged(before, hoard), line
-    (hoard / "new" / "letter.txt").write_text("mine")
+    (hoard / "new" / "letter.txt").write_text_atomically("mine")
     before = contents(hoard)
     assert called("ia-sample new --frames 1 --size 16 --overwrite") == 2
     assert contents(hoard) == before
@@ -185,7 +185,7 @@ import os, shutil, signal, sys
 from pathlib import Path
 
 from apps.learning.run_folder import RunFolder
-from capture.atomic_files import Draft, whole_folder, write_text
+from capture.atomic_files import AtomicFile, atomic_folder, write_text_atomically
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
 folder, left = Path(sys.argv[1]), -1
@@ -202,12 +202,12 @@ def work():
     run.check([], resume=False, overwrite=True)
     run.begin(resume=False)
     for _ in range(2):
-        write_text(run.checkpoint / "state.pt", "learnt")
-    package = Draft(run.package)
+        write_text_atomically(run.checkpoint / "state.pt", "learnt")
+    package = AtomicFile(run.package)
     package.part.write_bytes(b"avatar")
     package.finish()
-    write_text(run.report, "{}")
-    with whole_folder(folder / "frames") as part:
+    write_text_atomically(run.report, "{}")
+    with atomic_folder(folder / "frames") as part:
         (part / "0000.png").write_bytes(b"new")
 
 sys.addaudithook(count)

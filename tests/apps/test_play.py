@@ -16,9 +16,9 @@ from PIL import Image
 from apps import ingest, play
 from apps.playing import encoders
 from apps.playing.follow import FollowingCamera
-from apps.playing.novel import novel_motion
-from apps.playing.verdict import package_notes
-from capture.file_list import NAME as LIST
+from apps.playing.novel import demo_motion
+from apps.playing.verdict import package_warnings
+from capture.file_list import LIST_NAME as LIST
 from export.package import read_package, write_package
 from export.player import Player
 from export.web import runtime, site
@@ -62,7 +62,7 @@ def test_a_folder_gets_frames_with_alpha_and_nothing_else(call_play, package, no
     for row in (0, 11):
         with Image.open(out / f"{row:04d}.png") as picture:
             assert picture.mode == "RGBA"
-            expected = player.render(motion[row], camera.at(motion[row]))
+            expected = player.render(motion[row], camera.camera_for(motion[row]))
             np.testing.assert_array_equal(np.asarray(picture), expected)
 
 
@@ -70,7 +70,7 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
     out = tmp_path / "frames"
     for _ in range(2):
         assert call_play(package, "--poses", novel, "--out", out, "--size", SIZE).code == 0
-    (out / "notes.txt").write_text("mine")
+    (out / "notes.txt").write_text_atomically("mine")
     outcome = call_play(package, "--poses", novel, "--out", out, "--size", SIZE)
     assert outcome.code == 2
     assert "notes.txt" in outcome.complaint("ia-play")
@@ -81,7 +81,7 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
 @pytest.fixture
 def without_av(monkeypatch):
     """As where the extra [video] is not installed."""
-    monkeypatch.setattr(encoders, "_has_av", lambda codec: False)
+    monkeypatch.setattr(encoders, "_pyav_has", lambda codec: False)
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
@@ -96,7 +96,7 @@ def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, s
     assert len(frames) == 12
     player, motion = Player.load(package), read_motion(novel)
     camera = FollowingCamera.of(player, motion, SIZE)
-    rgba = player.render(motion[0], camera.at(motion[0])).astype(np.float64)
+    rgba = player.render(motion[0], camera.camera_for(motion[0])).astype(np.float64)
     alpha = rgba[..., 3:] / 255.0
     expected = rgba[..., :3] * alpha + np.array([64, 128, 192]) * (1.0 - alpha)
     assert np.abs(frames[0][..., ::-1] - expected).mean() < 6.0
@@ -139,13 +139,13 @@ def test_the_film_s_camera_shows_what_the_film_shows(call_play, package, film, t
 
 def test_the_standing_person_takes_four_fifths_of_the_picture(package):
     player = Player.load(package)
-    motion = novel_motion(2)
+    motion = demo_motion(2)
     standing = BodyPose(
         root_rotation=np.zeros(3),
         root_translation=np.zeros(3),
         joint_rotations=player.manifest.canonical_rotations,
     )
-    camera = FollowingCamera.of(player, motion, 256).at(standing)
+    camera = FollowingCamera.of(player, motion, 256).camera_for(standing)
     rows = np.flatnonzero((player.render(standing, camera)[..., 3] > 127).any(axis=1))
     assert (rows[-1] + 1 - rows[0]) / 256 == pytest.approx(0.8, abs=0.03)
     assert (rows[-1] + 1 + rows[0]) / 2 == pytest.approx(128, abs=4)
@@ -168,7 +168,7 @@ def test_the_picture_does_not_depend_on_where_the_tracker_s_world_lies(package, 
         single = read_motion(novel)
         single.root_rotations[0] = one.root_rotation
         camera = FollowingCamera.of(player, single, SIZE)
-        pictures.append(player.render(one, camera.at(one)).astype(int))
+        pictures.append(player.render(one, camera.camera_for(one)).astype(int))
     assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
 
 
@@ -236,10 +236,10 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
 
 def test_what_was_wrong_when_a_package_was_written_is_said(package):
     manifest = replace(Player.load(package).manifest, metrics={})
-    assert package_notes(manifest) == []
+    assert package_warnings(manifest) == []
     mark = {"psnr": 6.9, "verdict": "failed"}
     told = replace(manifest, metrics={"warnings": ["It is fog."], "held_out": mark})
-    fog, failed = package_notes(told)
+    fog, failed = package_warnings(told)
     assert fog == "It is fog."
     assert "6.9 dB (failed)" in failed
 

@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from apps.playing import arguments as play_arguments
-from apps.playing.follow import FollowingCamera, standing_pose
-from apps.playing.novel import novel_motion
+from apps.playing.follow import FollowingCamera, canonical_pose_of
+from apps.playing.novel import demo_motion
 from apps.playing.viewpoint import Viewpoint
 from export.player import Player
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose_file import read_motion
-from preprocess.rotations import axis_angles
+from preprocess.rotations import axis_angles_from_matrices
 
 SIZE = 96
 
@@ -53,10 +53,10 @@ def frames(call_play, package, tmp_path):
 def test_a_turntable_shows_all_sides_and_ends_where_it_began(frames, player):
     drawn = frames("--turntable", "2", "--fps", "6")
     assert len(drawn) == 12
-    pose = standing_pose(player)
+    pose = canonical_pose_of(player)
     for picture, degrees in ((0, 0.0), (3, 90.0), (6, 180.0), (11, 330.0)):
         view = Viewpoint(orbit_deg=degrees)
-        camera = FollowingCamera.of(player, novel_motion(2), SIZE, view).at(pose)
+        camera = FollowingCamera.of(player, demo_motion(2), SIZE, view).camera_for(pose)
         assert np.abs(drawn[picture] - player.render(pose, camera)).mean() < 0.1
 
 
@@ -71,7 +71,7 @@ def test_a_turntable_turns_about_a_motion_while_it_plays(frames, player, novel):
     np.testing.assert_array_equal(turning[0], still[0])
     motion = read_motion(novel)
     view = Viewpoint(orbit_deg=360.0 * (6 / 30) / 4)
-    camera = FollowingCamera.of(player, motion, SIZE, view).at(motion[6])
+    camera = FollowingCamera.of(player, motion, SIZE, view).camera_for(motion[6])
     assert np.abs(turning[6] - player.render(motion[6], camera)).mean() < 0.1
 
 
@@ -83,7 +83,7 @@ def test_one_pose_is_one_picture(call_play, package, player, novel, tmp_path):
     held = read_motion(novel)
     held.valid[:] = np.arange(12) == 5
     view = Viewpoint(orbit_deg=-40.0, elevation_deg=20.0)
-    camera = FollowingCamera.of(player, held, (80, 60), view).at(motion[5])
+    camera = FollowingCamera.of(player, held, (80, 60), view).camera_for(motion[5])
     with Image.open(out) as picture:
         np.testing.assert_array_equal(np.asarray(picture), player.render(motion[5], camera))
 
@@ -127,8 +127,8 @@ def test_pictures_do_not_depend_on_the_workers(frames, novel):
 
 def test_by_itself_there_is_a_worker_for_each_core(monkeypatch, package):
     monkeypatch.setattr(play_arguments.os, "sched_getaffinity", lambda process: {0, 2, 5})
-    assert play_arguments.PlayArguments(avatar=package).threads == 3
-    assert play_arguments.PlayArguments(avatar=package, workers=2).threads == 2
+    assert play_arguments.PlayArguments(avatar=package).worker_count == 3
+    assert play_arguments.PlayArguments(avatar=package, workers=2).worker_count == 2
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -169,7 +169,7 @@ def test_ctrl_c_leaves_a_clip_that_plays(call_play, package, novel, tmp_path, mo
 def amass(motion, pelvis, folder):
     """AMASS, SMPL+H: hands after 22 joints, 120 poses a second, z up."""
     up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    roots = axis_angles(up @ rotation_matrices(motion.root_rotations))
+    roots = axis_angles_from_matrices(up @ rotation_matrices(motion.root_rotations))
     joints = motion.joint_rotations[:, :21].reshape(len(motion), 63)
     path = folder / "walk_poses.npz"
     np.savez(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from apps import check
-from apps.studio.writer import ShootConfig, shoot
+from apps.studio.writer import ShootConfig, film_capture
 from capture.opening import open_source
 from preprocess.pose_file import read_motion, write_motion
 
@@ -20,7 +20,7 @@ SIDE, FRAMES = 96, 40
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("turning") / "capture"
-    shoot(folder, ShootConfig(frames=FRAMES, size=SIDE, background="plain", turns=1.0))
+    film_capture(folder, ShootConfig(frames=FRAMES, size=SIDE, background="plain", turns=1.0))
     return folder
 
 
@@ -91,7 +91,7 @@ def test_somebody_elses_poses_from_the_middle_on_are_no_offset(capture, diagnose
     write_motion(capture / "poses.npz", motion)
     code, said, found = diagnosed()
     assert "The poses jump once (20). Did the tracker change persons?" in said
-    assert found["cures"] == []
+    assert found["corrections"] == []
     assert code == 2
 
 
@@ -104,7 +104,7 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
     change_masks(capture, boxed)
     _, said, found = diagnosed()
     assert "The masks are boxes" in said
-    assert found["cures"] == []
+    assert found["corrections"] == []
 
 
 def test_masks_that_are_turned_here_and_there_are_named_and_left_out(capture, diagnosed):
@@ -112,7 +112,7 @@ def test_masks_that_are_turned_here_and_there_are_named_and_left_out(capture, di
     code, said, found = diagnosed()
     assert "4 of 16 masks that were looked at cannot be used" in said
     assert "wrong way round" in said
-    assert (code, found["verdict"], found["cures"]) == (0, "warn", [])
+    assert (code, found["verdict"], found["corrections"]) == (0, "warn", [])
     assert found["iou"]["now"] > 0.8
 
 
@@ -152,10 +152,10 @@ def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
     capture, diagnosed, tmp_path
 ):
     true = read_motion(capture / "poses.npz")
-    back = true.taken(np.arange(FRAMES)[::-1], np.arange(FRAMES))
+    back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
     write_motion(capture / "poses.npz", back)
     code, said, found = diagnosed("--fix", tmp_path / "mended")
-    assert (code, found["cause"], len(found["cures"])) == (0, "frame_rate", 1)
+    assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
     assert "the film runs backwards against its poses" in said
     assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
     mended = read_motion(tmp_path / "mended" / "poses.npz")
@@ -174,7 +174,7 @@ def test_degrees_are_told_from_radians_and_mended(capture, diagnosed, tmp_path):
     )
     write_motion(capture / "poses.npz", degrees)
     code, said, found = diagnosed("--fix", tmp_path / "mended")
-    assert (code, found["cause"], len(found["cures"])) == (0, "root_rotation", 1)
+    assert (code, found["cause"], len(found["corrections"])) == (0, "root_rotation", 1)
     assert "the rotations are in degrees, not in radians" in said
     assert "degrees given?" in found["refused"]
     assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]

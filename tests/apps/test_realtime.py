@@ -58,4 +58,4 @@ def test_what_a_resumed_run_saw_before_is_not_played_again(play, film):
 )  # fmt: skip
 def test_without_seconds_a_minute_or_the_clip_is_learnt(film, words, seconds):
     given = IngestArguments(video=film, **words)
-    assert given.training_seconds(given.recording()) == pytest.approx(seconds)
+    assert given.training_seconds(given.open_capture()) == pytest.approx(seconds)

@@ -2,14 +2,14 @@
 
 import pytest
 
-from apps.learning.remaining import after_learning_s, held_out_of, how_far
+from apps.learning.remaining import post_training_seconds, expected_held_out, describe_position
 
 
 def test_what_comes_after_learning_grows_with_frames_and_pixels():
-    few = after_learning_s(2, 270, fitted=False)
-    assert few < after_learning_s(12, 270, fitted=False) < after_learning_s(12, 540, fitted=False)
-    assert after_learning_s(12, 540, fitted=True) > after_learning_s(12, 540, fitted=False)
-    assert after_learning_s(2, 270, fitted=False, slowed=3.0) == pytest.approx(3.0 * few)
+    few = post_training_seconds(2, 270, fit_poses=False)
+    assert few < post_training_seconds(12, 270, fit_poses=False) < post_training_seconds(12, 540, fit_poses=False)
+    assert post_training_seconds(12, 540, fit_poses=True) > post_training_seconds(12, 540, fit_poses=False)
+    assert post_training_seconds(2, 270, fit_poses=False, slowdown=3.0) == pytest.approx(3.0 * few)
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ def test_what_comes_after_learning_grows_with_frames_and_pixels():
     [(120, 10, 12), (8, 10, 1), (None, 10, 100), (9000, 10, 100), (120, 0, 0)],
 )
 def test_how_many_frames_will_be_held_out(frames, every, held):
-    assert held_out_of(frames, every, 100) == held
+    assert expected_held_out(frames, every, 100) == held
 
 
 @pytest.mark.parametrize(
@@ -31,10 +31,10 @@ def test_how_many_frames_will_be_held_out(frames, every, held):
     ],
 )  # fmt: skip
 def test_time_that_is_up_is_explained(wall_s, reading, said):
-    found = how_far(wall_s=wall_s, given_s=40.0, step=9, steps=None, reading=reading)
+    found = describe_position(elapsed_s=wall_s, budget_s=40.0, step=9, steps=None, frames_read=reading)
     assert found.endswith(said)
 
 
 def test_steps_that_were_asked_for_are_counted():
-    found = how_far(wall_s=54.0, given_s=40.0, step=9, steps=100, reading=None)
+    found = describe_position(elapsed_s=54.0, budget_s=40.0, step=9, steps=100, frames_read=None)
     assert found == "step 9 of 100, 54 s"

@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 
 from apps.learning.deliver import play_command
-from apps.reporting.curve import CurvePoint, largest_fall, largest_falls
+from apps.reporting.curve import CurvePoint, largest_drop, largest_drops
 from apps.reporting.curve_svg import curve_svg
-from apps.reporting.failure import failure_of
-from apps.reporting.page import Pair, report_page
-from apps.reporting.pictures import data_uri, moving_data_uri
+from apps.reporting.failure import diagnose_failure
+from apps.reporting.page import ComparisonPair, report_page
+from apps.reporting.pictures import webp_data_uri, animated_webp_data_uri
 from apps.reporting.report import (
-    DroppedNote,
-    ExtendedNote,
-    FramesNote,
-    HeldOutNote,
-    MachineNote,
+    DroppedFrameEntry,
+    ForgettingStats,
+    FrameStats,
+    HeldOutStats,
+    MachineInfo,
     Report,
-    Spread,
-    StreamNote,
-    TrainingNote,
-    decibels,
-    mean,
+    Percentiles,
+    StreamStats,
+    TrainingStats,
+    format_psnr,
+    finite_mean,
 )
-from avatar.events import Score
+from avatar.events import HeldOutScore
 
 
 def point(seconds, psnr, psnr_mask=None):
@@ -43,19 +43,19 @@ def report(**changes):
     content = {
         "command": {"video": "a <b> & c.mp4"},
         "recipe": {"rays": 1024, "finest_m": 0.0081234567},
-        "machine": MachineNote(device="cpu", backend="numba", threads=2),
-        "frames": FramesNote(
+        "machine": MachineInfo(device="cpu", backend="numba", threads=2),
+        "frames": FrameStats(
             read=20,
             used=17,
             held_out=2,
-            dropped=(DroppedNote(index=7, reason="pose invalid"),),
-            alike=0,
+            dropped=(DroppedFrameEntry(index=7, reason="pose invalid"),),
+            near_duplicates=0,
             not_replayed=0,
         ),
-        "training": TrainingNote(
+        "training": TrainingStats(
             wall_seconds=60.0,
             cpu_seconds=61.0,
-            cpu_waited_seconds=0.5,
+            cpu_contention_seconds=0.5,
             startup_seconds=3.0,
             steps=100,
             rays=102400,
@@ -63,16 +63,16 @@ def report(**changes):
             samples_per_ray=7.0,
             peak_memory_mb=900.0,
         ),
-        "held_out": HeldOutNote.of((), None),
+        "held_out": HeldOutStats.of((), None),
         "curve": (point(2.0, 24.0, 18.0), point(5.0, 29.0, 23.0)),
-        "stream": StreamNote(
+        "stream": StreamStats(
             realtime=False,
-            ingest_ms=Spread(p50=20.0, p95=30.0),
+            ingest_ms=Percentiles(p50=20.0, p95=30.0),
             inbox_dropped=0,
             ready_after_last_frame_seconds=None,
-            latency_ms=Spread(p50=25.0, p95=40.0),
-            lateness_ms=Spread(p50=0.0, p95=1.0),
-            inbox_depth=Spread(p50=0.0, p95=2.0),
+            latency_ms=Percentiles(p50=25.0, p95=40.0),
+            lateness_ms=Percentiles(p50=0.0, p95=1.0),
+            inbox_depth=Percentiles(p50=0.0, p95=2.0),
         ),
         "package": None,
     }
@@ -81,19 +81,19 @@ def report(**changes):
 
 def scores(*values):
     return tuple(
-        Score(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
+        HeldOutScore(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
         for i, (psnr, mask) in enumerate(values)
     )
 
 
 def test_the_mean_leaves_out_what_is_no_number():
-    assert mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
-    assert mean([float("nan")]) is None
-    assert mean([]) is None
+    assert finite_mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
+    assert finite_mean([float("nan")]) is None
+    assert finite_mean([]) is None
 
 
 def test_a_frame_without_a_person_has_no_masked_score():
-    note = HeldOutNote.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
+    note = HeldOutStats.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
     assert (note.psnr, note.psnr_mask) == (31.0, 20.0)
     assert note.frames == (9, 19)
 
@@ -118,17 +118,17 @@ def test_a_fall_is_a_frames_own_and_not_that_of_a_mean():
         return replace(point(2.0, 24.0), frames=frames)
 
     joined = (scored((9, 30.0)), scored((9, 31.0), (19, 20.0)), scored((9, 30.5), (19, 26.0)))
-    assert largest_fall(joined) == pytest.approx(0.5)
-    assert largest_fall(joined[:2]) == 0.0
-    assert largest_fall(joined[:1]) is None
+    assert largest_drop(joined) == pytest.approx(0.5)
+    assert largest_drop(joined[:2]) == 0.0
+    assert largest_drop(joined[:1]) is None
 
 
 def test_a_frame_of_another_video_has_no_best_in_this_one():
     first = replace(point(2.0, 30.0), frames=((9, 30.0),))
     added = replace(point(4.0, 20.0), frames=((9, 20.0), (19, 21.0)), video=2)
-    assert largest_fall((first, added)) is None
+    assert largest_drop((first, added)) is None
     lower = replace(point(6.0, 19.0), frames=((9, 19.5), (19, 22.0)), video=2)
-    assert largest_falls((first, added, lower)) == {(2, 9): 0.5, (2, 19): 0.0}
+    assert largest_drops((first, added, lower)) == {(2, 9): 0.5, (2, 19): 0.0}
 
 
 def test_the_page_says_what_the_curve_is_a_mean_of():
@@ -156,9 +156,9 @@ def test_the_page_tells_of_the_video_before():
         replace(point(50.0, 21.0), video=2),
     )
     before, after = scores((20.0, 18.0), (22.0, 19.0)), scores((21.0, 18.0), (21.5, 19.0))
-    earlier = ExtendedNote.of(
-        before, after, videos=("first <1>.mp4",), video_of_frame=(1, 1), used=54, wall_seconds=30.0,
-        recalled=40,
+    earlier = ForgettingStats.of(
+        before, after, videos=("first <1>.mp4",), video_of_frame=(1, 1), frames_trained=54, wall_seconds=30.0,
+        replayed_key_frames=40,
     )  # fmt: skip
     page = report_page(report(extended=earlier, curve=marks), name="second.mp4")
     lead = "17 frames of this video, and 54 of first &lt;1&gt;.mp4 before"
@@ -177,9 +177,9 @@ def test_the_page_tells_of_the_video_before():
 
 def test_a_point_of_the_curve_survives_a_checkpoint():
     kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
-    assert CurvePoint.again(json.loads(json.dumps(vars(kept)))) == kept
+    assert CurvePoint.from_checkpoint(json.loads(json.dumps(vars(kept)))) == kept
     older = {key: value for key, value in vars(kept).items() if key not in ("frames", "verdict")}
-    assert CurvePoint.again(older).frames == ()
+    assert CurvePoint.from_checkpoint(older).frames == ()
 
 
 class Tags(HTMLParser):
@@ -203,12 +203,12 @@ class Tags(HTMLParser):
 
 
 def test_the_page_is_whole_and_asks_for_no_other_file():
-    white = data_uri(np.full((4, 4, 3), 255, np.uint8))
+    white = webp_data_uri(np.full((4, 4, 3), 255, np.uint8))
     page = report_page(
         report(),
         name="a <b> & c.mp4",
-        pairs=[Pair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
-        novel=moving_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
+        pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
+        animation=animated_webp_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
         warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
     )
     tags = Tags(page)
@@ -231,9 +231,9 @@ def test_a_page_without_pictures_or_scores_is_whole_too():
 
 def test_every_decibel_on_the_page_has_its_word():
     note = replace(
-        HeldOutNote.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
+        HeldOutStats.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
     )
-    pair = Pair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
+    pair = ComparisonPair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
     page = report_page(replace(report(), held_out=note), name="clip", pairs=[pair])
     assert "held-out PSNR, on white: blurred" in page
     assert "22.78 dB (blurred)" in page
@@ -241,7 +241,7 @@ def test_every_decibel_on_the_page_has_its_word():
 
 
 def failed(*, steps, video="my clip.mp4", overlap=0.9):
-    note = replace(HeldOutNote.of(scores((6.88, 6.0)), (64, 48)), verdict="failed", overlap=overlap)
+    note = replace(HeldOutStats.of(scores((6.88, 6.0)), (64, 48)), verdict="failed", overlap=overlap)
     given = report()
     return replace(
         given,
@@ -252,29 +252,29 @@ def failed(*, steps, video="my clip.mp4", overlap=0.9):
 
 
 def test_a_failure_names_what_was_seen_and_what_to_do():
-    room = failure_of(failed(steps=900, overlap=0.2))
+    room = diagnose_failure(failed(steps=900, overlap=0.2))
     assert "6.88 dB (failed)" in room
     assert "agrees with the masks by only 0.20" in room
     assert room.endswith("ia-check 'my clip.mp4' --poses p.npz")
-    assert "8% of the person's height" in failure_of(failed(steps=900))
-    assert "Only 26 steps were made" in failure_of(failed(steps=26))
-    assert "ia-check" not in failure_of(failed(steps=900, video="camera:0"))
-    assert failure_of(report()) is None
+    assert "8% of the person's height" in diagnose_failure(failed(steps=900))
+    assert "Only 26 steps were made" in diagnose_failure(failed(steps=26))
+    assert "ia-check" not in diagnose_failure(failed(steps=900, video="camera:0"))
+    assert diagnose_failure(report()) is None
 
 
 def test_nothing_has_failed_while_it_is_learnt():
-    assert decibels(13.3, "failed", digits=1) == "13.3 dB (failed)"
-    assert decibels(13.3, "failed", learning=True) == "13.30 dB (no person to be seen yet)"
-    assert decibels(30.0, "soft", learning=True) == "30.00 dB (soft)"
-    assert decibels(30.0, None) == "30.00 dB"
-    assert decibels(None, None) == "n/a"
+    assert format_psnr(13.3, "failed", digits=1) == "13.3 dB (failed)"
+    assert format_psnr(13.3, "failed", provisional=True) == "13.30 dB (no person to be seen yet)"
+    assert format_psnr(30.0, "soft", provisional=True) == "30.00 dB (soft)"
+    assert format_psnr(30.0, None) == "30.00 dB"
+    assert format_psnr(None, None) == "n/a"
 
 
 def test_an_avatar_that_is_good_in_fitted_poses_has_not_failed():
-    fitted = replace(HeldOutNote.of(scores((23.0, 18.0)), (64, 48)), verdict="soft")
+    fitted = replace(HeldOutStats.of(scores((23.0, 18.0)), (64, 48)), verdict="soft")
     kept = replace(failed(steps=900), held_out_refined=fitted)
     assert kept.verdict == "soft"
-    assert failure_of(kept) is None
+    assert diagnose_failure(kept) is None
 
 
 @pytest.mark.parametrize(
@@ -309,13 +309,13 @@ SOLVED = {
 @pytest.mark.parametrize("there", [(), ("cameras.npz",), ("cameras.npz", "poses.npz")])
 def test_the_page_names_no_file_that_is_not_there(there):
     solved = replace(report(), cameras=SOLVED)
-    page = report_page(solved, name="clip", present=there)
+    page = report_page(solved, name="clip", present_files=there)
     assert "60 key frames" in page
     assert ("cameras.npz" in page) == ("poses.npz" in page) == (len(there) == 2)
     assert "avatar.iavatar" not in page
     assert "ia-play" not in page
     command = play_command(Path("a run/avatar.iavatar"), Path("clip/poses.npz"))
-    page = report_page(solved, name="clip", play=command)
+    page = report_page(solved, name="clip", play_command=command)
     assert "ia-play &#x27;a run/avatar.iavatar&#x27; --poses clip/poses.npz" in page
 
 

@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
 from apps.studio import motions, walk
 from apps.studio.actor import Actor
-from apps.studio.pattern import leaves, repeated
-from apps.studio.room import GRAIN, Room
-from apps.studio.writer import ShootConfig, shoot
-from capture.errors import BadInput
-from capture.file_list import NAME as LIST
+from apps.studio.pattern import dead_leaves, repeat_motif
+from apps.studio.room import SENSOR_NOISE, FurnishedRoom
+from apps.studio.writer import ShootConfig, film_capture
+from capture.errors import InputError
+from capture.file_list import LIST_NAME as LIST
 from preprocess.camera_file import read_cameras
 from preprocess.observation import Observation
 from preprocess.pose_file import read_motion
@@ -32,18 +32,18 @@ def dressed_once():
 
 @pytest.fixture(scope="module")
 def room():
-    return Room.furnished("room", 192, 0)
+    return FurnishedRoom.furnished("room", 192, 0)
 
 
 @pytest.fixture(scope="module")
 def cameras():
-    return walk.carried(np.zeros((9, 2)), 1.8, 192, 3)
+    return walk.handheld_cameras(np.zeros((9, 2)), 1.8, 192, 3)
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shoot") / "walk"
-    shoot(folder, WALK)
+    film_capture(folder, WALK)
     return folder
 
 
@@ -85,7 +85,7 @@ def test_every_pixel_shows_the_nearest_face_of_the_room(room, cameras):
 
 
 def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, cameras):
-    """Around the projection of a free upper corner lie three faces or two and what is behind."""
+    """ClothedBody the projection of a free upper corner lie three faces or two and what is behind."""
     solids, met = room.solids, 0
     for camera in cameras:
         seen = room.seen(camera)
@@ -116,7 +116,7 @@ def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, c
 
 
 def test_a_place_of_the_wall_has_one_colour_from_everywhere(room):
-    near = walk.carried(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
+    near = walk.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
     first, second = (room.seen(camera) for camera in near)
     first = type(first)(rgb=first.rgb.copy(), depth=first.depth, face=first.face)
     points = points_seen(near[0], first.depth)
@@ -133,8 +133,8 @@ def test_a_place_of_the_wall_has_one_colour_from_everywhere(room):
 
 def test_nothing_in_the_room_repeats_and_all_of_the_tiles_do():
     generator = np.random.default_rng(0)
-    motif = leaves((120, 120, 120))
-    tiled = repeated(motif, 0.3, (0, 0, 0))((200, 100), 0.01, generator)
+    motif = dead_leaves((120, 120, 120))
+    tiled = repeat_motif(motif, 0.3, (0, 0, 0))((200, 100), 0.01, generator)
     np.testing.assert_array_equal(tiled[:, 30:], tiled[:, :-30])
     np.testing.assert_array_equal(tiled[30:], tiled[:-30])
     free = motif((200, 100), 0.01, generator).astype(float)
@@ -146,9 +146,9 @@ def test_nothing_in_the_room_repeats_and_all_of_the_tiles_do():
 @pytest.mark.parametrize("subject", [1, 2])
 def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
     actor = Actor.of(subject)
-    motion = motions.in_place(actor, frames=40, fps=30.0, turns=-0.75, seed=2)
+    motion = motions.gesturing_motion(actor, frames=40, fps=30.0, turns=-0.75, seed=2)
     at = (motion.root_translations + actor.shaped.joints[0])[:, [0, 2]]
-    cameras = walk.carried(at, walk.height_of(actor), 960, 2)
+    cameras = walk.handheld_cameras(at, walk.actor_height_m(actor), 960, 2)
     eyes = np.stack([camera.center_world for camera in cameras])
     angles = np.rad2deg(np.arctan2(eyes[:, 0], eyes[:, 2]))
     assert np.ptp(angles) > 100.0
@@ -162,7 +162,7 @@ def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
         assert pixels.min() > 5.0
         assert (pixels < [955.0, 535.0]).all()
         assert np.ptp(pixels[:, 1]) > 0.65 * 540
-        assert abs(actor.lowest(motion[row])) < 1e-9
+        assert abs(actor.sole_height_m(motion[row])) < 1e-9
 
 
 def test_the_cameras_are_told_only_by_the_truth(capture):
@@ -187,10 +187,10 @@ def test_the_cameras_are_told_only_by_the_truth(capture):
 def test_true_cameras_and_none_see_the_same_person(capture):
     true = capture / "truth" / "cameras.npz"
     recordings = [
-        open_recording(RecordingPaths(video=capture, cameras=cameras))
+        open_capture(CaptureInputs(video=capture, cameras=cameras))
         for cameras in (str(true), None)
     ]
-    assert [recording.cameras.moves for recording in recordings] == [True, False]
+    assert [recording.cameras.is_moving for recording in recordings] == [True, False]
     truth = read_motion(capture / "truth" / "poses.npz")
     np.testing.assert_allclose(
         recordings[0].motion.root_translations, truth.root_translations, atol=1e-9
@@ -210,31 +210,31 @@ def test_the_person_is_drawn_over_the_room_unchanged(capture):
     truth = read_motion(capture / "truth" / "poses.npz")
     track = read_cameras(capture / "truth" / "cameras.npz", (128, 72))
     video = cv2.VideoCapture(str(capture / "video.mp4"))
-    room = Room.furnished("room", 128, 0)
+    room = FurnishedRoom.furnished("room", 128, 0)
     for row in range(WALK.frames):
         frame = video.read()[1][..., ::-1]
-        rgb, alpha = actor.picture(truth[row], track[row])
+        rgb, alpha = actor.render_over(truth[row], track[row])
         mask = cv2.imread(str(capture / "masks" / f"{row:04d}.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(mask, alpha)
         np.testing.assert_array_equal(frame[mask == 255], rgb[mask == 255])
         behind = room.seen(track[row]).rgb
         free = (mask == 0) & (room.seen(track[row]).face != 2)
-        assert abs((frame.astype(float) - behind)[free]).std() < 2.0 * GRAIN
+        assert abs((frame.astype(float) - behind)[free]).std() < 2.0 * SENSOR_NOISE
 
 
 def test_a_still_camera_sees_the_same_room_under_new_noise(tmp_path):
-    shoot(tmp_path / "c", ShootConfig(frames=3, size=64, background="room"))
+    film_capture(tmp_path / "c", ShootConfig(frames=3, size=64, background="room"))
     assert (tmp_path / "c" / "cameras.npz").exists()
     video = cv2.VideoCapture(str(tmp_path / "c" / "video.mp4"))
     frames = np.stack([video.read()[1] for _ in range(3)]).astype(float)
     upper = frames[:, :20, :16] - frames[:1, :20, :16]  # a wall, away from actor and floor
-    assert 0.7 * GRAIN * np.sqrt(2) < upper[1:].std() < 1.4 * GRAIN * np.sqrt(2)
+    assert 0.7 * SENSOR_NOISE * np.sqrt(2) < upper[1:].std() < 1.4 * SENSOR_NOISE * np.sqrt(2)
     assert frames[0].std() > 20.0
 
 
 def test_the_same_seed_walks_the_same_and_another_does_not(capture, tmp_path):
-    shoot(tmp_path / "again", WALK)
-    shoot(tmp_path / "other", ShootConfig(frames=6, size=128, motion="walkaround", seed=1))
+    film_capture(tmp_path / "again", WALK)
+    film_capture(tmp_path / "other", ShootConfig(frames=6, size=128, motion="walkaround", seed=1))
     for name, same in (("again", True), ("other", False)):
         for file in ("video.mp4", "truth/cameras.npz"):
             bytes_ = [(folder / file).read_bytes() for folder in (capture, tmp_path / name)]
@@ -244,8 +244,8 @@ def test_the_same_seed_walks_the_same_and_another_does_not(capture, tmp_path):
 def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):
     for background in ("plain", "clutter"):
         config = ShootConfig(motion="walkaround", background=background)
-        with pytest.raises(BadInput, match=r"room or tiles"):
-            shoot(tmp_path / "c", config)
+        with pytest.raises(InputError, match=r"room or tiles"):
+            film_capture(tmp_path / "c", config)
 
 
 def test_a_pose_file_says_in_which_space_it_is(capture, tmp_path):
@@ -253,5 +253,5 @@ def test_a_pose_file_says_in_which_space_it_is(capture, tmp_path):
     with np.load(capture / "poses.npz") as arrays:
         changed = {**arrays, "space": np.array("moon")}
     np.savez(tmp_path / "poses.npz", **changed)
-    with pytest.raises(BadInput, match=r"expected world or camera"):
+    with pytest.raises(InputError, match=r"expected world or camera"):
         read_motion(tmp_path / "poses.npz")

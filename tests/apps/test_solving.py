@@ -15,24 +15,24 @@ import pytest
 from rich.console import Console as RichConsole
 
 from apps.learning.run_folder import RunFolder
-from apps.recording.opening import open_recording
-from apps.recording.wanted import RecordingPaths
+from apps.recording.opening import open_capture
+from apps.recording.wanted import CaptureInputs
 from apps.solving import solving as solving_module
-from apps.solving.attempt import Attempt
+from apps.solving.attempt import CameraSolving
 from apps.solving.job import SolveJob
-from apps.solving.joining import joined
-from apps.solving.solving import Solving
-from apps.solving.worker import person_finder
-from apps.studio.writer import ShootConfig, shoot
+from apps.solving.joining import apply_camera_solution
+from apps.solving.solving import SolverProcess
+from apps.solving.worker import make_person_mask
+from apps.studio.writer import ShootConfig, film_capture
 from apps.terminal.console import Console
-from apps.terminal.exit_codes import Stop
-from capture.errors import BadInput
+from apps.terminal.exit_codes import CommandExit
+from capture.errors import InputError
 from export.errors import ExportRefused
 from preprocess.camera_file import read_cameras, write_cameras
-from preprocess.fit.stature import height_of
+from preprocess.fit.stature import body_height_m
 from preprocess.pose_file import read_motion
-from preprocess.solve.gates import similarity
-from preprocess.solve.solved import Solved
+from preprocess.solve.gates import fit_similarity
+from preprocess.solve.solved import CameraSolution
 
 FRAMES = 14
 
@@ -41,12 +41,12 @@ FRAMES = 14
 def walkaround(tmp_path_factory) -> Path:
     """A phone is carried around the actor; where it was, only truth/ knows."""
     folder = tmp_path_factory.mktemp("walkaround") / "capture"
-    shoot(folder, ShootConfig(frames=FRAMES, size=256, motion="walkaround", background="room"))
+    film_capture(folder, ShootConfig(frames=FRAMES, size=256, motion="walkaround", background="room"))
     return folder
 
 
 def job_of(capture: Path, **paths) -> SolveJob:
-    named = RecordingPaths(
+    named = CaptureInputs(
         video=capture / "video.mp4", poses=capture / "poses.npz", masks=capture / "masks",
         cameras="solve", **paths,
     )  # fmt: skip
@@ -57,7 +57,7 @@ def job_of(capture: Path, **paths) -> SolveJob:
 def solved_run(walkaround, tmp_path_factory) -> Path:
     """A run's folder in which the process has solved the cameras."""
     run = tmp_path_factory.mktemp("solved") / "run"
-    with Solving(job_of(walkaround), run) as solving:
+    with SolverProcess(job_of(walkaround), run) as solving:
         assert solving.wait(quiet()) is not None
         assert not solving.running
     return run
@@ -67,19 +67,19 @@ def quiet() -> Console:
     return Console(RichConsole(file=StringIO()))
 
 
-def solved_of(run: Path) -> Solved:
-    return Solved.load(next((run / "cameras").iterdir()))
+def solved_of(run: Path) -> CameraSolution:
+    return CameraSolution.load(next((run / "cameras").iterdir()))
 
 
 def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
-    still = open_recording(job_of(walkaround).paths)
-    found = joined(still, solved_of(solved_run))
+    still = open_capture(job_of(walkaround).paths)
+    found = apply_camera_solution(still, solved_of(solved_run))
     true = read_cameras(walkaround / "truth" / "cameras.npz", still.source.size_px)
     centers, truth = (
         np.stack([camera.center_world for camera in track.cameras])
         for track in (found.cameras, true)
     )
-    scale, turn, shift = similarity(centers, truth)
+    scale, turn, shift = fit_similarity(centers, truth)
     assert np.linalg.norm(scale * centers @ turn.T + shift - truth, axis=1).max() < 0.03
     assert scale == pytest.approx(1.0, abs=0.03)
     assert np.degrees(np.arccos((turn @ [0.0, 1.0, 0.0])[1])) < 1.0  # y is up
@@ -94,9 +94,9 @@ def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solved_run):
         np.testing.assert_allclose(before, after, atol=1.5)  # the focal length was solved, too
     lenses = [each.cameras[0].focal_px[0] for each in (still, found)]
     assert lenses[1] == pytest.approx(lenses[0], rel=1e-9)  # stated, and near what was solved
-    assert found.solved["verdict"] == "solved"
-    assert found.solved["frames"]["key"] == FRAMES
-    assert set(found.solved["scale"]["cues"]) <= {"ground", "in place"}
+    assert found.camera_report["verdict"] == "solved"
+    assert found.camera_report["frames"]["key"] == FRAMES
+    assert set(found.camera_report["scale"]["cues"]) <= {"ground", "in place"}
 
 
 def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
@@ -106,11 +106,11 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
     poses.write_bytes((walkaround / "poses.npz").read_bytes())
     changed(poses, K=None)
     stated, silent = (
-        open_recording(replace(job_of(walkaround).paths, **parts))
+        open_capture(replace(job_of(walkaround).paths, **parts))
         for parts in ({}, {"poses": poses, "masks": Path("segmenter:grabcut")})
     )
     assert silent.cameras[0].focal_px[0] > 1.2 * stated.cameras[0].focal_px[0]  # a phone's
-    one, other = (joined(each, solved_of(solved_run)) for each in (stated, silent))
+    one, other = (apply_camera_solution(each, solved_of(solved_run)) for each in (stated, silent))
     for row in (0, 9):
         seen = [
             each.cameras[row].project(each.shaped.with_pose(each.motion[row]).joints())
@@ -120,35 +120,35 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
 
 
 def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
-    plain = open_recording(job_of(walkaround).paths)
-    tall = height_of(plain.shaped)
-    taller = open_recording(job_of(walkaround, height_m=1.1 * tall).paths)
-    assert height_of(taller.shaped) == pytest.approx(1.1 * tall)
+    plain = open_capture(job_of(walkaround).paths)
+    tall = body_height_m(plain.shaped)
+    taller = open_capture(job_of(walkaround, height_m=1.1 * tall).paths)
+    assert body_height_m(taller.shaped) == pytest.approx(1.1 * tall)
     for row in (0, 9):  # pictures cannot tell
         np.testing.assert_allclose(
             taller.cameras[0].project(taller.shaped.with_pose(taller.motion[row]).joints()),
             plain.cameras[0].project(plain.shaped.with_pose(plain.motion[row]).joints()),
             atol=1e-6,
         )
-    one, other = (joined(recording, solved_of(solved_run)) for recording in (plain, taller))
-    ratio = other.solved["scale"]["metres_per_unit"] / one.solved["scale"]["metres_per_unit"]
+    one, other = (apply_camera_solution(recording, solved_of(solved_run)) for recording in (plain, taller))
+    ratio = other.camera_report["scale"]["metres_per_unit"] / one.camera_report["scale"]["metres_per_unit"]
     assert ratio == pytest.approx(1.1, rel=1e-3)
 
 
 def test_a_camera_that_stood_stays_where_it_is(walkaround, solved_run):
-    recording = open_recording(job_of(walkaround).paths)
+    recording = open_capture(job_of(walkaround).paths)
     standing = replace(solved_of(solved_run), still=True, moved=0.001, model=None, gates=())
-    found = joined(recording, standing)
+    found = apply_camera_solution(recording, standing)
     assert found.cameras is recording.cameras
     assert found.motion is recording.motion
-    assert found.solved["verdict"] == "still"
+    assert found.camera_report["verdict"] == "still"
     assert "stood still" in found.notes[-1]
 
 
 def test_the_same_job_is_not_solved_twice(walkaround, solved_run, monkeypatch):
     monkeypatch.setattr(solving_module.subprocess, "Popen", None)
-    with Solving(job_of(walkaround), solved_run) as solving:
-        assert solving.wait(quiet()).marks.tolist() == solved_of(solved_run).marks.tolist()
+    with SolverProcess(job_of(walkaround), solved_run) as solving:
+        assert solving.wait(quiet()).frame_status.tolist() == solved_of(solved_run).frame_status.tolist()
 
 
 def test_another_job_has_another_folder(walkaround, tmp_path):
@@ -167,12 +167,12 @@ def test_another_job_has_another_folder(walkaround, tmp_path):
     copy.write_bytes(copy.read_bytes() + b" ")
     assert moved.key() != before
     for one in (job, others[1]):
-        assert SolveJob.of(json.loads(json.dumps(one.content()))) == one
+        assert SolveJob.of(json.loads(json.dumps(one.as_json()))) == one
 
 
 def test_what_is_stopped_leaves_no_process_and_is_taken_up_again(walkaround, tmp_path):
     stop = threading.Event()
-    with Solving(job_of(walkaround), tmp_path) as solving:
+    with SolverProcess(job_of(walkaround), tmp_path) as solving:
         process = solving._process
         while not (solving.folder / "key frames").exists() and process.poll() is None:
             time.sleep(0.05)
@@ -186,27 +186,27 @@ def test_what_is_stopped_leaves_no_process_and_is_taken_up_again(walkaround, tmp
 
 
 def test_the_process_ends_with_who_started_it(walkaround, tmp_path):
-    with Solving(job_of(walkaround), tmp_path) as solving:
+    with SolverProcess(job_of(walkaround), tmp_path) as solving:
         process = solving._process
         process.stdin.close()  # as the system does for a process that was killed
         assert process.wait(timeout=30.0) == 130
 
 
 def test_a_process_that_breaks_is_said_with_its_log(walkaround, tmp_path):
-    with Solving(job_of(walkaround), tmp_path) as solving:
+    with SolverProcess(job_of(walkaround), tmp_path) as solving:
         solving._process.kill()
-        with pytest.raises(BadInput, match=r"(?s)ended with -9.*log\.txt"):
+        with pytest.raises(InputError, match=r"(?s)ended with -9.*log\.txt"):
             solving.wait(quiet())
 
 
 def test_without_masks_the_posed_body_says_where_the_person_is(walkaround):
     masked, posed = (
-        open_recording(replace(job_of(walkaround).paths, masks=masks))
+        open_capture(replace(job_of(walkaround).paths, masks=masks))
         for masks in (walkaround / "masks", Path("segmenter:grabcut"))
     )
     frame = next(masked.source.frames())
-    mask = person_finder(masked)(frame, (160, 90))
-    around = person_finder(posed)(frame, (160, 90))
+    mask = make_person_mask(masked)(frame, (160, 90))
+    around = make_person_mask(posed)(frame, (160, 90))
     assert mask.sum() > 200
     assert (around | ~mask).mean() > 0.998  # all of the person
     assert around.sum() < 2.5 * mask.sum()
@@ -233,8 +233,8 @@ def test_a_run_learns_beside_the_solving_and_tells_of_both(
     track = read_cameras(out / "cameras.npz", (256, 144))
     motion = read_motion(out / "poses.npz")
     assert len(track.cameras) == len(motion) == FRAMES
-    again = open_recording(
-        RecordingPaths(
+    again = open_capture(
+        CaptureInputs(
             video=walkaround / "video.mp4", poses=out / "poses.npz",
             cameras=str(out / "cameras.npz"), masks=walkaround / "masks",
         )
@@ -276,8 +276,8 @@ def attempt(monkeypatch):
             assert stop.is_set()  # nobody waits any longer
             return solved
 
-        monkeypatch.setattr(Solving, "wait", wait)
-        return Attempt(Solving.__new__(Solving), beside=beside)
+        monkeypatch.setattr(SolverProcess, "wait", wait)
+        return CameraSolving(SolverProcess.__new__(SolverProcess), beside=beside)
 
     return make
 
@@ -287,12 +287,12 @@ def fails_in(block, error):
         raise error
 
 
-@pytest.mark.parametrize("end", [Stop("a reason", 1), KeyboardInterrupt(), OSError(28, "full")])
+@pytest.mark.parametrize("end", [CommandExit("a reason", 1), KeyboardInterrupt(), OSError(28, "full")])
 @pytest.mark.parametrize("finished", [True, False])
 def test_cameras_that_were_solved_by_then_outlive_any_end(
     walkaround, solved_run, attempt, tmp_path, end, finished
 ):
-    recording, run = open_recording(job_of(walkaround).paths), RunFolder(path=tmp_path / "run")
+    recording, run = open_capture(job_of(walkaround).paths), RunFolder(path=tmp_path / "run")
     begun = attempt(solved_of(solved_run) if finished else None, beside=True)
     with pytest.raises(type(end)):
         fails_in(begun.kept(recording, run, quiet()), end)
@@ -302,7 +302,7 @@ def test_cameras_that_were_solved_by_then_outlive_any_end(
 def test_cameras_that_are_solved_first_are_written_before_anything_is_learnt(
     walkaround, solved_run, attempt, tmp_path
 ):
-    found = joined(open_recording(job_of(walkaround).paths), solved_of(solved_run))
+    found = apply_camera_solution(open_capture(job_of(walkaround).paths), solved_of(solved_run))
     run = RunFolder(path=tmp_path / "run")
     with attempt(None, beside=False).kept(found, run, quiet()):
         assert len(read_motion(run.poses)) == len(read_cameras(run.cameras, (256, 144)).cameras)
@@ -313,7 +313,7 @@ def test_what_is_solved_when_the_run_is_stopped_counts(walkaround, solved_run, t
     shutil.copytree(solved_run / "cameras", tmp_path / "cameras")
     stop = threading.Event()
     stop.set()
-    with Solving(job_of(walkaround), tmp_path) as solving:
+    with SolverProcess(job_of(walkaround), tmp_path) as solving:
         ended = subprocess.Popen(["true"])
         ended.wait()
         solving._process = ended
@@ -327,11 +327,11 @@ def test_cameras_that_are_refused_cost_nobody_the_avatar(
     walkaround, call_ingest, tmp_path, without_baking, monkeypatch
 ):
     def refuse(self, console, stop=None):
-        raise BadInput("The cameras could not be solved with certainty: a reason.")
+        raise InputError("The cameras could not be solved with certainty: a reason.")
 
-    monkeypatch.setattr(Solving, "__init__", lambda self, job, run, gently: None)
-    monkeypatch.setattr(Solving, "wait", refuse)
-    monkeypatch.setattr(Solving, "stop", lambda self: None)
+    monkeypatch.setattr(SolverProcess, "__init__", lambda self, job, run, gently: None)
+    monkeypatch.setattr(SolverProcess, "wait", refuse)
+    monkeypatch.setattr(SolverProcess, "stop", lambda self: None)
     outcome = call_ingest(walkaround, "--cameras", "solve", "--out", tmp_path / "run")
     assert outcome.code == 2
     assert "a reason" in outcome.complaint()
@@ -348,11 +348,11 @@ def test_a_lens_that_nobody_knows_is_solved_first(
     """And if that fails, nothing is learnt."""
 
     def refuse(self, console, stop=None):
-        raise BadInput("The cameras could not be solved with certainty: a reason.")
+        raise InputError("The cameras could not be solved with certainty: a reason.")
 
-    monkeypatch.setattr(Solving, "__init__", lambda self, job, run, gently: None)
-    monkeypatch.setattr(Solving, "wait", refuse)
-    monkeypatch.setattr(Solving, "stop", lambda self: None)
+    monkeypatch.setattr(SolverProcess, "__init__", lambda self, job, run, gently: None)
+    monkeypatch.setattr(SolverProcess, "wait", refuse)
+    monkeypatch.setattr(SolverProcess, "stop", lambda self: None)
     poses = tmp_path / "poses.npz"
     poses.write_bytes((walkaround / "poses.npz").read_bytes())
     changed(poses, K=None)
@@ -368,10 +368,10 @@ def test_a_lens_that_nobody_knows_is_solved_first(
 def test_cameras_are_read_as_they_were_written(walkaround, tmp_path):
     true = read_cameras(walkaround / "truth" / "cameras.npz", (256, 144))
     bent = [replace(camera, distortion=(-0.1, 0.0, 0.0, 0.0)) for camera in true.cameras]
-    track = replace(true, cameras=tuple(bent), missing=frozenset({3, 5}))
+    track = replace(true, cameras=tuple(bent), frames_without_camera=frozenset({3, 5}))
     write_cameras(tmp_path / "cameras.npz", track)
     again = read_cameras(tmp_path / "cameras.npz", (256, 144))
-    assert again.missing == {3, 5}
+    assert again.frames_without_camera == {3, 5}
     for one, other in zip(bent, again.cameras, strict=True):
         assert one.distortion == other.distortion
         np.testing.assert_array_equal(one.camera_from_world, other.camera_from_world)
@@ -392,8 +392,8 @@ def test_heights_that_nobody_has_are_refused(walkaround, call_ingest, tmp_path, 
 
 
 def test_a_height_contradicts_cameras_that_have_a_world(walkaround):
-    with pytest.raises(BadInput, match="--height-cm contradicts"):
-        open_recording(
+    with pytest.raises(InputError, match="--height-cm contradicts"):
+        open_capture(
             replace(
                 job_of(walkaround).paths, height_m=1.8,
                 cameras=str(walkaround / "truth" / "cameras.npz"),

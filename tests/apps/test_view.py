@@ -17,7 +17,7 @@ import pytest
 
 from apps import ingest
 from apps.ingest_arguments import VIEW_PORT
-from apps.terminal.port import with_port
+from apps.terminal.port import fill_optional_port
 from export.player import Player
 from tests.apps.browser import Browser, chromium, until
 
@@ -159,7 +159,7 @@ def test_the_port_may_be_left_out(words, port):
 
     from apps.ingest_arguments import IngestArguments
 
-    given = tyro.cli(IngestArguments, args=with_port(words, "--view", VIEW_PORT))
+    given = tyro.cli(IngestArguments, args=fill_optional_port(words, "--view", VIEW_PORT))
     assert given.view == port
     assert given.video == Path("v.mp4")
 

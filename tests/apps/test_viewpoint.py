@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from apps.playing.follow import AWAY, FollowingCamera, standing_pose
-from apps.playing.novel import novel_motion
+from apps.playing.follow import DISTANCE_HEIGHTS, FollowingCamera, canonical_pose_of
+from apps.playing.novel import demo_motion
 from apps.playing.viewpoint import Viewpoint
-from capture.errors import BadInput
+from capture.errors import InputError
 from export.player import Player
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import BodyPose
@@ -22,7 +22,7 @@ def following(player):
     """A camera about the standing avatar, which faces the world's z."""
 
     def of(size=96, **wishes):
-        return FollowingCamera.of(player, novel_motion(2), size, Viewpoint(**wishes))
+        return FollowingCamera.of(player, demo_motion(2), size, Viewpoint(**wishes))
 
     return of
 
@@ -30,7 +30,7 @@ def following(player):
 def middle(following, pose):
     """Where the camera looks at, in the world."""
     camera = following.at(pose)
-    away = following.viewpoint.distance_m or AWAY * following.height_m
+    away = following.viewpoint.distance_m or DISTANCE_HEIGHTS * following.height_m
     return camera.center_world + away * camera.camera_from_world[2, :3]
 
 
@@ -47,7 +47,7 @@ def middle(following, pose):
     ],
 )
 def test_the_camera_stands_where_its_angles_say(player, following, wishes, direction):
-    pose, camera = standing_pose(player), following(**wishes, distance_m=2.0)
+    pose, camera = canonical_pose_of(player), following(**wishes, distance_m=2.0)
     pelvis = player.manifest.rest_joints[0]
     at = pelvis + camera.middle_m * np.array([0.0, 1.0, 0.0])
     place = camera.at(pose).center_world
@@ -55,7 +55,7 @@ def test_the_camera_stands_where_its_angles_say(player, following, wishes, direc
 
 
 def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player, following):
-    pose = standing_pose(player)
+    pose = canonical_pose_of(player)
     at = middle(following(), pose)
     for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}, {"orbit_deg": 9.0, "zoom": 3.0}):
         np.testing.assert_allclose(middle(following(**wishes), pose), at, atol=1e-9)
@@ -63,15 +63,15 @@ def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player
 
 
 def test_a_turntable_goes_round_once_in_its_time(player, following):
-    pose = standing_pose(player)
-    turning = following(turn_s=8.0)
+    pose = canonical_pose_of(player)
+    turning = following(turn_period_s=8.0)
     for seconds, degrees in ((0.0, 0.0), (2.0, 90.0), (5.0, 225.0), (8.0, 0.0)):
         np.testing.assert_allclose(
             turning.at(pose, seconds).camera_from_world,
             following(orbit_deg=degrees).at(pose).camera_from_world,
             atol=1e-9,
         )
-    backwards = following(turn_s=-8.0).at(pose, 2.0)
+    backwards = following(turn_period_s=-8.0).at(pose, 2.0)
     np.testing.assert_allclose(
         backwards.camera_from_world,
         following(orbit_deg=-90.0).at(pose).camera_from_world,
@@ -104,7 +104,7 @@ def bent_arm():
 
 
 def test_a_zoom_and_a_shorter_way_make_the_person_larger(player, following):
-    pose = standing_pose(player)
+    pose = canonical_pose_of(player)
 
     def height(camera):
         rows = np.flatnonzero((player.render(pose, camera.at(pose))[..., 3] > 127).any(axis=1))
@@ -117,7 +117,7 @@ def test_a_zoom_and_a_shorter_way_make_the_person_larger(player, following):
 
 @pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])
 def test_the_whole_person_fits_into_every_shape(player, following, size):
-    pose = standing_pose(player)
+    pose = canonical_pose_of(player)
     alpha = player.render(pose, following(size).at(pose))[..., 3]
     assert alpha.shape == size[::-1]
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
@@ -127,5 +127,5 @@ def test_the_whole_person_fits_into_every_shape(player, following, size):
 
 def test_wishes_that_cannot_be_are_named():
     for wishes in ({"orbit_deg": np.inf}, {"zoom": np.nan}, {"elevation_deg": np.nan}):
-        with pytest.raises(BadInput, match="--"):
+        with pytest.raises(InputError, match="--"):
             Viewpoint(**wishes)

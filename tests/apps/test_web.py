@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 
 from apps.playing.follow import FollowingCamera
-from capture.errors import BadInput
-from export.player import Likeness, Player, premultiplied
+from capture.errors import InputError
+from export.player import PictureDifference, Player, premultiply
 from export.web import runtime
 from preprocess.pose_file import read_motion
 from tests.apps.browser import Browser, chromium, until
 
 SIZE = (900, 700)
 STAGE = (slice(60, 600), slice(4, -4))
-"""Between the page's head and its bar, inside of the ring that marks the focus."""
+"""ResectionResult the page's head and its bar, inside of the ring that marks the focus."""
 
 
 def is_here():
     try:
         runtime.runtime_files()
-    except BadInput:
+    except InputError:
         return False
     return True
 
@@ -134,9 +134,9 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
     columns = slice(part["x"], part["x"] + part["width"])
     shown = np.zeros((size, size, 4), dtype=np.uint8)
     shown[rows, columns] = np.reshape(part["rgba"], (part["height"], part["width"], 4))
-    expected = player.render(motion[row], FollowingCamera.of(player, motion, size).at(motion[row]))
+    expected = player.render(motion[row], FollowingCamera.of(player, motion, size).camera_for(motion[row]))
     assert expected[..., 3].max() == 255
-    assert Likeness.of(premultiplied(shown), premultiplied(expected)).alike
+    assert PictureDifference.of(premultiply(shown), premultiply(expected)).matches
 
 
 @with_runtime
@@ -265,7 +265,7 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
     assert outcome.code == 0
     told = json.loads((out / "avatar.json").read_text())
     told["tiers"]["other"] = told["tiers"]["hq"]
-    (out / "avatar.json").write_text(json.dumps(told))
+    (out / "avatar.json").write_text_atomically(json.dumps(told))
     host = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"]
     with subprocess.Popen(
         host, cwd=tmp_path / "host", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -304,7 +304,7 @@ def test_a_page_replaces_a_page_but_nothing_else(call_play, package, tmp_path):
     assert not list(out.rglob("*.mjs"))  # which many hosts do not serve as a script
     other = tmp_path / "mine"
     other.mkdir()
-    (other / "notes.txt").write_text("mine")
+    (other / "notes.txt").write_text_atomically("mine")
     outcome = call_play(package, "--web", "--out", other)
     assert outcome.code == 2
     assert "notes.txt" in outcome.complaint("ia-play")

@@ -9,14 +9,14 @@ import torch
 
 from apps.studio import motions
 from apps.studio.actor import Actor
-from apps.studio.framing import framed
-from avatar.cells import WarpCells
+from apps.studio.framing import static_camera
+from avatar.cells import CorrespondenceGrid
 from avatar.config import TrainConfig
-from avatar.events import Score
-from avatar.hold import HeldOut, prepared, score
+from avatar.events import HeldOutScore
+from avatar.hold import HeldOutFrame, prepare_stream, score_frame
 from avatar.levels import HashLevels
 from avatar.rig import Rig
-from avatar.step import cosine
+from avatar.step import cosine_decay
 from avatar.trainer import Trainer
 from capture.camera import Camera
 from capture.frame import Frame
@@ -26,7 +26,7 @@ from preprocess.pose import BodyPose
 
 @pytest.fixture(scope="session")
 def rig(shaped) -> Rig:
-    return Rig.of(shaped)
+    return Rig.from_shaped_body(shaped)
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def generator() -> torch.Generator:
 def levels() -> HashLevels:
     """Four levels over a box that is no cube: the first two are dense, the others hashed."""
     low, high = np.array([-1.0, -0.5, 0.0]), np.array([1.0, 0.9, 0.4])
-    return HashLevels.over(
+    return HashLevels.spanning(
         low.astype(np.float32), high.astype(np.float32),
         coarsest_m=0.2, finest_m=0.02, levels=4, table_size=4096,
     )  # fmt: skip
@@ -104,17 +104,17 @@ class Clip:
 @pytest.fixture(scope="session")
 def clip() -> Clip:
     actor = Actor.of(1, 0)
-    camera = framed(actor, 72)
+    camera = static_camera(actor, 72)
 
     def observed(index: int, pose: BodyPose) -> Observation:
-        rgb, alpha = actor.picture(pose, camera)
+        rgb, alpha = actor.render_over(pose, camera)
         frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
         return Observation(
             frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera
         )
 
-    filmed = motions.turn(actor, frames=24, fps=30.0, turns=1.0, seed=0)
-    novel = motions.novel(actor)
+    filmed = motions.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
+    novel = motions.novel_poses(actor)
     return Clip(
         observations=[observed(i, filmed[i]) for i in range(len(filmed))],
         novel=observed(100, novel[0]),
@@ -131,36 +131,36 @@ class Learnt:
 
     Attributes:
         trainer: After its last step.
-        held: Frames that it has never seen.
+        held: EvaluationFrames that it has never seen.
         novel: A pose that was never filmed.
         marks: Scores of the held-out frames and the novel pose, every so many steps.
     """
 
     trainer: Trainer
-    held: list[HeldOut]
-    novel: HeldOut
-    marks: list[list[Score]]
+    held: list[HeldOutFrame]
+    novel: HeldOutFrame
+    marks: list[list[HeldOutScore]]
 
 
 @pytest.fixture(scope="session")
 def learnt(rig, clip) -> Learnt:
     """Trained once for all tests, with a rate that falls after half of the steps."""
     config = TrainConfig(
-        rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
+        rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
     )
     trainer = Trainer(rig, config, torch.device("cpu"))
     held = []
-    for item in prepared(iter(clip.observations), rig, every=6, total=None):
-        if isinstance(item, HeldOut):
+    for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
+        if isinstance(item, HeldOutFrame):
             held.append(item)
         else:
-            trainer.add(item)
-    cells = WarpCells.of(rig, clip.novel.pose.joint_rotations)
-    novel = HeldOut(observation=clip.novel, cells=cells)
+            trainer.add_frame(item)
+    cells = CorrespondenceGrid.solve(rig, clip.novel.pose.joint_rotations)
+    novel = HeldOutFrame(observation=clip.novel, correspondences=cells)
     marks = []
     for step in range(LEARNT_STEPS):
         falling = (step - FRAMES_ARRIVE_FOR) / (LEARNT_STEPS - FRAMES_ARRIVE_FOR)
-        trainer.step(rate=cosine(falling), hard_share=min(1.0, 4.0 * step / LEARNT_STEPS))
+        trainer.step(rate=cosine_decay(falling), hard_surface_share=min(1.0, 4.0 * step / LEARNT_STEPS))
         if trainer.steps % MARK_EVERY == 0:
-            marks.append([score(trainer.avatar, frame) for frame in [*held, novel]])
+            marks.append([score_frame(trainer.avatar, frame) for frame in [*held, novel]])
     return Learnt(trainer=trainer, held=held, novel=novel, marks=marks)

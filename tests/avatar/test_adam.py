@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from avatar.adam import Adam
+from avatar.adam import UncompiledAdam
 
 WITHOUT_COMPILER = """
 import sys, torch
@@ -25,7 +25,7 @@ def test_its_steps_are_those_of_torch():
     ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
     pair = [
         (numbers, kind([{"params": [numbers], "lr": 0.01}], betas=(0.9, 0.99), fused=True))
-        for numbers, kind in ((ours, Adam), (theirs, torch.optim.Adam))
+        for numbers, kind in ((ours, UncompiledAdam), (theirs, torch.optim.UncompiledAdam))
     ]
     for _ in range(5):
         grad = torch.randn(50, 4, generator=generator)

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from avatar import average
-from avatar.average import EVERY, HORIZON, follow
+from avatar.average import EMA_INTERVAL, EMA_HORIZON_STEPS, update_ema
 from avatar.config import TrainConfig
-from avatar.field import Field
-from avatar.hold import HeldOut, prepared, score
+from avatar.field import RadianceField
+from avatar.hold import HeldOutFrame, prepare_stream, score_frame
 from avatar.kernels.choice import backend_for
 from avatar.trainer import Trainer
 
@@ -18,11 +18,11 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def field(levels) -> Field:
-    return Field(levels, backend_for(CPU), CPU, torch.Generator().manual_seed(3))
+def field(levels) -> RadianceField:
+    return RadianceField(levels, backend_for(CPU), CPU, torch.Generator().manual_seed(3))
 
 
-def filled(field, value) -> Field:
+def filled(field, value) -> RadianceField:
     with torch.no_grad():
         for parameter in field.parameters():
             parameter.fill_(value)
@@ -39,17 +39,17 @@ def test_a_copy_has_the_same_numbers_and_none_in_common(field):
 
 def test_the_first_steps_are_followed_at_once(field):
     mean = filled(field.copied(), 0.0)
-    for steps in range(1, EVERY + 1):
-        follow(mean, filled(field, float(steps)), steps)
+    for steps in range(1, EMA_INTERVAL + 1):
+        update_ema(mean, filled(field, float(steps)), steps)
         assert all((p == steps).all() for p in mean.parameters())
 
 
 def test_later_it_is_the_exponential_mean_over_the_horizon(field):
-    mean, late = filled(field.copied(), 0.0), EVERY * 1000
+    mean, late = filled(field.copied(), 0.0), EMA_INTERVAL * 1000
     filled(field, 1.0)
-    for steps in range(late, late + EVERY * 20):
-        follow(mean, field, steps)
-    expected = 1.0 - (1.0 - EVERY / HORIZON) ** 20
+    for steps in range(late, late + EMA_INTERVAL * 20):
+        update_ema(mean, field, steps)
+    expected = 1.0 - (1.0 - EMA_INTERVAL / EMA_HORIZON_STEPS) ** 20
     for parameter in mean.parameters():
         torch.testing.assert_close(parameter, torch.full_like(parameter, expected))
 
@@ -57,18 +57,18 @@ def test_later_it_is_the_exponential_mean_over_the_horizon(field):
 @pytest.mark.slow
 def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_last_step(rig, clip):
     config = TrainConfig(
-        rays=512, step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
+        rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
     )
     trainer, held = Trainer(rig, config, CPU), []
-    for item in prepared(iter(clip.observations), rig, every=6, total=None):
-        if isinstance(item, HeldOut):
+    for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
+        if isinstance(item, HeldOutFrame):
             held.append(item)
         else:
-            trainer.add(item)
-    for _ in range(50 * average.EVERY):
-        trainer.step(rate=1.0, hard_share=1.0)
+            trainer.add_frame(item)
+    for _ in range(50 * average.EMA_INTERVAL):
+        trainer.step(rate=1.0, hard_surface_share=1.0)
     last = dataclasses.replace(trainer.avatar, field=trainer.field)
     mean, swinging = (
-        np.mean([score(avatar, frame).psnr for frame in held]) for avatar in (trainer.avatar, last)
+        np.mean([score_frame(avatar, frame).psnr for frame in held]) for avatar in (trainer.avatar, last)
     )
     assert mean > swinging + 0.3

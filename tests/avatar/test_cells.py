@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.kernels import reference, skin
 
 
@@ -17,7 +17,7 @@ def skinning(rig, rotations):
 
 def posed(rig, rotations, canonical):
     """Skins canonical points, with the reference."""
-    return skin.skinned(torch.from_numpy(canonical), *skinning(rig, rotations))
+    return skin.skin_points(torch.from_numpy(canonical), *skinning(rig, rotations))
 
 
 def nearest_root_error(cells, targets, canonical):
@@ -35,7 +35,7 @@ def candidates(cells, targets, bends=True):
     for candidate in range(3):
         row = reference.root_row(packed, candidate)
         bent = (packed & 4 > 0) & bends
-        point = reference.warped(roots, slot, row, bent, offset)
+        point = reference.canonical_points(roots, slot, row, bent, offset)
         found.append(torch.where(row[:, None] > 0, point, 1e3))
     return torch.stack(found, dim=1).numpy()
 
@@ -54,7 +54,7 @@ def around_the_skin(rig, rng, count=20000, spread=0.02):
 
 def test_the_canonical_pose_warps_to_itself(rig, rng):
     canonical = around_the_skin(rig, rng)
-    cells = WarpCells.of(rig, rig.canonical_rotations)
+    cells = CorrespondenceGrid.solve(rig, rig.canonical_rotations)
     error = nearest_root_error(cells, canonical, canonical)
     assert np.quantile(error, 0.999) < 1e-4
 
@@ -62,25 +62,25 @@ def test_the_canonical_pose_warps_to_itself(rig, rng):
 def test_points_come_back_from_a_bent_pose(rig, rng, bent_pose):
     canonical = around_the_skin(rig, rng)
     targets = posed(rig, bent_pose, canonical).numpy()
-    error = nearest_root_error(WarpCells.of(rig, bent_pose), targets, canonical)
+    error = nearest_root_error(CorrespondenceGrid.solve(rig, bent_pose), targets, canonical)
     assert np.median(error) < 1e-4
     assert np.quantile(error, 0.95) < 2e-3
     assert np.mean(error > 1e-2) < 2e-3
 
 
 def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
-    cells = WarpCells.of(rig, bent_pose)
-    place = np.argwhere((cells.index & 3) == 1)[::37]
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
+    place = np.argwhere((cells.packed_cells & 3) == 1)[::37]
     centers = torch.from_numpy((cells.low + (place + 0.5) * cells.cell_m).astype(np.float32))
-    roots = torch.from_numpy(cells.roots[cells.index[tuple(place.T)] >> 3])
-    found, rested = skin.find_roots(centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose))
+    roots = torch.from_numpy(cells.roots[cells.packed_cells[tuple(place.T)] >> 3])
+    found, rested = skin.broyden_roots(centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose))
     assert rested.float().mean() > 0.95
     off = (found - roots[:, :3]).norm(dim=1)[rested]
     assert float(off.quantile(0.95)) < 1e-3
 
 
 def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
-    cells = WarpCells.of(rig, bent_pose)
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
     roots = solved_roots(cells)[::29]
     step = rng.normal(size=(len(roots), 3)).astype(np.float32)
     step *= 1e-3 / np.linalg.norm(step, axis=1, keepdims=True)
@@ -91,7 +91,7 @@ def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
 
 
 def test_no_cell_is_far_from_the_body(rig, bent_pose):
-    cells = WarpCells.of(rig, bent_pose, band_m=0.05)
+    cells = CorrespondenceGrid.solve(rig, bent_pose, band_m=0.05)
     place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
     cell = (place * rig.distance.shape).astype(int)
     assert rig.distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
@@ -100,27 +100,27 @@ def test_no_cell_is_far_from_the_body(rig, bent_pose):
 def test_wild_poses_are_solved_without_harm(rig, rng):
     """Far from anything a body does: roots may be lost, but all that is kept is finite."""
     for _ in range(20):
-        cells = WarpCells.of(rig, rng.normal(size=(23, 3)) * 2.0)
+        cells = CorrespondenceGrid.solve(rig, rng.normal(size=(23, 3)) * 2.0)
         assert np.isfinite(cells.roots[1:]).all()
         place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
         assert ((place >= 0.0) & (place <= 1.0)).all()
 
 
 def test_only_nodes_near_the_skin_are_blended(rig):
-    near = rig.near_nodes(0.11)
+    near = rig.skinning_nodes_within(0.11)
     assert len(near.nodes) < 0.4 * rig.weights[..., 0].size
     weights = np.zeros((len(near.nodes), 24), dtype=np.float32)
     weights[np.repeat(np.arange(len(near.nodes)), np.diff(near.first)), near.joints] = near.shares
     np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.nodes])
-    assert len(rig.near_nodes(0.2).nodes) > len(near.nodes)
+    assert len(rig.skinning_nodes_within(0.2).nodes) > len(near.nodes)
 
 
 def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeypatch):
-    few = WarpCells.of(rig, bent_pose)
-    all_nodes = rig.near_nodes(9.0)
-    monkeypatch.setattr(type(rig), "near_nodes", lambda self, reach_m: all_nodes)
-    everywhere = WarpCells.of(rig, bent_pose)
-    np.testing.assert_array_equal(few.index, everywhere.index)
+    few = CorrespondenceGrid.solve(rig, bent_pose)
+    all_nodes = rig.skinning_nodes_within(9.0)
+    monkeypatch.setattr(type(rig), "skinning_nodes_within", lambda self, reach_m: all_nodes)
+    everywhere = CorrespondenceGrid.solve(rig, bent_pose)
+    np.testing.assert_array_equal(few.packed_cells, everywhere.packed_cells)
     same = np.abs(few.roots - everywhere.roots).max(axis=1) < 1e-3
     assert same.mean() > 0.995  # in folds rounding decides
 
@@ -128,9 +128,9 @@ def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeyp
 def test_the_second_order_term_betters_bent_cells_and_only_those_have_it(rig, rng, bent_pose):
     canonical = around_the_skin(rig, rng)
     targets = posed(rig, bent_pose, canonical).numpy()
-    cells = WarpCells.of(rig, bent_pose)
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
     place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
-    bent = (cells.index[tuple(place.T)] & 4) > 0
+    bent = (cells.packed_cells[tuple(place.T)] & 4) > 0
     assert 0.02 < bent.mean() < 0.4
     errors = [
         np.linalg.norm(candidates(cells, targets[bent], on) - canonical[bent, None], axis=2).min(1)
@@ -141,13 +141,13 @@ def test_the_second_order_term_betters_bent_cells_and_only_those_have_it(rig, rn
 
 
 def test_the_compiled_build_agrees_with_its_meaning(rig, rng, bent_pose, monkeypatch):
-    ours = WarpCells.of(rig, bent_pose)
+    ours = CorrespondenceGrid.solve(rig, bent_pose)
     monkeypatch.setenv("IA_BACKEND", "torch")
-    theirs = WarpCells.of(rig, bent_pose)
+    theirs = CorrespondenceGrid.solve(rig, bent_pose)
     np.testing.assert_allclose(ours.low, theirs.low, atol=1e-5)
-    assert ours.index.shape == theirs.index.shape
-    assert np.mean((ours.index & 3) == (theirs.index & 3)) > 0.995
-    assert np.mean((ours.index & 4) == (theirs.index & 4)) > 0.98
+    assert ours.packed_cells.shape == theirs.packed_cells.shape
+    assert np.mean((ours.packed_cells & 3) == (theirs.packed_cells & 3)) > 0.995
+    assert np.mean((ours.packed_cells & 4) == (theirs.packed_cells & 4)) > 0.98
     targets = posed(rig, bent_pose, around_the_skin(rig, rng)).numpy()
     found = [candidates(cells, targets)[:, :2] for cells in (ours, theirs)]
     gap = np.linalg.norm(found[0][:, :, None] - found[1][:, None], axis=3).min(axis=2)[:, 0]
@@ -157,8 +157,8 @@ def test_the_compiled_build_agrees_with_its_meaning(rig, rng, bent_pose, monkeyp
 
 
 def test_a_pose_is_solved_the_same_way_every_time(rig, bent_pose):
-    first, second = WarpCells.of(rig, bent_pose), WarpCells.of(rig, bent_pose)
-    np.testing.assert_array_equal(first.index, second.index)
+    first, second = CorrespondenceGrid.solve(rig, bent_pose), CorrespondenceGrid.solve(rig, bent_pose)
+    np.testing.assert_array_equal(first.packed_cells, second.packed_cells)
     np.testing.assert_array_equal(first.roots, second.roots)
 
 
@@ -170,7 +170,7 @@ def test_a_wider_band_holds_all_that_a_narrow_one_holds_and_more(rig, rng, bent_
     off_skin = rig.distance[tuple(cell.T)]
     far = (off_skin > 0.1) & (off_skin < 0.14)
     targets = posed(rig, rig.canonical_rotations + 0.02, canonical).numpy()
-    wide = WarpCells.of(rig, rig.canonical_rotations + 0.02, band_m=0.15)
+    wide = CorrespondenceGrid.solve(rig, rig.canonical_rotations + 0.02, band_m=0.15)
     error = nearest_root_error(wide, targets, canonical)
     assert far.sum() > 1000
     assert np.mean(error[far] < 2e-3) > 0.99

@@ -12,30 +12,30 @@ import torch
 
 from avatar import checkpoint
 from avatar.config import TrainConfig
-from avatar.prepare import prepare
+from avatar.prepare import prepare_frame
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.trainer import Trainer
-from capture.errors import BadInput
+from capture.errors import InputError
 
 CPU = torch.device("cpu")
 CONFIG = TrainConfig(
-    rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_points=32, seed=7
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_space_points=32, seed=7
 )
 
 
 @pytest.fixture(scope="module")
 def frames(rig, clip):
-    return [prepare(observation, rig) for observation in clip.observations[:3]]
+    return [prepare_frame(observation, rig) for observation in clip.observations[:3]]
 
 
 @pytest.fixture
 def trainer(rig, frames) -> Trainer:
     trainer = Trainer(rig, CONFIG, CPU)
     for frame in frames:
-        trainer.add(frame)
+        trainer.add_frame(frame)
     for _ in range(20):
-        trainer.step(rate=1.0, hard_share=0.5)
+        trainer.step(rate=1.0, hard_surface_share=0.5)
     trainer.wall_seconds, trainer.cpu_seconds = 12.5, 11.75
     return trainer
 
@@ -70,7 +70,7 @@ def test_what_is_read_is_what_was_written_to_the_last_bit(trainer, tmp_path):
     assert list(folder.iterdir()) == [path]
     assert read == notes
     assert again.config == trainer.config
-    for name in checkpoint.COUNTS:
+    for name in checkpoint.COUNTERS:
         assert getattr(again, name) == getattr(trainer, name) != 0
     for ours, theirs in zip(numbers(again), numbers(trainer), strict=True):
         assert torch.equal(ours, theirs)
@@ -93,7 +93,7 @@ def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
     for learner in (again, fresh):
         for frame in frames:
             learner.replay.add(frame)
-        taken = [learner.step(rate=1.0, hard_share=0.5) for _ in range(5)]
+        taken = [learner.step(rate=1.0, hard_surface_share=0.5) for _ in range(5)]
         losses.append(np.mean([float(result.loss.mean()) for result in taken]))
     assert losses[0] < 0.5 * losses[1]
     assert (again.steps, again.rays) == (25, 25 * CONFIG.rays)
@@ -158,14 +158,14 @@ def test_a_folder_without_a_checkpoint_says_so(tmp_path):
 def test_a_file_that_was_cut_off_is_refused_by_name(saved, share):
     whole = saved.read_bytes()
     saved.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(BadInput, match=str(saved)):
+    with pytest.raises(InputError, match=str(saved)):
         checkpoint.load(saved.parent, CPU)
 
 
 @pytest.mark.parametrize("content", [b"hello, I am no checkpoint", b"\x80\x02garbage", bytes(999)])
 def test_a_file_of_something_else_is_refused_by_name(saved, content):
     saved.write_bytes(content)
-    with pytest.raises(BadInput, match=str(saved)):
+    with pytest.raises(InputError, match=str(saved)):
         checkpoint.load(saved.parent, CPU)
 
 
@@ -184,7 +184,7 @@ def test_code_in_a_checkpoint_is_refused_and_not_executed(saved, tmp_path, write
     mark = tmp_path / "executed"
     trap = Trap(mark)
     write(trap if write is torch.save else pickle.dumps(trap, protocol=2), saved)
-    with pytest.raises(BadInput, match=rf"{saved} holds something other than numbers"):
+    with pytest.raises(InputError, match=rf"{saved} holds something other than numbers"):
         checkpoint.load(saved.parent, CPU)
     assert not mark.exists()
     pickle.loads(pickle.dumps(trap))  # the trap works
@@ -192,8 +192,8 @@ def test_code_in_a_checkpoint_is_refused_and_not_executed(saved, tmp_path, write
 
 
 def test_a_checkpoint_of_another_format_says_which(saved):
-    folder = damaged(saved, lambda state: state.update(format=checkpoint.FORMAT + 1))
-    with pytest.raises(BadInput, match=rf"format {checkpoint.FORMAT + 1}.*--overwrite"):
+    folder = damaged(saved, lambda state: state.update(format=checkpoint.CHECKPOINT_FORMAT + 1))
+    with pytest.raises(InputError, match=rf"format {checkpoint.CHECKPOINT_FORMAT + 1}.*--overwrite"):
         checkpoint.load(folder, CPU)
 
 
@@ -210,7 +210,7 @@ def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change
         else:
             state[key] = {} if isinstance(state[key], dict) else []
 
-    with pytest.raises(BadInput, match=str(saved)):
+    with pytest.raises(InputError, match=str(saved)):
         checkpoint.load(damaged(saved, lose), CPU)
 
 
@@ -222,6 +222,6 @@ def test_a_checkpoint_from_before_there_was_a_mean_shows_what_was_learnt(saved, 
 
 def test_a_checkpoint_from_before_anything_was_inside_knows_of_nothing_solid(saved, trainer):
     again, _ = checkpoint.load(damaged(saved, lambda state: state["rig"].pop("inside")), CPU)
-    assert not again.avatar.rig.inside.any()
-    assert again.avatar.rig.inside.shape == trainer.avatar.rig.inside.shape
-    assert len(again.avatar.occupancy.solid_points(10, torch.Generator())) == 0
+    assert not again.avatar.rig.inside_skin.any()
+    assert again.avatar.rig.inside_skin.shape == trainer.avatar.rig.inside.shape
+    assert len(again.avatar.occupancy.sample_interior(10, torch.Generator())) == 0

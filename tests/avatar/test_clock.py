@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.train import Clock
+from avatar.train import TrainingClock
 from avatar.trainer import Trainer
 
 
 @pytest.fixture
 def trainer(rig) -> Trainer:
-    config = TrainConfig(rays=64, step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
+    config = TrainConfig(rays=64, sample_step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
     return Trainer(rig, config, torch.device("cpu"))
 
 
@@ -31,14 +31,14 @@ def spend(monkeypatch):
 
 def test_time_goes_on_from_where_an_earlier_run_stopped(trainer, spend):
     trainer.wall_seconds, trainer.cpu_seconds = 5.0, 3.0
-    clock = Clock(trainer)
+    clock = TrainingClock(trainer)
     spend(4.0)
     assert clock.read() == trainer.wall_seconds == 9.0
     assert trainer.cpu_seconds == 5.0
 
 
 def test_a_pause_does_not_count(trainer, spend):
-    clock = Clock(trainer)
+    clock = TrainingClock(trainer)
     spend(2.0)
     with trainer.held_up():
         spend(60.0)
@@ -50,13 +50,13 @@ def test_a_pause_does_not_count(trainer, spend):
 def test_a_pause_before_the_clock_takes_nothing_from_it(trainer, spend):
     with trainer.held_up():
         spend(60.0)
-    clock = Clock(trainer)
+    clock = TrainingClock(trainer)
     spend(1.0)
     assert clock.read() == 1.0
 
 
 def test_a_pause_that_ends_badly_does_not_count_either(trainer, spend):
-    clock = Clock(trainer)
+    clock = TrainingClock(trainer)
 
     def stopped() -> None:
         with trainer.held_up():

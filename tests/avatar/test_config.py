@@ -4,31 +4,31 @@ import dataclasses
 
 import pytest
 
-from avatar.config import COARSEST_M, ENOUGH_FRAMES, TrainConfig
+from avatar.config import COARSEST_M, FULL_DETAIL_FRAMES, TrainConfig
 
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 0.004, 0.009, 0.02, 0.5])
 def test_every_recipe_can_be_built(footprint_m):
-    config = TrainConfig.within(60.0, footprint_m=footprint_m, frames=1)
+    config = TrainConfig.for_budget(60.0, footprint_m=footprint_m, frames=1)
     assert config.table_size & (config.table_size - 1) == 0
     assert 1 << 15 <= config.table_size <= 1 << 19
     assert 0.002 <= config.finest_m < COARSEST_M
-    assert 0.004 <= config.step_m <= 0.015
+    assert 0.004 <= config.sample_step_m <= 0.015
 
 
 def test_detail_follows_the_pixels():
-    far, near = (TrainConfig.within(60.0, footprint_m=size) for size in (0.012, 0.004))
+    far, near = (TrainConfig.for_budget(60.0, footprint_m=size) for size in (0.012, 0.004))
     assert near.finest_m == 0.004
     assert far.finest_m == 0.012
-    assert near.step_m < far.step_m
+    assert near.sample_step_m < far.sample_step_m
     assert near.table_size >= far.table_size
 
 
 def test_few_frames_determine_less_detail():
     def finest(frames):
-        return TrainConfig.within(60.0, footprint_m=0.004, frames=frames).finest_m
+        return TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames).finest_m
 
-    assert finest(6) == pytest.approx(0.004 * (ENOUGH_FRAMES / 6) ** 0.5)
+    assert finest(6) == pytest.approx(0.004 * (FULL_DETAIL_FRAMES / 6) ** 0.5)
     assert finest(6) > finest(12) > finest(24) == finest(300) == finest(None)
 
 
@@ -51,7 +51,7 @@ def test_what_contradicts_itself_is_refused_with_advice(choices, advice):
     [
         {},
         {"roots": "broyden", "refine_poses": False},
-        {"skipping": "none", "empty_weight": 0.0},
+        {"skipping": "none", "empty_space_weight": 0.0},
         {"skipping": "none", "empty_term": "global"},
         {"skipping": "union"},
         {"skipping": "frame", "roots": "broyden", "refine_poses": False},
@@ -63,32 +63,32 @@ def test_what_goes_together_is_taken(choices):
 
 def test_the_fewer_the_frames_the_smoother_surfaces_are_asked_to_be():
     weights = [
-        TrainConfig.within(60.0, footprint_m=0.004, frames=frames).variation_weight
+        TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames).density_tv_weight
         for frames in (None, 120, 24, 12, 6)
     ]
-    usual = TrainConfig().variation_weight
+    usual = TrainConfig().density_tv_weight
     assert weights == pytest.approx([usual, usual, usual, 2.0 * usual, 13.5 * usual])
 
 
 def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
-    usual = TrainConfig.within(60.0, footprint_m=0.004)
+    usual = TrainConfig.for_budget(60.0, footprint_m=0.004)
     for frames in (24, 25, 1000):
-        assert TrainConfig.within(60.0, footprint_m=0.004, frames=frames) == usual
-    dozen = TrainConfig.within(60.0, footprint_m=0.004, frames=12)
-    assert dozen.firm_weight == dozen.solid_weight == dozen.gap_weight == 0.0
-    assert dozen.soft_weight == dozen.even_weight == dozen.thin_density == 0.0
-    assert dozen.first_variation == 1.0
-    assert usual.firm_weight == usual.solid_weight == 0.0
-    assert usual.variation_at(0.0) == usual.variation_at(1.0) == usual.variation_weight
+        assert TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames) == usual
+    dozen = TrainConfig.for_budget(60.0, footprint_m=0.004, frames=12)
+    assert dozen.double_well_weight == dozen.interior_weight == dozen.inner_leg_weight == 0.0
+    assert dozen.density_slope_weight == dozen.color_tv_weight == dozen.min_occupied_density == 0.0
+    assert dozen.initial_density_tv_factor == 1.0
+    assert usual.double_well_weight == usual.interior_weight == 0.0
+    assert usual.density_tv_weight_at(0.0) == usual.density_tv_weight_at(1.0) == usual.density_tv_weight
 
 
 def test_surfaces_are_smoothest_at_first():
-    few = TrainConfig.within(60.0, footprint_m=0.004, frames=8)
-    weights = [few.variation_at(share) for share in (0.0, 0.5, 1.0)]
-    assert weights[2] == few.variation_weight < weights[1] < weights[0]
-    assert weights[0] == pytest.approx(1.5**3 * few.variation_weight)
+    few = TrainConfig.for_budget(60.0, footprint_m=0.004, frames=8)
+    weights = [few.density_tv_weight_at(share) for share in (0.0, 0.5, 1.0)]
+    assert weights[2] == few.density_tv_weight < weights[1] < weights[0]
+    assert weights[0] == pytest.approx(1.5**3 * few.density_tv_weight)
 
 
 def test_edges_may_be_as_steep_as_the_finest_cells_are_fine():
     coarse, fine = TrainConfig(finest_m=0.008), TrainConfig(finest_m=0.004)
-    assert fine.steepest_per_m == 2.0 * coarse.steepest_per_m == pytest.approx(1000.0)
+    assert fine.max_log_density_slope_per_m == 2.0 * coarse.max_log_density_slope_per_m == pytest.approx(1000.0)

@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from avatar.coverage import Coverage, Stage, posed
-from avatar.patches import PART_NAMES, SIDE_NAMES, SkinPatches, in_front
+from avatar.coverage import Coverage, VisibilityStage, pose_patches
+from avatar.patches import PART_NAMES, SIDE_NAMES, SkinPatches, visible_points
 
 L_SHOULDER, R_SHOULDER = 15, 16
 
@@ -46,7 +46,7 @@ def test_the_left_side_is_the_persons_left(coverage):
 
 def test_posed_patches_lie_on_the_posed_skin(shaped, observed, coverage):
     body = shaped.with_pose(observed(turned=1.0).pose)
-    points, normals = posed(coverage.patches, body.world_from_rest())
+    points, normals = pose_patches(coverage.patches, body.world_from_rest())
     spacing = np.linalg.norm(body.vertices()[None] - points[::50, None], axis=2).min(axis=1)
     assert spacing.max() < 0.02
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
@@ -59,7 +59,7 @@ def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverag
         assert parts[name].sides["front"] > 0.8
         assert parts[name].sides["back"] == 0.0
     assert 0.3 < coverage.seen < 0.5
-    _, normals = posed(coverage.patches, shaped.with_pose(observed().pose).world_from_rest())
+    _, normals = pose_patches(coverage.patches, shaped.with_pose(observed().pose).world_from_rest())
     # nobody is seen more than 72° aslant, and the body spans 15° of the camera's view to each side
     assert not (coverage.cosines[normals[:, 2] < np.cos(np.radians(72 + 15))] > 0.0).any()
 
@@ -67,8 +67,8 @@ def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverag
 def test_patches_are_seen_as_squarely_as_they_face_the_camera(shaped, observed, coverage):
     far = observed(distance_m=1000.0)
     coverage.add(far)
-    _, normals = posed(coverage.patches, shaped.with_pose(far.pose).world_from_rest())
-    seen = coverage.stages == Stage.SEEN
+    _, normals = pose_patches(coverage.patches, shaped.with_pose(far.pose).world_from_rest())
+    seen = coverage.stages == VisibilityStage.SEEN
     assert np.allclose(coverage.cosines[seen], normals[seen, 2], atol=0.01)
 
 
@@ -96,7 +96,7 @@ def test_an_arm_before_the_chest_hides_it(shaped, observed):
         view.pose.joint_rotations[L_SHOULDER] = 0.0, -lowered_forward, 0.0
         view.pose.joint_rotations[R_SHOULDER] = 0.0, lowered_forward, 0.0
         coverage.add(view)
-        return coverage.parts()["torso"].sides["front"]
+        return coverage.by_part()["torso"].sides["front"]
 
     assert chest(0.0) > 0.95
     assert chest(2.2) < chest(0.0) - 0.05
@@ -107,7 +107,7 @@ def test_what_is_outside_the_picture_is_not_seen(observed, coverage):
     for foot in ("left foot", "right foot"):
         assert coverage.parts()[foot].seen == 0.0
     here = coverage.patches.parts == PART_NAMES.index("left foot")
-    assert set(coverage.stages[here].tolist()) == {Stage.AWAY, Stage.OUTSIDE}
+    assert set(coverage.stages[here].tolist()) == {VisibilityStage.FACING_AWAY, VisibilityStage.OUTSIDE_IMAGE}
     assert coverage.parts()["head"].seen > 0.2
 
 
@@ -119,7 +119,7 @@ def test_what_the_mask_leaves_out_is_not_seen(observed, coverage):
     assert parts["right thigh"].seen == 0.0
     assert parts["left thigh"].sides["front"] > 0.9
     here = coverage.patches.parts == PART_NAMES.index("right thigh")
-    assert set(coverage.stages[here].tolist()) <= {Stage.AWAY, Stage.HIDDEN, Stage.MASKED}
+    assert set(coverage.stages[here].tolist()) <= {VisibilityStage.FACING_AWAY, VisibilityStage.SELF_OCCLUDED, VisibilityStage.OUTSIDE_MASK}
 
 
 def test_somebody_behind_the_camera_is_not_seen(observed, coverage):
@@ -144,28 +144,28 @@ def test_a_near_plane_hides_a_far_one_and_never_itself():
         depth = 3.0 + flat[:, 0] * np.tan(np.radians(degrees))
         plane = np.concatenate([flat, flat])
         depths = np.concatenate([depth, depth + 0.5])
-        free = in_front(plane, depths, np.full(len(plane), cosine), cell_m=0.03, slack_m=0.03)
+        free = visible_points(plane, depths, np.full(len(plane), cosine), cell_m=0.03, tolerance_m=0.03)
         assert free[: len(flat)].all()
         assert not free[len(flat) :].any()
 
 
 def test_points_that_look_away_hide_nothing():
     plane, depth = np.zeros((2, 2)), np.array([1.0, 2.0])
-    free = in_front(plane, depth, np.array([-1.0, 1.0]), cell_m=0.03, slack_m=0.03)
+    free = visible_points(plane, depth, np.array([-1.0, 1.0]), cell_m=0.03, tolerance_m=0.03)
     assert free.tolist() == [False, True]
 
 
 def test_what_was_seen_survives_a_checkpoint(shaped, observed, coverage):
     coverage.add(observed())
     again = Coverage(shaped)
-    again.recall(coverage.as_notes())
+    again.merge_state(coverage.to_state())
     assert np.array_equal(again.stages, coverage.stages)
     assert np.abs(again.cosines - coverage.cosines).max() < 0.5 / 255.0 + 1e-6
-    assert again.seen == coverage.seen
+    assert again.seen_share == coverage.seen
 
 
 def test_notes_of_another_body_count_nothing(shaped, coverage):
-    notes = Coverage(shaped).as_notes() | {"stages": "BAQE"}
+    notes = Coverage(shaped).to_state() | {"stages": "BAQE"}
     coverage.recall(notes)
     assert coverage.seen == 0.0
 
@@ -193,8 +193,8 @@ def test_shares_of_parts_make_up_the_share_of_the_whole(observed, coverage):
 
 
 def test_patches_that_touch_are_near_and_look_the_same_way(shaped):
-    patches = SkinPatches.of(shaped)
-    first, second = patches.links.T
+    patches = SkinPatches.from_shaped_body(shaped)
+    first, second = patches.adjacent_pairs.T
     apart = np.linalg.norm(patches.points[first] - patches.points[second], axis=1)
     assert apart.max() <= 0.045
     assert np.all(np.einsum("na,na->n", patches.normals[first], patches.normals[second]) > 0.0)

@@ -11,8 +11,8 @@ import torch
 from avatar import checkpoint, fit, pose_step
 from avatar.config import TrainConfig
 from avatar.events import Evaluated, Finished
-from avatar.hold import HeldOut, prepared, score
-from avatar.refine import BEGUN_AFTER_STEPS
+from avatar.hold import HeldOutFrame, prepare_stream, score_frame
+from avatar.refine import FIRST_CORRECTION_STEPS
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from elsewhere import ELSEWHERE, DeviceMixUpError, Elsewhere, elsewhere
 
 CONFIG = TrainConfig(
-    rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_points=16,
-    key_frames=3, most_samples=64, occupancy_every=4,
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_space_points=16,
+    replay_capacity=3, max_samples=64, occupancy_interval=4,
 )  # fmt: skip
 
 
@@ -49,19 +49,19 @@ def test_a_mix_up_of_devices_shows(device):
 def trainer(device, rig, clip):
     """Trained until poses are refined and the occupancy has been updated."""
     trainer = Trainer(rig, CONFIG, device)
-    for item in prepared(iter(clip.observations[:4]), rig, every=0, total=None):
-        trainer.add(item)
-    trainer.steps = BEGUN_AFTER_STEPS - 3
+    for item in prepare_stream(iter(clip.observations[:4]), rig, stride=0, total=None):
+        trainer.add_frame(item)
+    trainer.steps = FIRST_CORRECTION_STEPS - 3
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_step, "CHANCE", -1.0)  # these poses are exact, and would not move
+        patch.setattr(pose_step, "MIN_EVIDENCE", -1.0)  # these poses are exact, and would not move
         patch.setattr(pose_step, "CERTAIN", 0.0)
         for _ in range(12):
-            trainer.step(rate=1.0, hard_share=1.0)
+            trainer.step(rate=1.0, hard_surface_share=1.0)
     return trainer
 
 
-def held_out(clip, rig) -> list[HeldOut]:
-    return [next(prepared(iter([clip.novel]), rig, every=1, total=None))]
+def held_out(clip, rig) -> list[HeldOutFrame]:
+    return [next(prepare_stream(iter([clip.novel]), rig, stride=1, total=None))]
 
 
 def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig, monkeypatch):
@@ -69,9 +69,9 @@ def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig,
     assert all(parameter.device == ELSEWHERE for parameter in trainer.avatar.field.parameters())
     assert trainer.corrections  # poses were refined, too
     held = held_out(clip, rig)
-    assert np.isfinite(score(trainer.avatar, held[0]).psnr)
-    monkeypatch.setattr(fit, "CORRECTIONS", 4)
-    assert np.isfinite(fit.fitted_scores(trainer, held)[0].psnr)
+    assert np.isfinite(score_frame(trainer.avatar, held[0]).psnr)
+    monkeypatch.setattr(fit, "CORRECTIONS_PER_FRAME", 4)
+    assert np.isfinite(fit.score_with_fitted_poses(trainer, held)[0].psnr)
 
 
 @pytest.mark.parametrize(
@@ -85,9 +85,9 @@ def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig,
 def test_the_papers_schemes_stay_on_their_device(device, scheme, rig, clip):
     config = replace(CONFIG, rays=8, refine_poses=False, **scheme)
     trainer = Trainer(rig, config, device)
-    trainer.add(next(prepared(iter(clip.observations[:1]), rig, every=0, total=None)))
+    trainer.add_frame(next(prepare_stream(iter(clip.observations[:1]), rig, stride=0, total=None)))
     for _ in range(2):
-        result = trainer.step(rate=1.0, hard_share=1.0)
+        result = trainer.step(rate=1.0, hard_surface_share=1.0)
     assert result.loss.device == ELSEWHERE
     assert torch.isfinite(trainer.avatar.field.table.cpu()).all()
 
@@ -105,8 +105,8 @@ def test_a_checkpoint_goes_from_one_device_to_another(trainer, tmp_path):
 
 def test_the_stream_of_training_runs_on_a_device(device, clip, rig):
     trainer = Trainer(rig, replace(CONFIG, seconds=2.1, refine_poses=False), device)
-    held: list[HeldOut] = []
-    frames = prepared(iter(clip.observations[:6]), rig, every=3, total=None)
+    held: list[HeldOutFrame] = []
+    frames = prepare_stream(iter(clip.observations[:6]), rig, stride=3, total=None)
     events = list(train(trainer, Inbox(frames), held))
     assert isinstance(events[-1], Finished)
     assert any(isinstance(event, Evaluated) for event in events)

@@ -9,38 +9,38 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.config import TrainConfig
 from avatar.hold import (
-    HeldOut,
-    interleaved,
+    HeldOutFrame,
+    coarse_to_fine_order,
     is_held_out,
-    keep,
-    on_white,
-    prepared,
-    score,
-    spread,
-    truth_on_white,
+    add_held_out,
+    composite_on_white,
+    prepare_stream,
+    score_frame,
+    subsample_evenly,
+    ground_truth_on_white,
 )
 from avatar.metrics import psnr, ssim
-from avatar.prepare import PreparedFrame
+from avatar.prepare import TrainingFrame
 from avatar.trainer import Trainer
 from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.observation import Observation
-from preprocess.observe import Dropped
+from preprocess.observe import DroppedFrame
 from preprocess.pose import BodyPose
 
 
 def held_of(total, every=10):
-    return [p for p in range(total) if is_held_out(p, every=every, total=total)]
+    return [p for p in range(total) if is_held_out(p, stride=every, total=total)]
 
 
 @pytest.fixture(scope="module")
-def held(rig, clip) -> HeldOut:
+def held(rig, clip) -> HeldOutFrame:
     observation = clip.observations[3]
-    cells = WarpCells.of(rig, observation.pose.joint_rotations)
-    return HeldOut(observation=observation, cells=cells)
+    cells = CorrespondenceGrid.solve(rig, observation.pose.joint_rotations)
+    return HeldOutFrame(observation=observation, correspondences=cells)
 
 
 @given(st.integers(20, 500))
@@ -59,7 +59,7 @@ def test_a_single_frame_is_trained_on():
 
 @given(st.integers(0, 10_000))
 def test_a_stream_of_unknown_length_is_held_out_like_a_long_one(position):
-    assert is_held_out(position, every=10, total=None) == (position % 10 == 9)
+    assert is_held_out(position, stride=10, total=None) == (position % 10 == 9)
 
 
 @given(st.integers(1, 500))
@@ -68,14 +68,14 @@ def test_nothing_is_held_out_if_nobody_wants_it(total):
 
 
 def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip):
-    items = [*clip.observations[:5], Dropped(index=5, reason="empty mask"), clip.observations[6]]
-    ready = list(prepared(iter(items), rig, every=3, total=None))
+    items = [*clip.observations[:5], DroppedFrame(index=5, reason="empty mask"), clip.observations[6]]
+    ready = list(prepare_stream(iter(items), rig, stride=3, total=None))
     assert [type(item) for item in ready] == [
-        PreparedFrame, PreparedFrame, HeldOut, PreparedFrame, PreparedFrame, Dropped, PreparedFrame
+        TrainingFrame, TrainingFrame, HeldOutFrame, TrainingFrame, TrainingFrame, DroppedFrame, TrainingFrame
     ]  # fmt: skip
     assert ready[5] is items[5]
     assert ready[2].observation is items[2]
-    indices = [item.index for item in ready if isinstance(item, PreparedFrame)]
+    indices = [item.index for item in ready if isinstance(item, TrainingFrame)]
     assert indices == [0, 1, 3, 4, 6]
 
 
@@ -92,7 +92,7 @@ def test_the_truth_is_the_picture_where_the_person_is_and_white_elsewhere():
     rgb = np.array([[[255, 51, 0], [10, 20, 30], [0, 102, 204]]], dtype=np.uint8)
     alpha = np.array([[1.0, 0.0, 0.5]], dtype=np.float32)
     expected = [[[1.0, 0.2, 0.0], [1.0, 1.0, 1.0], [0.5, 0.7, 0.9]]]
-    np.testing.assert_allclose(truth_on_white(observed(rgb, alpha)), expected, atol=1e-6)
+    np.testing.assert_allclose(ground_truth_on_white(observed(rgb, alpha)), expected, atol=1e-6)
 
 
 def test_a_perfect_rendering_on_white_is_the_truth(rng):
@@ -100,15 +100,15 @@ def test_a_perfect_rendering_on_white_is_the_truth(rng):
     alpha = rng.random((7, 5), dtype=np.float32)
     color = rgb.astype(np.float32) / 255.0 * alpha[..., None]
     perfect = np.concatenate([color, alpha[..., None]], axis=-1)
-    np.testing.assert_allclose(on_white(perfect), truth_on_white(observed(rgb, alpha)), atol=1e-6)
+    np.testing.assert_allclose(composite_on_white(perfect), ground_truth_on_white(observed(rgb, alpha)), atol=1e-6)
 
 
 def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
     trainer = Trainer(rig, TrainConfig(levels=2, table_size=1 << 10), torch.device("cpu"))
-    trainer.avatar.occupancy.grid.occupied.zero_()
-    truth, mask = truth_on_white(held.observation), held.observation.alpha > 0.5
+    trainer.avatar.occupancy.density_grid.occupied.zero_()
+    truth, mask = ground_truth_on_white(held.observation), held.observation.alpha > 0.5
     white = np.ones_like(truth)
-    got = score(trainer.avatar, held)
+    got = score_frame(trainer.avatar, held)
     assert got.frame == held.observation.frame.index
     assert got.psnr == pytest.approx(psnr(white, truth))
     assert got.psnr_mask == pytest.approx(psnr(white, truth, mask))
@@ -118,8 +118,8 @@ def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
 
 @given(count=st.integers(0, 60), most=st.integers(2, 20))
 def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
-    frames = [HeldOut(observation=held.observation, cells=held.cells) for _ in range(count)]
-    chosen = [frames.index(frame) for frame in spread(frames, most)]
+    frames = [HeldOutFrame(observation=held.observation, correspondences=held.cells) for _ in range(count)]
+    chosen = [frames.index(frame) for frame in subsample_evenly(frames, most)]
     assert len(chosen) == min(count, most)
     if count > most:
         gaps = np.diff(chosen)
@@ -131,7 +131,7 @@ def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
 
 
 def test_every_beginning_of_the_interleaved_order_is_spread_over_the_stream():
-    order = interleaved(list(range(12)))
+    order = coarse_to_fine_order(list(range(12)))
     assert sorted(order) == list(range(12))
     assert order[:2] == [0, 8]
     assert max(np.diff(sorted([*order[:3], 12]))) <= 4
@@ -143,7 +143,7 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
     kept, places = [], range(9, 10 * count, 10)
     for place in places:
         frame = replace(held.observation.frame, index=place)
-        keep(kept, HeldOut(observation=replace(held.observation, frame=frame)), most=most)
+        add_held_out(kept, HeldOutFrame(observation=replace(held.observation, frame=frame)), max_frames=most)
     indices = [frame.observation.frame.index for frame in kept]
     assert min(len(places), most // 2) <= len(indices) <= most
     assert indices[0] == places[0]
@@ -155,5 +155,5 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
 
 
 def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
-    lazy = HeldOut(observation=held.observation)
-    assert score(learnt.trainer.avatar, lazy) == score(learnt.trainer.avatar, lazy.solved(rig))
+    lazy = HeldOutFrame(observation=held.observation)
+    assert score_frame(learnt.trainer.avatar, lazy) == score_frame(learnt.trainer.avatar, lazy.with_correspondences(rig))

@@ -33,11 +33,11 @@ def run(folder: Path) -> list[str]:
 
 
 def test_a_kernel_is_compiled_again_when_a_kernel_it_calls_has_changed(tmp_path):
-    (tmp_path / "caller.py").write_text(CALLER)
-    (tmp_path / "callee.py").write_text(CALLEE.format(factor=3.0))
+    (tmp_path / "caller.py").write_text_atomically(CALLER)
+    (tmp_path / "callee.py").write_text_atomically(CALLEE.format(factor=3.0))
     assert run(tmp_path) == ["6.0", "0"]
     assert run(tmp_path) == ["6.0", "1"]
-    (tmp_path / "callee.py").write_text(CALLEE.format(factor=5.0))
+    (tmp_path / "callee.py").write_text_atomically(CALLEE.format(factor=5.0))
     assert run(tmp_path) == ["10.0", "0"]
 
 

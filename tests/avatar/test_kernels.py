@@ -7,16 +7,16 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_cdt
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.kernels import reference
-from avatar.kernels.backend import Grid, Marching, Rays, Samples
+from avatar.kernels.backend import DensityGrid, MarchSettings, RayBatch, RaySamples
 from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.torch_backend import TorchBackend
-from avatar.levels import FEATURES
-from avatar.occupancy import Occupancy
-from avatar.render import cell_tables
-from capture.errors import BadInput
+from avatar.levels import FEATURES_PER_LEVEL
+from avatar.occupancy import OccupancyGrid
+from avatar.render import correspondence_tables
+from capture.errors import InputError
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
 BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
@@ -32,7 +32,7 @@ def packed(counts):
     counts = torch.tensor(counts, dtype=torch.int32)
     total = int(counts.sum())
     first = torch.cumsum(counts, 0) - counts
-    return Samples(torch.zeros(total, 3), first, counts, torch.zeros(total, dtype=torch.int32))
+    return RaySamples(torch.zeros(total, 3), first, counts, torch.zeros(total, dtype=torch.int32))
 
 
 def test_the_levels_hold_dense_and_hashed_ones(levels):
@@ -42,19 +42,19 @@ def test_the_levels_hold_dense_and_hashed_ones(levels):
 
 @BACKENDS
 def test_features_at_a_vertex_of_a_dense_level_are_its_entry(backend, levels, generator):
-    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     i, j, k = 3, 2, 1
     point = torch.from_numpy(levels.low) + torch.tensor([i, j, k]) / float(levels.cells_per_m[0])
     features = backend.encode(point[None].float(), table, levels)
     nx, ny, _ = levels.counts[0].tolist()
     torch.testing.assert_close(
-        features[0, :FEATURES], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
+        features[0, :FEATURES_PER_LEVEL], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
     )
 
 
 @pytest.mark.parametrize("count", [0, 1, 700])
 def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
-    table = torch.randn(levels.entries, FEATURES, generator=generator)
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     points = points_in(levels, count, generator, beyond=0.1)
     torch.testing.assert_close(
         NUMBA.encode(points, table, levels), TORCH.encode(points, table, levels),
@@ -66,7 +66,7 @@ def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
 def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     points = points_in(levels, count, generator)
     slope = torch.randn(count, levels.width, generator=generator)
-    ours, theirs = (torch.zeros(levels.entries, FEATURES) for _ in range(2))
+    ours, theirs = (torch.zeros(levels.entries, FEATURES_PER_LEVEL) for _ in range(2))
     NUMBA.encode_backward(points, slope, levels, ours)
     TORCH.encode_backward(points, slope, levels, theirs)
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
@@ -74,7 +74,7 @@ def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
 
 def test_the_encodings_gradient_passes_gradcheck_in_double(levels, generator):
     points = points_in(levels, 5, generator).double()
-    table = torch.randn(levels.entries, FEATURES, generator=generator, dtype=torch.float64)
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator, dtype=torch.float64)
     entries = torch.unique(torch.randint(levels.entries, (50,), generator=generator))
     part = table[entries].clone().requires_grad_()
 
@@ -87,7 +87,7 @@ def test_the_encodings_gradient_passes_gradcheck_in_double(levels, generator):
 def test_the_encodings_gradient_for_the_points_passes_gradcheck_in_double(levels, generator):
     """Inside, and outside the box, where the border's cells extrapolate."""
     points = points_in(levels, 6, generator, beyond=0.1).double().requires_grad_()
-    table = torch.randn(levels.entries, FEATURES, generator=generator, dtype=torch.float64)
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator, dtype=torch.float64)
     assert torch.autograd.gradcheck(
         lambda places: reference.encode(places, table, levels), (points,), eps=1e-7
     )
@@ -127,12 +127,12 @@ def test_compiled_loss_and_gradient_agree_with_autograd(generator):
 
 
 def test_the_gradient_of_the_loss_is_exact_to_a_millionth_however_opaque_a_ray(generator):
-    """Behind an opaque sample a gradient is nothing, not rounding times a large optical depth."""
+    """BackgroundModel an opaque sample a gradient is nothing, not rounding times a large optical depth."""
     raw, samples, *rest = loss_case(generator, counts=(60, 90, 40, 1, 80))
     raw[:, 3] = 8.9 - 6.0 * torch.rand(len(raw), generator=generator)
     step_m, target, background, *weights = rest
     leaf = raw.double().requires_grad_()
-    rendered = reference.composite(leaf, samples.first, samples.count, step_m)
+    rendered = reference.composite(leaf, samples.offsets, samples.counts, step_m)
     loss = reference.loss_per_ray(rendered, target.double(), background.double(), *weights)
     (expected,) = torch.autograd.grad(loss.mean(), leaf)
     grad = NUMBA.composite_loss(raw, samples, *rest)[2]
@@ -150,7 +150,7 @@ def test_the_meaning_of_the_loss_passes_gradcheck_in_double(generator):
     raw, samples, step_m, target, background, *weights = loss_case(generator)
 
     def mean_loss(raw):
-        rendered = reference.composite(raw, samples.first, samples.count, step_m)
+        rendered = reference.composite(raw, samples.offsets, samples.counts, step_m)
         return reference.loss_per_ray(
             rendered, target.double(), background.double(), *weights
         ).mean()
@@ -164,16 +164,16 @@ def scene(rig):
     rotations = np.zeros((23, 3))
     rotations[15, 2], rotations[16, 2], rotations[17, 1] = -1.0, 0.8, -0.8
     generator = torch.Generator().manual_seed(1)
-    grid = Occupancy(rig, torch.device("cpu")).grid
+    grid = OccupancyGrid(rig, torch.device("cpu")).density_grid
     distance = torch.from_numpy(rig.distance)
     grid.density.copy_(torch.where(distance < 0.02, 400.0, 0.5) * (distance < 0.05))
     grid.occupied.copy_((distance < 0.05).to(torch.uint8))
-    cells = cell_tables(WarpCells.of(rig, rotations), torch.device("cpu"))
+    cells = correspondence_tables(CorrespondenceGrid.solve(rig, rotations), torch.device("cpu"))
     origins = torch.randn(300, 3, generator=generator)
     origins = torch.nn.functional.normalize(origins, dim=1) * 3.0
     aim = torch.rand(300, 3, generator=generator) * torch.tensor([0.8, 1.6, 0.3])
     aim -= torch.tensor([0.4, 1.0, 0.15])
-    rays = Rays(
+    rays = RayBatch(
         origins, torch.nn.functional.normalize(aim - origins, dim=1),
         torch.zeros(300, dtype=torch.int32), torch.rand(300, generator=generator),
     )  # fmt: skip
@@ -182,7 +182,7 @@ def scene(rig):
 
 @pytest.mark.parametrize("grace_m", [0.06, math.inf], ids=["training", "exact"])
 def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
-    how = Marching(0.01, grace_m, 96)
+    how = MarchSettings(0.01, grace_m, 96)
     ours, theirs = NUMBA.march(*scene, how), TORCH.march(*scene, how)
     agree = ours.count == theirs.count
     assert agree.float().mean() > 0.97  # a lattice point on a wall may fall on either side
@@ -196,16 +196,16 @@ def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
 def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
     """Seven samples at a time are, one after the other, those of the whole ray."""
     rays, cells, grid = scene
-    whole = backend.march(rays, cells, grid, Marching(0.01, math.inf, 512))
+    whole = backend.march(rays, cells, grid, MarchSettings(0.01, math.inf, 512))
     parts = [[] for _ in rays.slots]
     alive = torch.arange(len(rays.slots))
     while len(alive):
-        some, jitter = backend.march_on(rays, cells, grid, Marching(0.01, math.inf, 7))
+        some, jitter = backend.march_on(rays, cells, grid, MarchSettings(0.01, math.inf, 7))
         for ray, points in zip(alive, some.points.split(some.count.tolist()), strict=True):
             parts[ray].append(points)
         on = some.count == 7
         alive = alive[on]
-        rays = Rays(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
+        rays = RayBatch(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
     assert max(map(len, parts)) > 5
     # the offset of the lattice is rounded once more with every part
     torch.testing.assert_close(
@@ -223,7 +223,7 @@ def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, back
         index=torch.from_numpy(np.where(index == 0, -away, index).astype(np.int32).reshape(1, -1))
     )
     assert int(told.index.min()) < -3
-    how = Marching(0.01, math.inf, 512)
+    how = MarchSettings(0.01, math.inf, 512)
     ours, plain = backend.march(rays, told, grid, how), backend.march(rays, cells, grid, how)
     assert torch.equal(ours.points, plain.points)
     assert torch.equal(ours.count, plain.count)
@@ -233,14 +233,14 @@ def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, back
 def test_rays_that_miss_have_no_samples(scene, backend):
     rays, cells, grid = scene
     away = rays._replace(directions=-rays.directions)
-    assert int(backend.march(away, cells, grid, Marching(0.01, 0.06, 96)).count.sum()) == 0
+    assert int(backend.march(away, cells, grid, MarchSettings(0.01, 0.06, 96)).count.sum()) == 0
 
 
 @BACKENDS
 def test_nothing_is_sampled_where_nothing_is_occupied(scene, backend):
     rays, cells, grid = scene
-    empty = Grid(torch.zeros_like(grid.occupied), *grid[1:])
-    assert int(backend.march(rays, cells, empty, Marching(0.01, 0.06, 96)).count.sum()) == 0
+    empty = DensityGrid(torch.zeros_like(grid.occupied), *grid[1:])
+    assert int(backend.march(rays, cells, empty, MarchSettings(0.01, 0.06, 96)).count.sum()) == 0
 
 
 @BACKENDS
@@ -249,7 +249,7 @@ def test_a_ray_is_followed_for_its_grace_in_metres_whatever_the_step(scene, back
     rays, cells, grid = scene
     solid = grid._replace(density=torch.full_like(grid.density, 1e6))
     for step_m in (0.02, 0.01, 0.005):
-        count = backend.march(rays, cells, solid, Marching(step_m, 0.06, 512)).count
+        count = backend.march(rays, cells, solid, MarchSettings(step_m, 0.06, 512)).count
         assert int(count.max()) * step_m == pytest.approx(0.06, abs=2.1 * step_m)
 
 
@@ -274,8 +274,8 @@ def test_the_backend_can_be_forced(monkeypatch):
     monkeypatch.setenv("IA_BACKEND", "torch")
     assert backend_for(cpu).name == "torch"
     monkeypatch.setenv("IA_BACKEND", "abacus")
-    with pytest.raises(BadInput, match="abacus"):
+    with pytest.raises(InputError, match="abacus"):
         backend_for(cpu)
     monkeypatch.setenv("IA_BACKEND", "numba")
-    with pytest.raises(BadInput, match="on the CPU only"):
+    with pytest.raises(InputError, match="on the CPU only"):
         backend_for(torch.device("cuda"))

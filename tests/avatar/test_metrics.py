@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar.metrics import overlap, psnr, ssim
+from avatar.metrics import soft_iou, psnr, ssim
 
 SHADE = st.floats(0.0, 1.0)
 
@@ -81,8 +81,8 @@ def test_ssim_sees_structure_where_psnr_is_the_same(picture, rng):
 
 def test_two_silhouettes_overlap_by_what_they_share_of_what_either_has():
     one, other = np.zeros((4, 5), dtype=bool), np.zeros((4, 5), dtype=bool)
-    assert overlap(one, other) == 1.0
+    assert soft_iou(one, other) == 1.0
     one[:, :3], other[:, 2:] = True, True
-    assert overlap(one, other) == overlap(other, one) == 4 / 20
-    assert overlap(one, one) == 1.0
-    assert overlap(one, ~one) == 0.0
+    assert soft_iou(one, other) == soft_iou(other, one) == 4 / 20
+    assert soft_iou(one, one) == 1.0
+    assert soft_iou(one, ~one) == 0.0

@@ -1,4 +1,4 @@
-"""Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten."""
+"""OccupancyGrid: what is dense stays, what is empty goes, thin surfaces are not forgotten."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.occupancy import OPACITY, SOLID_M, Occupancy, grown, specks
+from avatar.occupancy import MIN_STEP_OPACITY, INTERIOR_DEPTH_M, OccupancyGrid, dilate, find_floaters
 
 CPU = torch.device("cpu")
 STEP_M = 0.01
@@ -14,7 +14,7 @@ STEP_M = 0.01
 
 @pytest.fixture
 def occupancy(rig):
-    return Occupancy(rig, CPU)
+    return OccupancyGrid(rig, CPU)
 
 
 def shell_at(rig, *, thickness_m):
@@ -38,7 +38,7 @@ def test_everything_near_the_skin_is_occupied_at_first(rig, occupancy):
 
 def test_empty_space_is_given_up(occupancy, generator):
     run(occupancy, lambda points: torch.full_like(points[:, 0], -20.0), generator, 40)
-    dense = occupancy.grid.density > OPACITY / STEP_M
+    dense = occupancy.grid.density > MIN_STEP_OPACITY / STEP_M
     assert not dense.any()
 
 
@@ -101,10 +101,10 @@ def test_haze_counts_as_nothing_where_that_is_asked(occupancy, generator):
 def test_growing_adds_the_six_neighbours():
     one = torch.zeros(5, 5, 5, dtype=torch.uint8)
     one[2, 2, 2] = 1
-    assert int(grown(one).sum()) == 7
+    assert int(dilate(one).sum()) == 7
     corner = torch.zeros(3, 3, 3, dtype=torch.uint8)
     corner[0, 0, 0] = 1
-    assert int(grown(corner).sum()) == 4
+    assert int(dilate(corner).sum()) == 4
 
 
 def test_specks_go_and_pieces_near_the_skin_stay():
@@ -115,7 +115,7 @@ def test_specks_go_and_pieces_near_the_skin_stay():
     firm[15, 35, 35] = True  # a speck
     near_skin = np.ones(firm.shape, dtype=bool)
     near_skin[28:] = False
-    gone = specks(firm, near_skin).bool()
+    gone = find_floaters(firm, near_skin).bool()
     assert not gone[firm][: 10 * 1600].any()
     assert not gone[20:22, 20:30, 20:30].any()
     assert gone[30:33, 5:15, 5:15].all()
@@ -127,7 +127,7 @@ def test_specks_go_and_pieces_near_the_skin_stay():
 def test_one_piece_has_no_specks():
     firm = torch.zeros(8, 8, 8, dtype=torch.bool)
     firm[2:5, 2:5, 2:5] = True
-    assert int(specks(firm, np.ones(firm.shape, dtype=bool)).sum()) == 0
+    assert int(find_floaters(firm, np.ones(firm.shape, dtype=bool)).sum()) == 0
 
 
 def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
@@ -135,4 +135,4 @@ def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
     cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
     assert len(points) == 500
     assert rig.inside[tuple(cell.T.numpy())].all()
-    assert (rig.distance[tuple(cell.T.numpy())] > SOLID_M).all()
+    assert (rig.distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()

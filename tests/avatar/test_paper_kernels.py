@@ -1,11 +1,11 @@
-"""Samples placed through a posed grid, and roots by Broyden's method: both twins of both."""
+"""RaySamples placed through a posed grid, and roots by BroydenLookup's method: both twins of both."""
 
 import numpy as np
 import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.kernels.backend import PosedGrid, Rays
+from avatar.kernels.backend import PosedOccupancy, RayBatch
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.roots import SAME_ROOT_M
 from avatar.kernels.torch_backend import TorchBackend
@@ -24,7 +24,7 @@ def rays_at(boxes, count, generator):
     aim = boxes.low[slots.long()] + size[slots.long()] * torch.rand(count, 3, generator=generator)
     origins = aim + 3.0 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator))
     directions = torch.nn.functional.normalize(aim - origins)
-    return Rays(origins, directions, slots, torch.rand(count, generator=generator))
+    return RayBatch(origins, directions, slots, torch.rand(count, generator=generator))
 
 
 @pytest.fixture
@@ -36,20 +36,20 @@ def boxes(generator):
     shape = torch.tensor([[5, 7, 3], [4, 4, 4]], dtype=torch.int32)
     low = torch.tensor([[-0.5, -0.8, -0.3], [0.0, 0.1, 0.2]])
     cells_per_m = torch.tensor([[5.0, 4.0, 5.0], [8.0, 4.0, 2.0]])
-    return PosedGrid(
+    return PosedOccupancy(
         occupied=torch.randint(-4, 5, (2, 105), generator=generator, dtype=torch.int32),
         low=low,
         cells_per_m=cells_per_m,
         shape=shape,
-        near=low,
-        far=low + shape / cells_per_m,
+        ray_box_low=low,
+        ray_box_high=low + shape / cells_per_m,
     )
 
 
 def test_both_twins_place_the_same_samples(boxes, generator):
     rays = rays_at(boxes, 400, generator)
     (points, counts), (expected, expected_counts) = (
-        backend.place(rays, boxes, STEP_M) for backend in (NUMBA, TORCH)
+        backend.sample_occupied_cells(rays, boxes, STEP_M) for backend in (NUMBA, TORCH)
     )
     # a sample on a cell's wall may fall to either side
     same = counts == expected_counts
@@ -83,7 +83,7 @@ def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, ge
 def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
     """A box that is smaller than the grid on one side and larger on the other."""
     full = boxes._replace(
-        occupied=torch.ones_like(boxes.occupied), near=boxes.near + 0.1, far=boxes.far + 0.1
+        occupied=torch.ones_like(boxes.occupied), ray_box_low=boxes.near + 0.1, ray_box_high=boxes.far + 0.1
     )
     rays = rays_at(full, 200, generator)
     points, counts = backend.place(rays, full, STEP_M)
@@ -107,7 +107,7 @@ def test_an_empty_cell_has_no_samples(backend, boxes, generator):
 
 @BACKENDS
 def test_no_rays_have_no_samples(backend, boxes):
-    none = Rays(
+    none = RayBatch(
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
     )
     points, counts = backend.place(none, boxes, STEP_M)
@@ -135,7 +135,7 @@ def posed(rig):
         rotations = np.zeros((23, 3))
         rotations[3, 0], rotations[17, 1], rotations[16, 2] = bend, -bend, 0.8
         bones = rig.body_from_canonical(rotations)[:, :3].reshape(24, 12).astype(np.float32)
-        warp.admit(slot, torch.from_numpy(bones))
+        warp.set_pose(slot, torch.from_numpy(bones))
         here = slots == slot
         matrix = (rig.weights_at(canonical[here]) @ bones).reshape(-1, 3, 4)
         carried[here] = (matrix[..., :3] @ canonical[here, :, None])[..., 0] + matrix[..., 3]
@@ -162,7 +162,7 @@ def test_no_root_is_found_twice(backend, posed):
 def test_both_twins_find_the_same_roots(posed):
     _, carried, slots, poses = posed
     (roots, valid), (expected, rests) = (
-        b.find_roots(carried, slots, poses) for b in (NUMBA, TORCH)
+        b.find_all_roots(carried, slots, poses) for b in (NUMBA, TORCH)
     )
     gap = (roots[:, :, None] - expected[:, None]).norm(dim=-1)
     gap = torch.where(valid[:, :, None] & rests[:, None], gap, torch.inf)
@@ -175,7 +175,7 @@ def test_both_twins_find_the_same_roots(posed):
 def test_nothing_is_found_of_nothing(posed):
     poses = posed[-1]
     for backend in (NUMBA, TORCH):
-        roots, valid = backend.find_roots(
+        roots, valid = backend.find_all_roots(
             torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), poses
         )
         assert roots.shape == (0, 9, 3)

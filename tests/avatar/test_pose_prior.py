@@ -1,17 +1,17 @@
-"""Neighbours tell of a pose's error what a wandering tracker lets them, and else nothing."""
+"""TemporalPosePrior tell of a pose's error what a wandering tracker lets them, and else nothing."""
 
 import numpy as np
 import pytest
 
 from avatar.pose_prior import (
-    FARTHEST_APART,
-    FEWEST_PAIRS,
-    UNKNOWN,
-    WORTH,
-    Neighbours,
-    correlation,
-    expected,
-    guessed,
+    MAX_FRAME_GAP,
+    MIN_NEIGHBOR_PAIRS,
+    UNINFORMATIVE_PRIOR,
+    NEIGHBOR_PRECISION,
+    TemporalPosePrior,
+    neighbor_correlation,
+    prior_from_neighbors,
+    interpolate_correction,
 )
 
 
@@ -26,51 +26,51 @@ def errors_of(rng, frames, *, alike):
 @pytest.mark.parametrize("alike", [0.0, 0.5, 0.9])
 def test_the_correlation_of_a_process_is_found_in_any_order_of_its_frames(rng, alike):
     errors, order = errors_of(rng, 100, alike=alike), rng.permutation(100)
-    assert correlation(order, errors[order]) == pytest.approx(alike, abs=0.06)
+    assert neighbor_correlation(order, errors[order]) == pytest.approx(alike, abs=0.06)
 
 
 def test_too_few_neighbours_tell_nothing(rng):
-    errors = errors_of(rng, FEWEST_PAIRS + 1, alike=0.99)
-    numbers = np.arange(FEWEST_PAIRS + 1)
-    assert correlation(numbers, errors) > 0.8
-    assert correlation(numbers[1:], errors[1:]) == 0.0
-    assert correlation((FARTHEST_APART + 1) * numbers, errors) == 0.0
+    errors = errors_of(rng, MIN_NEIGHBOR_PAIRS + 1, alike=0.99)
+    numbers = np.arange(MIN_NEIGHBOR_PAIRS + 1)
+    assert neighbor_correlation(numbers, errors) > 0.8
+    assert neighbor_correlation(numbers[1:], errors[1:]) == 0.0
+    assert neighbor_correlation((MAX_FRAME_GAP + 1) * numbers, errors) == 0.0
 
 
 def test_a_frame_is_expected_to_err_as_those_around_it_do_the_nearest_most(rng):
     errors = errors_of(rng, 40, alike=0.95)
     frames = np.delete(np.arange(41), 20)
-    told = expected(20, frames, errors, 0.95)
+    told = prior_from_neighbors(20, frames, errors, 0.95)
     distances = np.abs(frames - 20)
-    weights = np.where(distances <= FARTHEST_APART, 1.0 / distances, 0.0)
-    mean = WORTH / (1.0 + WORTH) * np.average(errors, axis=0, weights=weights)
-    assert told.precision == 1.0 + WORTH
+    weights = np.where(distances <= MAX_FRAME_GAP, 1.0 / distances, 0.0)
+    mean = NEIGHBOR_PRECISION / (1.0 + NEIGHBOR_PRECISION) * np.average(errors, axis=0, weights=weights)
+    assert told.precision == 1.0 + NEIGHBOR_PRECISION
     np.testing.assert_allclose(told.mean, mean)
-    np.testing.assert_allclose(guessed(20, dict(zip(frames.tolist(), errors, strict=True))), mean)
+    np.testing.assert_allclose(interpolate_correction(20, dict(zip(frames.tolist(), errors, strict=True))), mean)
 
 
 def test_the_error_of_a_frame_in_between_is_guessed_where_errors_wander(rng):
     errors = errors_of(rng, 60, alike=0.97)
     known = {frame: error for frame, error in enumerate(errors) if frame % 10}
-    missed = [errors[frame] - guessed(frame, known) for frame in range(10, 60, 10)]
+    missed = [errors[frame] - interpolate_correction(frame, known) for frame in range(10, 60, 10)]
     assert np.mean(np.square(missed)) < 0.3 * np.mean(np.square(errors[10::10]))
 
 
 def test_a_slot_is_asked_of_by_its_neighbours_and_does_not_tell_of_itself(rng):
-    errors, neighbours = errors_of(rng, 40, alike=0.95), Neighbours(40)
+    errors, neighbours = errors_of(rng, 40, alike=0.95), TemporalPosePrior(40)
     for slot in range(40):
-        neighbours.put(slot, slot)
-        neighbours.tell(slot, errors[slot])
-    before = neighbours.expected(20, errors)
-    assert before.precision == 1.0 + WORTH
+        neighbours.set_frame(slot, slot)
+        neighbours.record_estimate(slot, errors[slot])
+    before = neighbours.prior_for(20, errors)
+    assert before.precision == 1.0 + NEIGHBOR_PRECISION
     errors[20] += 100.0
-    np.testing.assert_array_equal(neighbours.expected(20, errors).mean, before.mean)
-    neighbours.put(20, None)
-    assert neighbours.expected(20, errors) is UNKNOWN
+    np.testing.assert_array_equal(neighbours.prior_for(20, errors).mean, before.mean)
+    neighbours.set_frame(20, None)
+    assert neighbours.prior_for(20, errors) is UNINFORMATIVE_PRIOR
 
 
 def test_neighbours_say_nothing_where_errors_flicker_or_nobody_is_near(rng):
     flickering, wandering = (errors_of(rng, 40, alike=alike) for alike in (0.0, 0.95))
-    assert not guessed(20, dict(enumerate(flickering))).any()
-    assert not guessed(60, dict(enumerate(wandering))).any()
-    assert not guessed(20, {}).any()
+    assert not interpolate_correction(20, dict(enumerate(flickering))).any()
+    assert not interpolate_correction(60, dict(enumerate(wandering))).any()
+    assert not interpolate_correction(20, {}).any()

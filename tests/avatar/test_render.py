@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from avatar import render as render_module
 from avatar.config import TrainConfig
-from avatar.kernels.backend import Marching, Rays
-from avatar.prepare import BodyRays
-from avatar.render import UNSEEN, cell_tables, render
-from avatar.strays import Strays
+from avatar.kernels.backend import MarchSettings, RayBatch
+from avatar.prepare import BodyFrameRays
+from avatar.render import MIN_TRANSMITTANCE, correspondence_tables, render
+from avatar.strays import CorrespondenceCheck
 from avatar.trainer import Trainer
 from capture.camera import Camera
 from preprocess.pose import BodyPose
@@ -64,7 +64,7 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
 
     Of samples that skinning carries to the ray: the others hold nothing.
     """
-    config = TrainConfig(levels=2, table_size=1 << 10, step_m=0.03)
+    config = TrainConfig(levels=2, table_size=1 << 10, sample_step_m=0.03)
     avatar = Trainer(rig, config, torch.device("cpu")).avatar
     weights, bias = avatar.field.layers[2:]
     pose, camera = shot
@@ -72,22 +72,22 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
         weights.zero_()
         bias.copy_(torch.tensor([-1.0, 0.0, 2.0, 1.5]))
     got = render(avatar, pose, camera)
-    cells = render_module.WarpCells.of(rig, pose.joint_rotations)
+    cells = render_module.CorrespondenceGrid.solve(rig, pose.joint_rotations)
     pixels = camera.pixel_centers().reshape(-1, 2)
-    rays = BodyRays.through(pixels, camera, rig.world_from_body(pose))
-    batch = Rays(
+    rays = BodyFrameRays.through(pixels, camera, rig.world_from_body(pose))
+    batch = RayBatch(
         torch.from_numpy(rays.origin).expand(len(pixels), 3).contiguous(),
         torch.from_numpy(rays.directions),
         torch.zeros(len(pixels), dtype=torch.int32),
         torch.full((len(pixels),), 0.5),
     )
-    how = Marching(config.step_m, np.inf, 512)
-    tables = cell_tables(cells, torch.device("cpu"))
+    how = MarchSettings(config.sample_step_m, np.inf, 512)
+    tables = correspondence_tables(cells, torch.device("cpu"))
     samples = avatar.field.backend.march(batch, tables, avatar.rendering_grid(), how)
-    strays = Strays.of(rig, pose.joint_rotations, cells, torch.device("cpu"))
-    rays_of_strays = torch.searchsorted(samples.first, strays.among(samples, batch), right=True) - 1
-    count = samples.count.numpy() - np.bincount(rays_of_strays, minlength=len(pixels))
-    alpha = 1.0 - np.exp(-np.exp(1.5) * config.step_m * count.reshape(camera.size_px[::-1]))
+    strays = CorrespondenceCheck.for_pose(rig, pose.joint_rotations, cells, torch.device("cpu"))
+    rays_of_strays = torch.searchsorted(samples.offsets, strays.find_spurious(samples, batch), right=True) - 1
+    count = samples.counts.numpy() - np.bincount(rays_of_strays, minlength=len(pixels))
+    alpha = 1.0 - np.exp(-np.exp(1.5) * config.sample_step_m * count.reshape(camera.size_px[::-1]))
     color = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 2.0])))
     assert alpha.max() > 0.5
     np.testing.assert_allclose(got[..., 3], alpha, atol=1e-5)
@@ -144,7 +144,7 @@ def test_only_where_camera_and_person_stand_to_each_other_matters(rig, avatar, s
 
 def test_how_many_rays_go_at_once_changes_nothing(avatar, shot, picture, monkeypatch):
     monkeypatch.setattr(render_module, "RAYS_AT_ONCE", 700)
-    np.testing.assert_allclose(render(avatar, *shot), picture, atol=2 * UNSEEN)
+    np.testing.assert_allclose(render(avatar, *shot), picture, atol=2 * MIN_TRANSMITTANCE)
 
 
 def test_a_warp_solved_before_gives_the_same_picture(learnt, avatar, shot, picture):

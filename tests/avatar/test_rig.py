@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from avatar.rig import PARTS, canonical_rotations
+from avatar.rig import PART_OF_JOINT, canonical_rotations
 from preprocess.pose import BodyPose
 from preprocess.skeleton import PARENTS
 
@@ -144,7 +144,7 @@ def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin):
     reach, nearest = seeds.query(skin)
     assert on_skin.max() < 1e-6
     assert reach.max() < 0.02 * np.sqrt(3.0)  # a voxel's diagonal
-    assert set(rig.seed_parts) == set(PARTS)
+    assert set(rig.seed_parts) == set(PART_OF_JOINT)
     np.testing.assert_allclose(rig.seed_weights.sum(axis=1), 1.0, atol=1e-5)
     assert len(np.unique(nearest)) == len(rig.seeds)
 
@@ -153,8 +153,8 @@ def test_body_parts_mirror():
     """Left and right joints belong to different parts unless both belong to the trunk."""
     pairs = [(1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21), (22, 23)]
     for left, right in pairs:
-        assert (PARTS[left] == PARTS[right]) == (PARTS[left] == 0)
-        assert (PARTS[left] == PARTS[PARENTS[left]]) == (PARTS[right] == PARTS[PARENTS[right]])
+        assert (PART_OF_JOINT[left] == PART_OF_JOINT[right]) == (PART_OF_JOINT[left] == 0)
+        assert (PART_OF_JOINT[left] == PART_OF_JOINT[PARENTS[left]]) == (PART_OF_JOINT[right] == PART_OF_JOINT[PARENTS[right]])
 
 
 def winding_number(points, vertices, faces) -> np.ndarray:

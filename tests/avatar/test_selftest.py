@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from avatar.kernels import choice
-from avatar.kernels.backend import Cells, Samples
+from avatar.kernels.backend import SolvedCorrespondences, RaySamples
 from avatar.kernels.choice import backend_for
 from avatar.kernels.cpu import NumbaBackend
-from avatar.kernels.selftest import strays
+from avatar.kernels.selftest import failing_operation
 from avatar.kernels.torch_backend import TorchBackend
 
 
@@ -29,9 +29,9 @@ class Spoiled:
             if result is None:  # works in place, on its last argument
                 arguments[-1].mul_(self._factor)
                 return None
-            if isinstance(result, Cells):
+            if isinstance(result, SolvedCorrespondences):
                 return result._replace(roots=result.roots * self._factor)
-            if isinstance(result, Samples):
+            if isinstance(result, RaySamples):
                 return result._replace(points=result.points * self._factor)
             if isinstance(result, tuple):
                 return tuple(part * self._factor for part in result)
@@ -41,7 +41,7 @@ class Spoiled:
 
 
 def test_the_compiled_backend_is_sound():
-    assert strays(NumbaBackend()) is None
+    assert failing_operation(NumbaBackend()) is None
 
 
 @pytest.mark.parametrize(
@@ -53,13 +53,13 @@ def test_the_compiled_backend_is_sound():
 )  # fmt: skip
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
 def test_an_operation_that_is_off_is_named(operation, factor):
-    assert strays(Spoiled(operation, factor)) == operation
+    assert failing_operation(Spoiled(operation, factor)) == operation
 
 
 def test_a_straying_backend_is_replaced_with_one_warning(monkeypatch):
     monkeypatch.delenv("IA_BACKEND", raising=False)
     monkeypatch.setattr(choice, "_numba", lambda: Spoiled("encode", 1.01))
-    choice._numba_is_sound.cache_clear()
+    choice._numba_passes_self_test.cache_clear()
     cpu = torch.device("cpu")
     try:
         with pytest.warns(UserWarning, match="'encode' differs from its meaning") as said:
@@ -67,4 +67,4 @@ def test_a_straying_backend_is_replaced_with_one_warning(monkeypatch):
         assert all(isinstance(one, TorchBackend) for one in chosen)
         assert len(said) == 1
     finally:
-        choice._numba_is_sound.cache_clear()
+        choice._numba_passes_self_test.cache_clear()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar.skinning import CLOSEST_M, NEIGHBOURS, distance_volume, skinning_volume, volume_shape
+from avatar.skinning import MIN_VERTEX_DISTANCE_M, BLENDED_VERTICES, skin_distance_volume, skinning_weight_volume, volume_shape
 
 LOW, HIGH = np.array([-0.5, -0.3, -0.2]), np.array([0.5, 0.3, 0.2])
 CELL_M = 0.05
@@ -18,15 +18,15 @@ def one_hot(joint, count=1):
 
 
 def volume(vertices, weights, reach_m=10.0):
-    return skinning_volume(vertices, weights, LOW, HIGH, CELL_M, reach_m)
+    return skinning_weight_volume(vertices, weights, LOW, HIGH, CELL_M, reach_m)
 
 
 def two_blobs():
     """Thirty vertices of joint 4 at -x, thirty of joint 7 at the mirrored places."""
-    left = np.random.default_rng(0).normal(size=(NEIGHBOURS, 3)) * 0.01 + [-0.2, 0.0, 0.0]
+    left = np.random.default_rng(0).normal(size=(BLENDED_VERTICES, 3)) * 0.01 + [-0.2, 0.0, 0.0]
     right = left * [-1.0, 1.0, 1.0]
     return np.concatenate([left, right]), np.concatenate(
-        [one_hot(4, NEIGHBOURS), one_hot(7, NEIGHBOURS)]
+        [one_hot(4, BLENDED_VERTICES), one_hot(7, BLENDED_VERTICES)]
     )
 
 
@@ -75,28 +75,28 @@ def test_near_one_of_two_bodies_the_weights_are_its_own():
 def test_weights_fall_with_the_square_of_the_distance():
     """One vertex against the others at three times its distance: each of those weighs a ninth."""
     node = np.array([0.0, 0.0, 0.0])
-    around = np.random.default_rng(2).normal(size=(NEIGHBOURS - 1, 3))
+    around = np.random.default_rng(2).normal(size=(BLENDED_VERTICES - 1, 3))
     around *= 0.3 / np.linalg.norm(around, axis=1, keepdims=True)
     vertices = np.concatenate([[[0.1, 0.0, 0.0]], around]) + node
-    weights = np.concatenate([one_hot(9), one_hot(2, NEIGHBOURS - 1)])
-    share = skinning_volume(vertices, weights, -1e-4 + node, 1e-4 + node, 1e-4, 10.0)
-    np.testing.assert_allclose(share[..., 9], 1.0 / (1.0 + (NEIGHBOURS - 1) / 9.0), atol=1e-3)
+    weights = np.concatenate([one_hot(9), one_hot(2, BLENDED_VERTICES - 1)])
+    share = skinning_weight_volume(vertices, weights, -1e-4 + node, 1e-4 + node, 1e-4, 10.0)
+    np.testing.assert_allclose(share[..., 9], 1.0 / (1.0 + (BLENDED_VERTICES - 1) / 9.0), atol=1e-3)
 
 
 def test_a_node_on_a_vertex_is_not_taken_by_it_alone():
-    around = np.random.default_rng(2).normal(size=(NEIGHBOURS - 1, 3))
+    around = np.random.default_rng(2).normal(size=(BLENDED_VERTICES - 1, 3))
     around *= 0.02 / np.linalg.norm(around, axis=1, keepdims=True)
     vertices = np.concatenate([np.zeros((1, 3)), around])
-    weights = np.concatenate([one_hot(9), one_hot(2, NEIGHBOURS - 1)])
-    share = skinning_volume(vertices, weights, np.full(3, -1e-5), np.full(3, 1e-5), 1e-5, 10.0)
-    own, others = CLOSEST_M**-2, (NEIGHBOURS - 1) * 0.02**-2
+    weights = np.concatenate([one_hot(9), one_hot(2, BLENDED_VERTICES - 1)])
+    share = skinning_weight_volume(vertices, weights, np.full(3, -1e-5), np.full(3, 1e-5), 1e-5, 10.0)
+    own, others = MIN_VERTEX_DISTANCE_M**-2, (BLENDED_VERTICES - 1) * 0.02**-2
     np.testing.assert_allclose(share[..., 9], own / (own + others), atol=1e-3)
 
 
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 3))
 def test_the_distance_to_a_single_vertex_is_exact(place):
     vertex = np.array(place)
-    distance, _ = distance_volume(vertex[None], np.eye(3)[:1], LOW, HIGH, CELL_M, 0.3)
+    distance, _ = skin_distance_volume(vertex[None], np.eye(3)[:1], LOW, HIGH, CELL_M, 0.3)
     shape = np.array(distance.shape)
     index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     expected = np.linalg.norm(LOW + (index + 0.5) / shape * (HIGH - LOW) - vertex, axis=-1)

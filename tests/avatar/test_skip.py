@@ -8,24 +8,24 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.kernels import reference
-from avatar.kernels.backend import Marching, Rays
+from avatar.kernels.backend import MarchSettings, RayBatch
 from avatar.kernels.reference import MAX_LOG_DENSITY
 from avatar.model import Avatar
-from avatar.prepare import BodyRays
-from avatar.render import EMPTY_LOG_DENSITY, cell_tables, render
-from avatar.skip import pruned, window
-from avatar.strays import Strays
+from avatar.prepare import BodyFrameRays
+from avatar.render import EMPTY_LOG_DENSITY, correspondence_tables, render
+from avatar.skip import cull_cells, screen_bounds
+from avatar.strays import CorrespondenceCheck
 from capture.camera import Camera
 
 CPU = torch.device("cpu")
 
 
-def rays_of(camera: Camera, world_from_body: np.ndarray) -> Rays:
+def rays_of(camera: Camera, world_from_body: np.ndarray) -> RayBatch:
     pixels = camera.pixel_centers().reshape(-1, 2)
-    rays = BodyRays.through(pixels, camera, world_from_body)
-    return Rays(
+    rays = BodyFrameRays.through(pixels, camera, world_from_body)
+    return RayBatch(
         torch.from_numpy(rays.origin).expand(len(pixels), 3).contiguous(),
         torch.from_numpy(rays.directions),
         torch.zeros(len(pixels), dtype=torch.int32),
@@ -33,22 +33,22 @@ def rays_of(camera: Camera, world_from_body: np.ndarray) -> Rays:
     )
 
 
-def lattice_samples(avatar: Avatar, pose, camera, cells: WarpCells):
+def lattice_samples(avatar: Avatar, pose, camera, cells: CorrespondenceGrid):
     """Every sample of each ray through the cells, and which skinning carries elsewhere."""
     rays = rays_of(camera, avatar.rig.world_from_body(pose))
-    how = Marching(avatar.step_m, math.inf, 1024)
+    how = MarchSettings(avatar.sample_step_m, math.inf, 1024)
     grid = avatar.rendering_grid()
-    samples = avatar.field.backend.march(rays, cell_tables(cells, CPU), grid, how)
-    assert int(samples.count.max()) < how.most
-    return samples, Strays.of(avatar.rig, pose.joint_rotations, cells, CPU).among(samples, rays)
+    samples = avatar.field.backend.march(rays, correspondence_tables(cells, CPU), grid, how)
+    assert int(samples.counts.max()) < how.max_samples
+    return samples, CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, CPU).find_spurious(samples, rays)
 
 
-def brute_force(avatar: Avatar, pose, camera, cells: WarpCells) -> np.ndarray:
+def brute_force(avatar: Avatar, pose, camera, cells: CorrespondenceGrid) -> np.ndarray:
     """All of them but those, summed in double precision."""
     samples, strays = lattice_samples(avatar, pose, camera, cells)
     raw = avatar.field.forward(samples.points).raw.double()
     raw[strays, 3] = EMPTY_LOG_DENSITY
-    colors = reference.composite(raw, samples.first, samples.count, avatar.step_m)
+    colors = reference.composite(raw, samples.offsets, samples.counts, avatar.sample_step_m)
     return colors.reshape(*camera.size_px[::-1], 4).numpy()
 
 
@@ -127,8 +127,8 @@ def test_clear_foggy_and_opaque_people_are_summed_as_exactly(altered, shot, log_
     samples, strays = lattice_samples(person, pose, camera, cells)
     there = torch.ones(len(samples.points))
     there[strays] = 0.0
-    ray = torch.repeat_interleave(torch.arange(len(samples.count)), samples.count)
-    count = torch.bincount(ray, there, minlength=len(samples.count))
+    ray = torch.repeat_interleave(torch.arange(len(samples.counts)), samples.counts)
+    count = torch.bincount(ray, there, minlength=len(samples.counts))
     through = math.exp(-math.exp(min(log_density, MAX_LOG_DENSITY)) * person.step_m)
     alpha = 1.0 - through ** count.numpy().reshape(picture.shape[:2])
     np.testing.assert_allclose(picture[..., 3], alpha, atol=1e-5)
@@ -157,26 +157,26 @@ def scattered(avatar, share: float):
 @pytest.mark.parametrize("share", [0.0, 1e-4, 1e-2, 1.0])
 def test_pruning_loses_no_sample(avatar, shot, share):
     pose, camera, cells = shot
-    grid, how = scattered(avatar, share), Marching(0.007, math.inf, 1024)
+    grid, how = scattered(avatar, share), MarchSettings(0.007, math.inf, 1024)
     rays = rays_of(camera, avatar.rig.world_from_body(pose))
     march = avatar.field.backend.march
-    full = march(rays, cell_tables(cells, CPU), grid, how)
-    held = pruned(cells, grid)
-    some = march(rays, cell_tables(held, CPU), grid, how)
+    full = march(rays, correspondence_tables(cells, CPU), grid, how)
+    held = cull_cells(cells, grid)
+    some = march(rays, correspondence_tables(held, CPU), grid, how)
     assert torch.equal(some.points, full.points)
     assert torch.equal(some.count, full.count)
-    assert ((held.index > 0) <= (cells.index > 0)).all()
+    assert ((held.packed_cells > 0) <= (cells.index > 0)).all()
     assert (len(full.points) > 0) == (share > 0.0)
 
 
 def test_pruning_leaves_few_cells_that_lead_to_nothing(avatar, shot):
     grid, cells = avatar.rendering_grid(), shot[2]
-    kept, whole = (pruned(cells, grid).index > 0).sum(), (cells.index > 0).sum()
+    kept, whole = (cull_cells(cells, grid).packed_cells > 0).sum(), (cells.index > 0).sum()
     assert 0.2 * whole < kept < 0.85 * whole
 
 
 def test_an_empty_cell_knows_how_far_off_the_next_full_one_is(avatar, shot):
-    index = pruned(shot[2], scattered(avatar, 1e-4)).index
+    index = cull_cells(shot[2], scattered(avatar, 1e-4)).packed_cells
     full = np.argwhere(index > 0)
     for cell in np.argwhere(index <= 0)[::997]:
         assert np.abs(full - cell).max(axis=1).min() == -index[tuple(cell)]
@@ -186,22 +186,22 @@ def test_no_ray_beside_the_window_meets_anything(avatar, shot):
     pose, camera, cells = shot
     world_from_body = avatar.rig.world_from_body(pose)
     grid = avatar.rendering_grid()
-    held = pruned(cells, grid)
+    held = cull_cells(cells, grid)
     for seen in views(avatar, pose, camera).values():
         samples = avatar.field.backend.march(
-            rays_of(seen, world_from_body), cell_tables(cells, CPU), grid,
-            Marching(avatar.step_m, math.inf, 1024),
+            rays_of(seen, world_from_body), correspondence_tables(cells, CPU), grid,
+            MarchSettings(avatar.step_m, math.inf, 1024),
         )  # fmt: skip
         count = samples.count.numpy().reshape(seen.size_px[::-1]).copy()
         assert count.any()
-        count[window(held, seen, world_from_body)] = 0
+        count[screen_bounds(held, seen, world_from_body)] = 0
         assert not count.any()
 
 
 def test_the_window_of_a_person_seen_from_afar_is_narrow(avatar, shot):
     pose, camera, cells = shot
-    held = pruned(cells, avatar.rendering_grid())
-    found = window(held, camera, avatar.rig.world_from_body(pose))
+    held = cull_cells(cells, avatar.rendering_grid())
+    found = screen_bounds(held, camera, avatar.rig.world_from_body(pose))
     opaque = render(avatar, pose, camera, cells=cells)[..., 3] > 0.5
     for axis, part in enumerate(found):
         seen = np.flatnonzero(opaque.any(axis=1 - axis))

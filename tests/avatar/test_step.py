@@ -8,21 +8,21 @@ import torch
 from avatar import priors
 from avatar.config import TrainConfig
 from avatar.kernels import reference
-from avatar.kernels.backend import Marching, Samples
+from avatar.kernels.backend import MarchSettings, RaySamples
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.torch_backend import TorchBackend
-from avatar.prepare import prepare
-from avatar.sampling import CanonicalSampler
-from avatar.step import cosine, gradients
+from avatar.prepare import prepare_frame
+from avatar.sampling import OccupancySampler
+from avatar.step import cosine_decay, compute_gradients
 from avatar.trainer import Trainer
 
 FIRM_SHARE = 0.25
 """Far from 0 and 1, so that no term may be left out."""
 CONFIG = TrainConfig(
-    rays=200, step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_points=32,
-    empty_weight=0.3, hard_weight=0.1, variation_weight=0.2, variation_pairs=16,
-    first_variation=3.0, firm_weight=0.4, solid_weight=0.1, solid_points=24, most_samples=256,
-    soft_weight=0.2, even_weight=0.3, soft_pairs=40, gap_weight=0.5, gap_points=20,
+    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=32,
+    empty_space_weight=0.3, hard_surface_weight=0.1, density_tv_weight=0.2, density_tv_pairs=16,
+    initial_density_tv_factor=3.0, double_well_weight=0.4, interior_weight=0.1, interior_points=24, max_samples=256,
+    density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40, inner_leg_weight=0.5, inner_leg_points=20,
 )  # fmt: skip
 
 
@@ -30,9 +30,9 @@ CONFIG = TrainConfig(
 def trainer(rig, clip):
     trainer = Trainer(rig, CONFIG, torch.device("cpu"))
     for observation in clip.observations[:4]:
-        trainer.add(prepare(observation, rig))
+        trainer.add_frame(prepare_frame(observation, rig))
     for _ in range(40):
-        trainer.step(rate=1.0, hard_share=1.0)
+        trainer.step(rate=1.0, hard_surface_share=1.0)
     return trainer
 
 
@@ -44,20 +44,20 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
     hidden = torch.relu(features @ first + first_bias)
     raw = hidden @ second + second_bias
     count = len(samples.points)
-    rendered = reference.composite(raw[:count], samples.first, samples.count, CONFIG.step_m)
+    rendered = reference.composite(raw[:count], samples.first, samples.count, CONFIG.sample_step_m)
     loss = reference.loss_per_ray(
         rendered, batch.target.to(table.dtype), background.to(table.dtype),
-        CONFIG.alpha_weight, CONFIG.hard_weight,
+        CONFIG.alpha_weight, CONFIG.hard_surface_weight,
     ).mean()  # fmt: skip
     parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
     loss = loss + FIRM_SHARE * of_close_pairs(raw[count:].split(parts)[3], close)
     density = torch.exp(raw[count:, 3].clamp(max=reference.MAX_LOG_DENSITY))
-    opacity = 1.0 - torch.exp(-density * priors.OPACITY_M)
+    opacity = 1.0 - torch.exp(-density * priors.OPACITY_LENGTH_M)
     of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
-    loss = loss + CONFIG.empty_weight * of_empty.mean()
+    loss = loss + CONFIG.empty_space_weight * of_empty.mean()
     if len(gaps):
-        loss = loss + CONFIG.gap_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
-    loss = loss - CONFIG.solid_weight * of_solid.log().mean()
+        loss = loss + CONFIG.inner_leg_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
+    loss = loss - CONFIG.interior_weight * of_solid.log().mean()
     if len(pairs) == 0:
         return loss
     one, other = of_pairs.chunk(2)
@@ -83,21 +83,21 @@ def one_step(trainer, backend):
     batch = trainer.replay.draw(CONFIG.rays, torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(4)
     field.table_grad.zero_()
-    gradients(
-        field, CanonicalSampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
-        hard_share=1.0, firm_share=FIRM_SHARE, generator=generator,
+    compute_gradients(
+        field, OccupancySampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
+        hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
-    how = Marching(CONFIG.step_m, CONFIG.grace_m, CONFIG.most_samples)
+    how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
     samples = backend.march(batch.rays, trainer.replay.cells, occupancy.grid, how)
-    empty = occupancy.empty_points(CONFIG.empty_points, generator)
-    drawn = CONFIG.variation_pairs if len(samples.points) else 0
+    empty = occupancy.empty_points(CONFIG.empty_space_points, generator)
+    drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
     chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
-    apart = priors.APART_M * torch.randn(drawn, 3, generator=generator)
+    apart = priors.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
-    solid = occupancy.solid_points(CONFIG.solid_points, generator)
-    close = priors.close_pairs(samples.points, CONFIG, generator)
-    gaps = occupancy.gap_points(CONFIG.gap_points, generator)
+    solid = occupancy.solid_points(CONFIG.interior_points, generator)
+    close = priors.sample_smoothness_pairs(samples.points, CONFIG, generator)
+    gaps = occupancy.gap_points(CONFIG.inner_leg_points, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
     return grads, (samples, empty, pairs, solid, close, gaps, batch, background)
@@ -136,15 +136,15 @@ def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     trainer.avatar.occupancy.grid.occupied.zero_()
     (_, first, *_), drawn = one_step(trainer, NumbaBackend())
     samples, empty, pairs, _, close, _, batch, background = drawn
-    assert isinstance(samples, Samples)
+    assert isinstance(samples, RaySamples)
     assert len(samples.points) == 0
     assert torch.isfinite(first).all()
     assert len(batch.target) == CONFIG.rays == len(background)
-    assert len(empty) == CONFIG.empty_points
+    assert len(empty) == CONFIG.empty_space_points
     assert len(pairs) == len(close) == 0
 
 
 def test_the_learning_rate_falls_from_one_to_a_twentieth():
-    assert cosine(-1.0) == cosine(0.0) == 1.0
-    assert cosine(0.5) == pytest.approx(0.5)
-    assert cosine(1.0) == cosine(2.0) == 0.05
+    assert cosine_decay(-1.0) == cosine_decay(0.0) == 1.0
+    assert cosine_decay(0.5) == pytest.approx(0.5)
+    assert cosine_decay(1.0) == cosine_decay(2.0) == 0.05

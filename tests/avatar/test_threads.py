@@ -4,7 +4,7 @@ import numba
 import pytest
 import torch
 
-from avatar.kernels.backend import Marching
+from avatar.kernels.backend import MarchSettings
 from avatar.kernels.cpu import NumbaBackend
 
 NUMBA = NumbaBackend()
@@ -21,7 +21,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     batch, cells = trainer.replay.draw(700, generator), trainer.replay.cells
     grid = trainer.avatar.occupancy.grid
     grid = grid._replace(density=grid.density.clone())
-    samples = NUMBA.march(batch.rays, cells, grid, Marching(0.01, 0.06, 128))
+    samples = NUMBA.march(batch.rays, cells, grid, MarchSettings(0.01, 0.06, 128))
     points, count = samples.points, len(samples.points)
     raw = torch.randn(count, 4, generator=generator)
     slope = torch.randn(count, field.levels.width, generator=generator)
@@ -29,12 +29,12 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     grad_table = torch.zeros_like(field.table)
     NUMBA.encode_backward(points, slope, field.levels, grad_table)
     grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
-    NUMBA.keep_highest(points, raw[:, 3].contiguous(), grid)
-    wrenches = NUMBA.wrenches(
+    NUMBA.scatter_max_density(points, raw[:, 3].contiguous(), grid)
+    wrenches = NUMBA.bone_wrenches(
         samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones
     )
     moved = cells._replace(roots=cells.roots.clone())
-    NUMBA.follow(moved, 0, poses.skin, poses.bones[0])
+    NUMBA.update_roots(moved, 0, poses.skin, poses.bones[0])
     return {
         "encode": [NUMBA.encode(points, field.table, field.levels)],
         "encode_backward": [grad_table],

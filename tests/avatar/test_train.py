@@ -12,18 +12,18 @@ import torch
 
 from avatar import train as train_module
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.events import Arrived, Evaluated, Finished, Idle, Stepped, Warned
-from avatar.hold import HeldOut, prepared
-from avatar.prepare import prepare
+from avatar.events import FrameArrived, Evaluated, Finished, WaitingForFrame, Stepped, Warned
+from avatar.hold import HeldOutFrame, prepare_stream
+from avatar.prepare import prepare_frame
 from avatar.render import render
 from avatar.train import train
 from avatar.trainer import Trainer
 from capture.inbox import Inbox
-from preprocess.observe import Dropped
+from preprocess.observe import DroppedFrame
 
 CPU = torch.device("cpu")
 QUICK = TrainConfig(
-    rays=128, step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_points=32,
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_space_points=32,
     seconds=60.0,
 )  # fmt: skip
 
@@ -31,9 +31,9 @@ QUICK = TrainConfig(
 @pytest.fixture
 def ready(rig, clip):
     """Prepared frames 0 … 7, where 2 and 5 are held out and 4 is left out."""
-    observations = [*clip.observations[:4], Dropped(index=4, reason="empty mask")]
+    observations = [*clip.observations[:4], DroppedFrame(index=4, reason="empty mask")]
     observations += clip.observations[5:8]
-    return list(prepared(iter(observations), rig, every=3, total=None))
+    return list(prepare_stream(iter(observations), rig, stride=3, total=None))
 
 
 def taught(rig, ready, config):
@@ -94,10 +94,10 @@ def test_rays_need_few_samples(learnt):
 def after_three_steps(rig, ready, config):
     trainer = Trainer(rig, config, CPU)
     for item in ready:
-        if not isinstance(item, HeldOut | Dropped):
-            trainer.add(item)
-    losses = [trainer.step(rate=1.0, hard_share=0.5).loss for _ in range(3)]
-    grid = trainer.avatar.occupancy.grid
+        if not isinstance(item, HeldOutFrame | DroppedFrame):
+            trainer.add_frame(item)
+    losses = [trainer.step(rate=1.0, hard_surface_share=0.5).loss for _ in range(3)]
+    grid = trainer.avatar.occupancy.density_grid
     return [*losses, *trainer.avatar.field.parameters(), grid.density, grid.occupied]
 
 
@@ -122,7 +122,7 @@ def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
 def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
     trainer, held, events = taught(rig, ready, dataclasses.replace(QUICK, steps=60))
     assert trainer.frames_seen == 5
-    assert trainer.replay.indices == [0, 1, 3, 6, 7]
+    assert trainer.replay.frame_indices == [0, 1, 3, 6, 7]
     assert [frame.observation.frame.index for frame in held] == [2, 5]
     warnings = [event.message for event in events if isinstance(event, Warned)]
     assert len(warnings) == 1
@@ -153,12 +153,12 @@ def test_it_stops_when_the_time_is_up(rig, ready, ticking):
     events = list(train(trainer, inbox, []))
     steps = [event for event in events if isinstance(event, Stepped)]
     late = [step for step in steps if step.wall_seconds >= 0.4]
-    assert len(late) <= 1 or len(steps) == train_module.FAREWELL_STEPS
+    assert len(late) <= 1 or len(steps) == train_module.MIN_STEPS_AFTER_LAST_FRAME
     assert events[-1].wall_seconds >= 0.4
 
 
 def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
-    monkeypatch.setattr(train_module, "MARKS_S", (1 / 50, 10 / 50, 60.0))  # after 1 and 10 steps
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (1 / 50, 10 / 50, 60.0))  # after 1 and 10 steps
     _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=20))
     marks = [event for event in events if isinstance(event, Evaluated)]
     assert [mark.frames_seen for mark in marks] == [2, 5]
@@ -167,8 +167,8 @@ def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, m
 
 
 def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch, ticking):
-    monkeypatch.setattr(train_module, "MARKS_S", (0.05, 60.0))
-    monkeypatch.setattr(train_module, "SCORING_SHARE", 0.0)
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.05, 60.0))
+    monkeypatch.setattr(train_module, "EVALUATION_TIME_SHARE", 0.0)
     trainer, held = Trainer(rig, dataclasses.replace(QUICK, seconds=0.5), CPU), []
     inbox = Inbox(ready)
     inbox._thread.join()  # all frames are there before the first mark
@@ -178,7 +178,7 @@ def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch,
 
 
 def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ticking):
-    frames = [prepare(observation, rig) for observation in clip.observations[:3]]
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
     gate = threading.Event()
 
     def arriving():
@@ -202,9 +202,9 @@ def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ti
 
 
 def test_a_stream_without_a_usable_frame_ends_without_a_step(rig):
-    nothing = [Dropped(index=index, reason="pose invalid") for index in range(3)]
+    nothing = [DroppedFrame(index=index, reason="pose invalid") for index in range(3)]
     trainer, _, events = taught(rig, nothing, QUICK)
-    assert [type(event) for event in events if not isinstance(event, Idle)] == [Warned] * 3
+    assert [type(event) for event in events if not isinstance(event, WaitingForFrame)] == [Warned] * 3
     assert trainer.steps == 0
 
 
@@ -231,14 +231,14 @@ def test_a_resumed_trainer_goes_on_counting(rig, ready):
 
 def test_every_frame_that_arrives_is_announced_in_order(rig, ready):
     _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=30))
-    arrived = [(event.index, event.held_out) for event in events if isinstance(event, Arrived)]
+    arrived = [(event.index, event.held_out) for event in events if isinstance(event, FrameArrived)]
     assert arrived == [(0, False), (1, False), (2, True), (3, False), (5, True), (6, False),
                        (7, False)]  # fmt: skip
 
 
 def arriving_at(rig, clip, *, gate):
     """One frame at once, and two more when the gate opens."""
-    frames = [prepare(observation, rig) for observation in clip.observations[:3]]
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
     yield frames[0]
     gate.wait(10.0)
     yield from frames[1:]
@@ -261,14 +261,14 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
 def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip, ticking):
     """Read as fast as possible, reading would come first after half of the time."""
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
-    assert set(rates[1] + rates[2]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
-    assert len(rates[3]) == train_module.FAREWELL_STEPS
+    assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
+    assert len(rates[3]) == train_module.MIN_STEPS_AFTER_LAST_FRAME
     assert trainer.wall_seconds > 0.8  # the last frame came after the time that was given
 
 
 def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=1.5, opens_after_s=0.0)
-    assert set(rates[1] + rates[2]) == {train_module.STREAMED_RATE * QUICK.learning_rate}
+    assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
     falling = np.array(rates[3][1:])
     assert (np.diff(falling) <= 0.0).all()
     assert falling[-1] < 0.1 * QUICK.learning_rate
@@ -276,7 +276,7 @@ def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
 
 
 def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
-    frames = [prepare(observation, rig) for observation in clip.observations[:2]]
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
     closed = threading.Event()
 
     def never_ending():
@@ -290,7 +290,7 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
     inbox.close()
     assert isinstance(events[-1], Finished)
     assert trainer.wall_seconds >= 0.4
-    assert trainer.steps >= train_module.FAREWELL_STEPS
+    assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
 def test_while_nothing_has_come_the_listener_is_heard(rig):
@@ -302,20 +302,20 @@ def test_while_nothing_has_come_the_listener_is_heard(rig):
         yield from ()
 
     inbox = Inbox(nothing(), paced=True, live=True)
-    assert isinstance(next(train(Trainer(rig, QUICK, CPU), inbox, [])), Idle)
+    assert isinstance(next(train(Trainer(rig, QUICK, CPU), inbox, [])), WaitingForFrame)
     closed.set()
     inbox.close()
 
 
 def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
-    config = dataclasses.replace(QUICK, key_frames=3)
+    config = dataclasses.replace(QUICK, replay_capacity=3)
     trainer = Trainer(rig, config, CPU)
-    frame = prepare(clip.observations[0], rig)
+    frame = prepare_frame(clip.observations[0], rig)
     for index in range(40):
-        trainer.add(dataclasses.replace(frame, index=index))
-        trainer.corrections[index] = np.full((25, 3), float(index))
-    assert len(trainer.corrections) <= 2 * config.key_frames + 1
-    assert set(trainer.replay.indices) <= set(trainer.corrections)
+        trainer.add_frame(dataclasses.replace(frame, index=index))
+        trainer.pose_corrections[index] = np.full((25, 3), float(index))
+    assert len(trainer.pose_corrections) <= 2 * config.replay_capacity + 1
+    assert set(trainer.replay.frame_indices) <= set(trainer.pose_corrections)
 
 
 # --- steps instead of seconds -----------------------------------------------------------------

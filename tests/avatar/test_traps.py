@@ -16,20 +16,20 @@ import torch
 
 from apps.studio import motions
 from apps.studio.actor import Actor
-from apps.studio.framing import framed
+from apps.studio.framing import static_camera
 from avatar.config import TrainConfig
-from avatar.hold import HeldOut, prepared, score
-from avatar.kernels.backend import CellTables, Grid, Marching, Rays
+from avatar.hold import HeldOutFrame, prepare_stream, score_frame
+from avatar.kernels.backend import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch
 from avatar.kernels.cpu import NumbaBackend
 from avatar.kernels.reference import OPAQUE_DEPTH
 from avatar.kernels.torch_backend import TorchBackend
-from avatar.metrics import overlap
+from avatar.metrics import soft_iou
 from avatar.model import Avatar
-from avatar.occupancy import DECAY, OPACITY, Occupancy
-from avatar.prepare import PreparedFrame
+from avatar.occupancy import OCCUPANCY_DECAY, MIN_STEP_OPACITY, OccupancyGrid
+from avatar.prepare import TrainingFrame
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.step import cosine
+from avatar.step import cosine_decay
 from avatar.trainer import Trainer
 from capture.frame import Frame
 from preprocess.observation import Observation
@@ -46,8 +46,8 @@ SIDE = 40
 """Warp cells along the flat world's edge; what they carry nowhere is its own canonical space."""
 
 
-def flat_world() -> CellTables:
-    """Cells in which every point is its own root."""
+def flat_world() -> CorrespondenceTables:
+    """SolvedCorrespondences in which every point is its own root."""
     places = np.stack(np.meshgrid(*[np.arange(SIDE)] * 2, np.arange(8), indexing="ij"), axis=-1)
     centers = ((places.reshape(-1, 3) + 0.5) * CELL_M).astype(np.float32)
     roots = np.zeros((1, len(centers) + 1, 12), dtype=np.float32)
@@ -55,24 +55,24 @@ def flat_world() -> CellTables:
     roots[0, :, [3, 7, 11]] = 1.0
     index = (np.arange(1, len(centers) + 1, dtype=np.int32) * 8 + 1)[None]
     shape = torch.tensor([[SIDE, SIDE, 8]], dtype=torch.int32)
-    return CellTables(
+    return CorrespondenceTables(
         torch.from_numpy(index), torch.from_numpy(roots), torch.zeros(1, 3), shape, CELL_M
     )
 
 
-def ground(density: float) -> Grid:
+def ground(density: float) -> DensityGrid:
     """Everything occupied; the lower half as dense as that, by what the cells have seen."""
     shape = (2 * SIDE, 2 * SIDE, 16)
     cached = torch.zeros(shape)
     cached[:, :, :8] = density
     per_m = torch.full((3,), 1.0 / CANONICAL_M)
-    return Grid(torch.ones(shape, dtype=torch.uint8), cached, torch.zeros(3), per_m)
+    return DensityGrid(torch.ones(shape, dtype=torch.uint8), cached, torch.zeros(3), per_m)
 
 
-def descending(slope: float) -> Rays:
+def descending(slope: float) -> RayBatch:
     """A ray that sinks by so much for each metre that it goes forward."""
     direction = torch.tensor([[1.0, 0.0, -slope]])
-    return Rays(
+    return RayBatch(
         torch.tensor([[-0.5, 0.6, 8 * CANONICAL_M + slope * 0.9]]),
         direction / direction.norm(),
         torch.zeros(1, dtype=torch.int32),
@@ -82,7 +82,7 @@ def descending(slope: float) -> Rays:
 
 def lowest(backend, slope: float, step_m: float, grace_m: float) -> float:
     """How deep below the dense cells' upper wall the last sample of the ray lies, metres."""
-    how = Marching(step_m, grace_m, 4096)
+    how = MarchSettings(step_m, grace_m, 4096)
     points = backend.march(descending(slope), flat_world(), ground(2000.0), how).points
     return 8 * CANONICAL_M - float(points[-1, 2])
 
@@ -94,7 +94,7 @@ def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step
     backend, slope, step_m
 ):
     """A surface may lie anywhere in the first cell that has shown its density."""
-    grace_m = TrainConfig().grace_m
+    grace_m = TrainConfig().opaque_margin_m
     depth = lowest(backend, slope, step_m, grace_m)
     assert depth >= CANONICAL_M
     # it goes on for the grace, after what makes it opaque, and ends on the lattice
@@ -121,8 +121,8 @@ SHEET = 0.15
 
 def forgotten(rig, *, decay: float, updates: int) -> float:
     """Share of a thin sheet's cells that are held for empty after so many probes of each."""
-    occupancy, generator = Occupancy(rig, CPU), torch.Generator().manual_seed(0)
-    grid = occupancy.grid
+    occupancy, generator = OccupancyGrid(rig, CPU), torch.Generator().manual_seed(0)
+    grid = occupancy.density_grid
     layer = int((float(rig.rest_joints[6, 2]) + 0.05 - rig.box_low[2]) * grid.cells_per_m[2])
     middle = float(rig.box_low[2] + (layer + 0.5) / grid.cells_per_m[2])
     thickness_m = SHEET / float(grid.cells_per_m[2])
@@ -133,16 +133,16 @@ def forgotten(rig, *, decay: float, updates: int) -> float:
     sheet = torch.from_numpy(rig.distance <= 0.08)[:, :, layer]
     shares = []
     for update in range(updates):
-        occupancy.update(log_density_at, share=1.0, decay=decay, step_m=0.01, generator=generator)
+        occupancy.update(log_density_at, share=1.0, decay=decay, sample_step_m=0.01, generator=generator)
         if update >= updates // 2:
-            shares.append(float((grid.density[:, :, layer][sheet] < OPACITY / 0.01).float().mean()))
+            shares.append(float((grid.density[:, :, layer][sheet] < MIN_STEP_OPACITY / 0.01).float().mean()))
     return float(np.mean(shares))
 
 
 def test_a_decay_of_six_tenths_with_one_probe_a_cell_would_forget_thin_surfaces(rig):
     """A probe misses with probability 1 - p; after n misses in a row the cell counts as empty."""
-    for decay, misses in ((0.6, 11), (DECAY, 51)):
-        assert misses == math.ceil(math.log(math.exp(6.0) / (OPACITY / 0.01)) / -math.log(decay))
+    for decay, misses in ((0.6, 11), (OCCUPANCY_DECAY, 51)):
+        assert misses == math.ceil(math.log(math.exp(6.0) / (MIN_STEP_OPACITY / 0.01)) / -math.log(decay))
         share = forgotten(rig, decay=decay, updates=160)
         assert share == pytest.approx((1.0 - SHEET) ** misses, rel=0.15, abs=1e-3)
 
@@ -155,27 +155,27 @@ class Filmed:
     """The studio's actor turning once, made ready, and what a pixel covers on the body."""
 
     rig: Rig
-    frames: list[PreparedFrame]
-    held: list[HeldOut]
+    frames: list[TrainingFrame]
+    held: list[HeldOutFrame]
     footprint_m: float
 
 
 def filmed(size: int) -> Filmed:
     actor = Actor.of(1, 0)
-    rig, camera = Rig.of(actor.shaped), framed(actor, size)
-    poses = motions.turn(actor, frames=20, fps=30.0, turns=1.0, seed=0)
+    rig, camera = Rig.from_shaped_body(actor.shaped), static_camera(actor, size)
+    poses = motions.turning_motion(actor, frames=20, fps=30.0, turns=1.0, seed=0)
     observations = []
     for index in range(len(poses)):
-        rgb, alpha = actor.picture(poses[index], camera)
+        rgb, alpha = actor.render_over(poses[index], camera)
         frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
         mask = alpha.astype(np.float32) / 255.0
         observations.append(Observation(frame=frame, alpha=mask, pose=poses[index], camera=camera))
-    items = list(prepared(iter(observations), rig, every=7, total=None))
+    items = list(prepare_stream(iter(observations), rig, stride=7, total=None))
     pelvis = np.append(rig.rest_joints[0] + poses[0].root_translation, 1.0)
     return Filmed(
         rig=rig,
-        frames=[item for item in items if isinstance(item, PreparedFrame)],
-        held=[item.solved(rig) for item in items if isinstance(item, HeldOut)],
+        frames=[item for item in items if isinstance(item, TrainingFrame)],
+        held=[item.with_correspondences(rig) for item in items if isinstance(item, HeldOutFrame)],
         footprint_m=float((camera.camera_from_world @ pelvis)[2]) / camera.focal_px[0],
     )
 
@@ -185,7 +185,7 @@ class Taught:
     """An avatar after so many steps, and the held-out frames' PSNR at some marks on the way."""
 
     avatar: Avatar
-    held: list[HeldOut]
+    held: list[HeldOutFrame]
     marks: list[list[float]]
 
     def overlaps(self, **how) -> list[float]:
@@ -193,25 +193,25 @@ class Taught:
         found = []
         for held in self.held:
             seen = held.observation
-            picture = render(self.avatar, seen.pose, seen.camera, cells=held.cells, **how)
-            found.append(overlap(picture[..., 3] > 0.5, seen.alpha > 0.5))
+            picture = render(self.avatar, seen.pose, seen.camera, cells=held.correspondences, **how)
+            found.append(soft_iou(picture[..., 3] > 0.5, seen.alpha > 0.5))
         return found
 
 
 def taught(clip: Filmed, steps: int, *, grace_steps: int | None = None, marks: int = 5) -> Taught:
     """So many steps of the recipe for a clip; a grace in samples is the old rule."""
-    config = TrainConfig.within(30.0, footprint_m=clip.footprint_m)
+    config = TrainConfig.for_budget(30.0, footprint_m=clip.footprint_m)
     config = dataclasses.replace(config, refine_poses=False)
     if grace_steps is not None:
-        config = dataclasses.replace(config, grace_m=grace_steps * config.step_m)
+        config = dataclasses.replace(config, opaque_margin_m=grace_steps * config.sample_step_m)
     trainer, scores = Trainer(clip.rig, config, CPU), []
     for frame in clip.frames:
-        trainer.add(frame)
+        trainer.add_frame(frame)
     for step in range(steps):
         share = step / steps
-        trainer.step(rate=cosine(2.0 * share - 1.0), hard_share=min(1.0, 4.0 * share))
+        trainer.step(rate=cosine_decay(2.0 * share - 1.0), hard_surface_share=min(1.0, 4.0 * share))
         if trainer.steps % (steps // marks) == 0:
-            scores.append([score(trainer.avatar, held).psnr for held in clip.held])
+            scores.append([score_frame(trainer.avatar, held).psnr for held in clip.held])
     return Taught(avatar=trainer.avatar, held=clip.held, marks=scores)
 
 
@@ -254,13 +254,13 @@ def test_no_frame_falls_back_between_marks(small, large):
 def test_a_picture_that_ended_by_cached_densities_would_have_holes(large):
     """A surface that is grazed is cut off; the exact picture has none of it."""
     avatar = large.avatar
-    how = Marching(avatar.step_m, 4 * avatar.step_m, 512)
+    how = MarchSettings(avatar.step_m, 4 * avatar.step_m, 512)
     cut = partial(avatar.field.backend.march, grid=avatar.occupancy.grid, how=how)
     assert max(large.overlaps(samples_along=cut)) < 0.98 <= min(large.overlaps())
     held = large.held[0]
     seen = held.observation
     exact = render(avatar, seen.pose, seen.camera, cells=held.cells)
-    ended = render(avatar, seen.pose, seen.camera, cells=held.cells, samples_along=cut)
+    ended = render(avatar, seen.pose, seen.camera, cells=held.cells, sample_rays=cut)
     assert ((exact - ended)[..., 3] > 0.5).sum() > 200
 
 

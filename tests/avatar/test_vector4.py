@@ -3,13 +3,13 @@
 import numpy as np
 
 from avatar.kernels.jit import compile_kernel
-from avatar.kernels.vector4 import dot4, load4, plus4, store4, times4
+from avatar.kernels.vector4 import dot4, load4, add4, store4, scale4
 
 
 @compile_kernel(cache=False)
 def blend(array, one, other, share, out):
     first, second = load4(array, one, 1), load4(array, other, 1)
-    store4(out, 0, 2, plus4(first, times4(share, second)))
+    store4(out, 0, 2, add4(first, scale4(share, second)))
     return dot4(first, second)
 
 

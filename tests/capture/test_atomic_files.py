@@ -8,22 +8,22 @@ from pathlib import Path
 
 import pytest
 
-from capture.atomic_files import whole_file, whole_folder, write_text
-from capture.errors import BadInput
-from capture.file_list import HEADER, NAME, FileList
+from capture.atomic_files import atomic_file, atomic_folder, write_text_atomically
+from capture.errors import InputError
+from capture.file_list import HEADER, LIST_NAME, OutputFileList
 
 
 def names(folder):
     """Of all files in a folder but its list, at any depth."""
     found = (str(p.relative_to(folder)) for p in folder.rglob("*") if not p.is_dir())
-    return sorted(name for name in found if Path(name).name != NAME)
+    return sorted(name for name in found if Path(name).name != LIST_NAME)
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "deep" / "report.json"
-    write_text(path, "old")
-    with whole_file(path) as part:
-        part.write_text("new")
+    write_text_atomically(path, "old")
+    with atomic_file(path) as part:
+        part.write_text_atomically("new")
         assert path.read_text() == "old"
         assert part.suffix == path.suffix
     assert path.read_text() == "new"
@@ -32,11 +32,11 @@ def test_a_file_appears_when_it_is_whole(tmp_path):
 
 def test_a_file_that_fails_leaves_the_older_one(tmp_path):
     path = tmp_path / "report.json"
-    write_text(path, "old")
+    write_text_atomically(path, "old")
 
     def fails():
-        with whole_file(path) as part:
-            part.write_text("half")
+        with atomic_file(path) as part:
+            part.write_text_atomically("half")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -47,11 +47,11 @@ def test_a_file_that_fails_leaves_the_older_one(tmp_path):
 
 def test_a_folder_that_fails_leaves_the_older_one(tmp_path):
     path = tmp_path / "frames"
-    with whole_folder(path) as part:
+    with atomic_folder(path) as part:
         (part / "0000.png").write_bytes(b"old")
 
     def fails():
-        with whole_folder(path) as part:
+        with atomic_folder(path) as part:
             (part / "0000.png").write_bytes(b"half")
             raise OSError("full")
 
@@ -64,14 +64,14 @@ def test_a_folder_that_fails_leaves_the_older_one(tmp_path):
 def test_a_link_stays_and_what_it_points_to_is_replaced(tmp_path):
     (tmp_path / "far").mkdir()
     (tmp_path / "frames").symlink_to(tmp_path / "far")
-    with whole_folder(tmp_path / "frames") as part:
-        (part / "old.png").write_text("old")
-    with whole_folder(tmp_path / "frames") as part:
-        (part / "new.png").write_text("new")
+    with atomic_folder(tmp_path / "frames") as part:
+        (part / "old.png").write_text_atomically("old")
+    with atomic_folder(tmp_path / "frames") as part:
+        (part / "new.png").write_text_atomically("new")
     assert (tmp_path / "frames").is_symlink()
     assert names(tmp_path / "far") == ["new.png"]
     (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
-    write_text(tmp_path / "a.json", "{}")
+    write_text_atomically(tmp_path / "a.json", "{}")
     assert (tmp_path / "a.json").is_symlink()
     assert (tmp_path / "b.json").read_text() == "{}"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.json", "b.json", "far", "frames"]
@@ -81,11 +81,11 @@ def test_figures_can_go_to_stdout_and_no_device_is_ever_replaced(capfd, tmp_path
     stdout = Path("/dev/stdout")
     if not stdout.exists():
         pytest.skip("there is no /dev/stdout here")
-    write_text(stdout, "figures\n")
+    write_text_atomically(stdout, "figures\n")
     assert capfd.readouterr().out == "figures\n"
     os.mkfifo(tmp_path / "pipe.png")
     for device in (Path(os.devnull), stdout, tmp_path / "pipe.png"):
-        with pytest.raises(BadInput, match="device or a pipe"), whole_file(device):
+        with pytest.raises(InputError, match="device or a pipe"), atomic_file(device):
             pass
     assert [file.name for file in tmp_path.iterdir()] == ["pipe.png"]
 
@@ -95,51 +95,51 @@ def test_figures_can_go_to_stdout_and_no_device_is_ever_replaced(capfd, tmp_path
 
 @pytest.fixture
 def listing(tmp_path):
-    made = FileList(tmp_path)
-    made.make()
+    made = OutputFileList(tmp_path)
+    made.create()
     return made
 
 
 def test_a_listed_file_is_ours_until_somebody_changes_it(tmp_path, listing):
     path = tmp_path / "report.json"
-    write_text(path, "one")
+    write_text_atomically(path, "one")
     assert listing.holds("report.json")
-    write_text(path, "two")
+    write_text_atomically(path, "two")
     assert path.read_text() == "two"
-    path.write_text("mine now")
+    path.write_text_atomically("mine now")
     assert not listing.holds("report.json")
-    with pytest.raises(BadInput, match=r"report\.json is there already"):
-        write_text(path, "three")
+    with pytest.raises(InputError, match=r"report\.json is there already"):
+        write_text_atomically(path, "three")
     assert not listing.remove("report.json")
     assert path.read_text() == "mine now"
     assert names(tmp_path) == ["report.json"]
 
 
 def test_a_copied_folder_still_knows_its_files(tmp_path, listing):
-    write_text(tmp_path / "a.json", "{}")
+    write_text_atomically(tmp_path / "a.json", "{}")
     shutil.copytree(tmp_path, tmp_path / "copy", copy_function=shutil.copyfile)
-    assert FileList(tmp_path / "copy").remove("a.json")
+    assert OutputFileList(tmp_path / "copy").remove("a.json")
     assert names(tmp_path) == ["a.json"]
 
 
 def test_without_a_list_the_caller_says_what_may_go(tmp_path):
     path = tmp_path / "a.json"
-    path.write_text("mine")
-    with pytest.raises(BadInput, match="left alone"):
-        write_text(path, "ours", replace=False)
+    path.write_text_atomically("mine")
+    with pytest.raises(InputError, match="left alone"):
+        write_text_atomically(path, "ours", replace=False)
     assert path.read_text() == "mine"
-    write_text(path, "ours", replace=True)
+    write_text_atomically(path, "ours", replace=True)
     assert path.read_text() == "ours"
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_a_file_that_comes_while_ours_is_written_stays(tmp_path, listing):
     def races():
-        with whole_file(tmp_path / "poses.npz") as part:
+        with atomic_file(tmp_path / "poses.npz") as part:
             part.write_bytes(b"ours")
             (tmp_path / "poses.npz").write_bytes(b"mine")
 
-    with pytest.raises(BadInput, match="left alone"):
+    with pytest.raises(InputError, match="left alone"):
         races()
     assert (tmp_path / "poses.npz").read_bytes() == b"mine"
     assert names(tmp_path) == ["poses.npz"]
@@ -149,7 +149,7 @@ def test_a_folder_with_one_strange_file_is_never_replaced(tmp_path):
     out = tmp_path / "frames"
 
     def write(content):
-        with whole_folder(out) as part:
+        with atomic_folder(out) as part:
             (part / "deep").mkdir()
             (part / "deep" / "0000.png").write_bytes(content)
 
@@ -162,7 +162,7 @@ def test_a_folder_with_one_strange_file_is_never_replaced(tmp_path):
             path.mkdir()
         else:
             path.write_bytes(b"mine")
-        with pytest.raises(BadInput, match=strange.rstrip("/")):
+        with pytest.raises(InputError, match=strange.rstrip("/")):
             write(b"three")
         assert path.is_dir() or path.read_bytes() == b"mine"
         if path.is_dir():
@@ -179,30 +179,30 @@ def test_what_comes_into_a_folder_that_is_being_replaced_is_not_lost(tmp_path):
     out = tmp_path / "frames"
 
     def write(strange=None):
-        with whole_folder(out) as part:
+        with atomic_folder(out) as part:
             (part / "0000.png").write_bytes(b"ours")
             if strange is not None:
                 (out / strange).write_bytes(b"mine")
 
     write()
-    with pytest.raises(BadInput, match=r"mine\.txt"):
+    with pytest.raises(InputError, match=r"mine\.txt"):
         write("mine.txt")
     assert names(tmp_path) == ["frames/0000.png", "frames/mine.txt"]
 
 
 def test_somebody_elses_list_is_not_written_to(tmp_path):
-    (tmp_path / NAME).write_text("milk, eggs")
-    with pytest.raises(BadInput, match="not a list"):
-        FileList(tmp_path).make()
-    write_text(tmp_path / "a.json", "{}")
-    assert (tmp_path / NAME).read_text() == "milk, eggs"
+    (tmp_path / LIST_NAME).write_text_atomically("milk, eggs")
+    with pytest.raises(InputError, match="not a list"):
+        OutputFileList(tmp_path).create()
+    write_text_atomically(tmp_path / "a.json", "{}")
+    assert (tmp_path / LIST_NAME).read_text() == "milk, eggs"
 
 
 def test_a_line_that_was_cut_short_costs_only_itself(tmp_path, listing):
-    write_text(tmp_path / "a.json", "{}")
+    write_text_atomically(tmp_path / "a.json", "{}")
     with listing.path.open("ab") as file:
         file.write(b'\n{"name": "b.js')
-    write_text(tmp_path / "c.json", "{}")
+    write_text_atomically(tmp_path / "c.json", "{}")
     assert listing.holds("a.json")
     assert listing.holds("c.json")
     assert listing.path.read_bytes().startswith(HEADER)
@@ -215,15 +215,15 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path, listing):
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.iavatar")], check=False)
     (tmp_path / ".a.mine.part.iavatar").write_bytes(b"mine")
-    with whole_file(tmp_path / "b.iavatar") as ours:
+    with atomic_file(tmp_path / "b.iavatar") as ours:
         assert len(names(tmp_path)) == 3
-        listing.remove_unfinished()
+        listing.remove_temporaries()
         assert names(tmp_path) == sorted([".a.mine.part.iavatar", ours.name])
     assert names(tmp_path) == [".a.mine.part.iavatar", "b.iavatar"]
 
 
 def test_a_list_alone_goes_and_with_it_nothing_else(tmp_path, listing):
-    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "mine.txt").write_text_atomically("mine")
     listing.tidy()
     assert listing.exists()
     (tmp_path / "mine.txt").unlink()

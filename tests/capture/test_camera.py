@@ -28,13 +28,13 @@ def camera_at(seed: int, distortion: tuple[float, ...] = ()) -> Camera:
 def test_a_point_on_a_ray_projects_back_to_its_pixel(seed, depth, distortion):
     camera = camera_at(seed, distortion)
     pixels = np.random.default_rng(seed).uniform((0, 0), (200, 150), size=(20, 2))
-    points = camera.center_world + depth * camera.directions(pixels)
+    points = camera.center_world + depth * camera.ray_directions(pixels)
     np.testing.assert_allclose(camera.project(points), pixels, atol=2e-2 if distortion else 1e-8)
 
 
 def test_directions_are_unit_and_start_at_the_camera_center():
     camera = camera_at(3)
-    directions = camera.directions(camera.pixel_centers())
+    directions = camera.ray_directions(camera.pixel_centers())
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
     center = camera.camera_from_world @ np.append(camera.center_world, 1.0)
     np.testing.assert_allclose(center[:3], 0.0, atol=1e-12)
@@ -47,7 +47,7 @@ def test_the_camera_looks_along_z_with_x_right_and_y_down():
         size_px=(100, 100),
         camera_from_world=np.eye(4),
     )
-    np.testing.assert_allclose(camera.directions(np.array([50.0, 50.0])), [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(camera.ray_directions(np.array([50.0, 50.0])), [0.0, 0.0, 1.0])
     np.testing.assert_allclose(camera.project(np.array([1.0, 2.0, 4.0])), [75.0, 100.0])
 
 
@@ -60,10 +60,10 @@ def test_the_first_pixel_has_its_center_at_a_half():
 
 def test_a_resized_camera_sees_the_same_directions():
     camera = camera_at(5)
-    half = camera.resized((100, 75))
+    half = camera.resize((100, 75))
     pixels = np.array([[0.0, 0.0], [13.0, 99.0], [200.0, 150.0]])
-    np.testing.assert_allclose(half.directions(pixels / 2), camera.directions(pixels), atol=1e-12)
-    np.testing.assert_allclose(half.resized((200, 150)).intrinsic, camera.intrinsic)
+    np.testing.assert_allclose(half.ray_directions(pixels / 2), camera.ray_directions(pixels), atol=1e-12)
+    np.testing.assert_allclose(half.resize((200, 150)).intrinsic, camera.intrinsic)
 
 
 def test_the_intrinsic_matrix_goes_round():
@@ -77,8 +77,8 @@ def test_the_intrinsic_matrix_goes_round():
 
 def test_without_distortion_the_lens_model_changes_nothing():
     pixels = np.random.default_rng(0).uniform(0, 150, size=(9, 2))
-    bent = camera_at(1, (0.0, 0.0, 0.0, 0.0)).directions(pixels)
-    np.testing.assert_allclose(bent, camera_at(1).directions(pixels), atol=1e-9)
+    bent = camera_at(1, (0.0, 0.0, 0.0, 0.0)).ray_directions(pixels)
+    np.testing.assert_allclose(bent, camera_at(1).ray_directions(pixels), atol=1e-9)
 
 
 def test_barrel_distortion_pulls_points_inwards():
@@ -111,7 +111,7 @@ def test_a_turned_camera_sees_each_point_where_the_turned_picture_shows_it(turns
     inside = (pixels >= 0).all(axis=1) & (pixels < [96, 64]).all(axis=1)
     points, pixels = points[inside], pixels[inside]
     assert len(points) > 20
-    seen = camera.turned(turns)
+    seen = camera.rotate_quarter_turns(turns)
     turned = np.rot90(picture, turns)
     assert seen.size_px == turned.shape[::-1]
     for point, (x, y) in zip(points, pixels, strict=True):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from capture import camera_device
-from capture.camera_device import MOST_WAITING, CameraDevice, camera_address
-from capture.errors import BadInput
-from capture.pace import Pace
-from capture.selection import Selection
+from capture.camera_device import MAX_QUEUED_FRAMES, CameraDevice, camera_address
+from capture.errors import InputError
+from capture.pace import PacingClock
+from capture.selection import FrameSelection
 
 
 class Quick:
@@ -54,7 +54,7 @@ def test_an_argument_names_a_camera_or_does_not(argument, address):
 
 def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
     """Ten pictures at 25 a second: 0.36 s; nobody is late, so none is lost."""
-    source = CameraDevice(str(write_video(frames=10)), Selection(), Pace())
+    source = CameraDevice(str(write_video(frames=10)), FrameSelection(), PacingClock())
     began = time.perf_counter()
     frames = list(source.frames())
     took = time.perf_counter() - began
@@ -76,13 +76,13 @@ def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
 
 def test_who_comes_late_gets_the_latest_and_is_told_what_was_lost(monkeypatch):
     monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(500))
-    source = CameraDevice("0", Selection(), Pace())
+    source = CameraDevice("0", FrameSelection(), PacingClock())
     frames = source.frames()
     first = next(frames)
     source._reader.join(timeout=10.0)
     rest = list(frames)
     assert grey(first) == first.index % 256
-    assert [frame.index for frame in rest] == list(range(500 - MOST_WAITING, 500))
+    assert [frame.index for frame in rest] == list(range(500 - MAX_QUEUED_FRAMES, 500))
     assert [grey(frame) for frame in rest] == [frame.index % 256 for frame in rest]
     assert len(rest) + 1 + source.dropped == 500
     source.close()
@@ -90,7 +90,7 @@ def test_who_comes_late_gets_the_latest_and_is_told_what_was_lost(monkeypatch):
 
 def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
     monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(5))
-    source = CameraDevice("0", Selection(), Pace())
+    source = CameraDevice("0", FrameSelection(), PacingClock())
     assert [frame.index for frame in source.frames()] == [0, 1, 2, 3, 4]
     (warning,) = source.warnings
     assert "camera:0" in warning
@@ -99,7 +99,7 @@ def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
 
 def test_a_selection_ends_a_camera_too(monkeypatch):
     monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(12))
-    source = CameraDevice("0", Selection(start=2, stop=9, step=3), Pace())
+    source = CameraDevice("0", FrameSelection(start=2, stop=9, step=3), PacingClock())
     assert [frame.index for frame in source.frames()] == [2, 5, 8]
     source.close()
 
@@ -111,9 +111,9 @@ def test_closing_wakes_who_waits_and_lets_the_camera_go(monkeypatch):
                 time.sleep(0.3)
             return super().grab()
 
-    device, pace = Slow(1000), Pace()
+    device, pace = Slow(1000), PacingClock()
     monkeypatch.setattr(camera_device, "_opened", lambda address: device)
-    source = CameraDevice("0", Selection(), pace)
+    source = CameraDevice("0", FrameSelection(), pace)
     frames = source.frames()
     next(frames)
     began = time.perf_counter()
@@ -121,12 +121,12 @@ def test_closing_wakes_who_waits_and_lets_the_camera_go(monkeypatch):
     assert list(frames) == []
     assert time.perf_counter() - began < 2.0
     assert device.released
-    assert pace.ended
+    assert pace.stopped
 
 
 def test_a_camera_that_is_not_there_is_refused_with_those_that_are(capfd):
-    with pytest.raises(BadInput, match=r"There is no camera '97'.*cameras of this machine"):
-        CameraDevice("97", Selection(), Pace())
+    with pytest.raises(InputError, match=r"There is no camera '97'.*cameras of this machine"):
+        CameraDevice("97", FrameSelection(), PacingClock())
     assert capfd.readouterr().err == ""
 
 
@@ -134,7 +134,7 @@ def test_a_camera_that_gives_no_picture_is_busy(monkeypatch):
     device = Quick(0)
     monkeypatch.setattr(camera_device, "_opened", lambda address: device)
     with pytest.raises(OSError, match="no picture") as caught:
-        CameraDevice("0", Selection(), Pace())
+        CameraDevice("0", FrameSelection(), PacingClock())
     assert caught.value.errno == errno.EBUSY
     assert device.released
 
@@ -152,8 +152,8 @@ def test_a_device_that_is_there_and_cannot_be_opened_is_busy(monkeypatch):
     monkeypatch.setattr(Path, "is_char_device", lambda path: True)
     monkeypatch.setattr(camera_device.os, "access", lambda path, mode: True)
     with pytest.raises(OSError, match="another program") as caught:
-        CameraDevice("0", Selection(), Pace())
+        CameraDevice("0", FrameSelection(), PacingClock())
     assert caught.value.errno == errno.EBUSY
     monkeypatch.setattr(camera_device.os, "access", lambda path, mode: False)
     with pytest.raises(PermissionError):
-        CameraDevice("0", Selection(), Pace())
+        CameraDevice("0", FrameSelection(), PacingClock())

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from capture import growing
-from capture.errors import BadInput
-from capture.growing import GrowingFolder
-from capture.pace import Pace
-from capture.selection import Selection
+from capture.errors import InputError
+from capture.growing import WatchedImageFolder
+from capture.pace import PacingClock
+from capture.selection import FrameSelection
 
 
 def picture(index):
@@ -25,7 +25,7 @@ def write(folder, index, content=None):
 
 
 def watch(folder, *, idle_s=0.3, selection=None):
-    return GrowingFolder(folder, selection or Selection(), Pace(), idle_s=idle_s)
+    return WatchedImageFolder(folder, selection or FrameSelection(), PacingClock(), idle_s=idle_s)
 
 
 def greys(frames):
@@ -82,9 +82,9 @@ def test_the_first_picture_is_waited_for(tmp_path):
 
 
 def test_a_folder_that_stays_empty_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="No picture came into"):
+    with pytest.raises(InputError, match="No picture came into"):
         watch(tmp_path, idle_s=0.1)
-    with pytest.raises(BadInput, match="no folder"):
+    with pytest.raises(InputError, match="no folder"):
         watch(tmp_path / "none")
 
 
@@ -123,10 +123,10 @@ def test_who_comes_late_gets_an_even_choice_with_the_newest(tmp_path):
     for index in range(1, 51):
         write(tmp_path, index)
     rest = [frame.index for frame in frames]
-    assert len(rest) == growing.MOST_WAITING
+    assert len(rest) == growing.MAX_PENDING
     assert (rest[0], rest[-1]) == (1, 50)
     assert set(np.diff(rest)) == {7}
-    assert source.dropped == 50 - growing.MOST_WAITING
+    assert source.dropped == 50 - growing.MAX_PENDING
 
 
 def test_what_was_there_before_is_not_lost(tmp_path):
@@ -169,6 +169,6 @@ def test_closing_ends_the_watch_at_once(tmp_path):
 def test_a_selection_counts_pictures_in_natural_order(tmp_path):
     for index in range(12):
         write(tmp_path, index)
-    source = watch(tmp_path, selection=Selection(start=1, stop=9, step=3))
+    source = watch(tmp_path, selection=FrameSelection(start=1, stop=9, step=3))
     assert greys(source.frames()) == [1, 4, 7]
     assert source.count_frames() == 12

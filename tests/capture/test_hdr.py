@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from capture.decoder import CvDecoder
-from capture.hdr import HLG, PEAK_NITS, PQ, WHITE_NITS, hdr_curve, sdr_from_hdr
+from capture.decoder import OpenCvDecoder
+from capture.hdr import HLG, PEAK_NITS, PQ, WHITE_NITS, read_hdr_transfer, tone_map_hdr
 from capture.opening import open_source
 
 
@@ -38,7 +38,7 @@ def movie(*boxes: bytes, wide: bool = False) -> bytes:
 def test_a_files_index_tells_its_curve_and_its_pictures_do_not(tmp_path, boxes, curve, wide):
     path = tmp_path / "video.mov"
     path.write_bytes(movie(*boxes, wide=wide))
-    assert hdr_curve(path) == curve
+    assert read_hdr_transfer(path) == curve
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_a_files_index_tells_its_curve_and_its_pictures_do_not(tmp_path, boxes, 
 def test_what_is_no_movie_has_no_curve(tmp_path, data):
     path = tmp_path / "video.mp4"
     path.write_bytes(data)
-    assert hdr_curve(path) is None
+    assert read_hdr_transfer(path) is None
 
 
 def code_of(nits: float, curve: int) -> int:
@@ -64,7 +64,7 @@ def code_of(nits: float, curve: int) -> int:
 
 def grey(nits: float, curve: int) -> np.ndarray:
     code = np.full((2, 3, 3), code_of(nits, curve), np.uint16)
-    return sdr_from_hdr(code, curve)[0, 0].astype(int)
+    return tone_map_hdr(code, curve)[0, 0].astype(int)
 
 
 @pytest.mark.parametrize("curve", [PQ, HLG])
@@ -86,9 +86,9 @@ def test_a_grey_stays_grey_and_a_skin_tone_stays_its_hue():
     assert np.ptp(grey(100.0, PQ)) <= 1
     wide = np.array([[1.0, 0.6, 0.45]]) * 120.0
     codes = np.array([[[code_of(n, PQ) for n in wide[0]]]], np.uint16)
-    low = sdr_from_hdr(codes, PQ)[0, 0].astype(float)
+    low = tone_map_hdr(codes, PQ)[0, 0].astype(float)
     bright = np.array([[[code_of(4 * n, PQ) for n in wide[0]]]], np.uint16)
-    high = sdr_from_hdr(bright, PQ)[0, 0].astype(float)
+    high = tone_map_hdr(bright, PQ)[0, 0].astype(float)
 
     def hue(rgb):
         linear = (rgb / 255) ** 2.2
@@ -133,7 +133,7 @@ def write_hdr(tmp_path):
 def test_an_hdr_video_comes_in_sdr_and_without_a_warning(write_hdr, curve):
     source = open_source(write_hdr(curve))
     frames = list(source.frames())
-    expected = sdr_from_hdr(np.full((1, 1, 3), round((700 - 64) / 876 * 65535), np.uint16), curve)
+    expected = tone_map_hdr(np.full((1, 1, 3), round((700 - 64) / 876 * 65535), np.uint16), curve)
     assert len(frames) == 6
     assert np.abs(frames[0].rgb.astype(int) - expected.astype(int)).max() <= 3
     assert not source.warnings
@@ -141,7 +141,7 @@ def test_an_hdr_video_comes_in_sdr_and_without_a_warning(write_hdr, curve):
 
 def test_without_pyav_an_hdr_video_is_read_and_warned_of(write_hdr, monkeypatch):
     path = write_hdr(HLG)
-    monkeypatch.setattr("capture.video.open_decoder", CvDecoder)
+    monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
     source = open_source(path)
     assert len(list(source.frames())) == 6
     assert "HDR video" in source.warnings[0]

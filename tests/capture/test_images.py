@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.images import list_images, read_image
 from capture.opening import open_source
 
@@ -110,17 +110,17 @@ def test_a_repeated_picture_is_flagged(tmp_path):
 
 
 def test_a_folder_without_pictures_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="found neither"):
+    with pytest.raises(InputError, match="found neither"):
         open_source(tmp_path)
-    (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(BadInput, match=r"found files ending in \.txt"):
+    (tmp_path / "notes.txt").write_text_atomically("nothing")
+    with pytest.raises(InputError, match=r"found files ending in \.txt"):
         open_source(tmp_path)
 
 
 def test_a_folder_of_damaged_pictures_is_refused(tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.png").write_bytes(b"\x89PNG")
-    with pytest.raises(BadInput, match="None of the 3 pictures"):
+    with pytest.raises(InputError, match="None of the 3 pictures"):
         open_source(tmp_path)
 
 
@@ -146,7 +146,7 @@ def test_a_video_of_masks_and_hidden_files_are_not_the_film(write_video, tmp_pat
 def test_two_videos_in_a_folder_are_too_many(write_video, tmp_path):
     write_video("a.mp4", frames=2)
     write_video("b.mp4", frames=2)
-    with pytest.raises(BadInput, match=r"a\.mp4, b\.mp4"):
+    with pytest.raises(InputError, match=r"a\.mp4, b\.mp4"):
         open_source(tmp_path)
 
 

@@ -18,7 +18,7 @@ def taken(inbox, items=None):
     items, deadline = [] if items is None else items, time.monotonic() + PATIENCE_S
     while not inbox.finished:
         assert time.monotonic() < deadline
-        items += inbox.take(wait_s=0.02)
+        items += inbox.take(timeout_s=0.02)
     return items
 
 
@@ -56,7 +56,7 @@ def test_a_full_inbox_makes_the_producer_wait_and_loses_nothing():
     first = inbox.take()
     assert first[:4] == [0, 1, 2, 3]
     wait_until(lambda: source.asked >= 8)
-    assert (first + inbox.take(wait_s=PATIENCE_S))[:6] == [0, 1, 2, 3, 4, 5]
+    assert (first + inbox.take(timeout_s=PATIENCE_S))[:6] == [0, 1, 2, 3, 4, 5]
     inbox.close()
 
 
@@ -70,11 +70,11 @@ def test_taking_does_not_wait_unless_it_is_told_to():
     inbox = Inbox(items())
     assert inbox.take() == []
     began = time.monotonic()
-    assert inbox.take(wait_s=0.05) == []
+    assert inbox.take(timeout_s=0.05) == []
     assert time.monotonic() - began >= 0.05
     assert not inbox.finished
     gate.set()
-    assert inbox.take(wait_s=PATIENCE_S) == ["here"]
+    assert inbox.take(timeout_s=PATIENCE_S) == ["here"]
     assert taken(inbox) == []
 
 
@@ -123,7 +123,7 @@ def test_the_source_runs_on_a_thread_of_its_own():
 def test_a_live_producer_never_waits_and_the_latest_is_kept():
     inbox = Inbox(range(1000), capacity=4, live=True)
     wait_until(lambda: inbox._ended.is_set())
-    assert inbox.waiting == 4
+    assert inbox.pending == 4
     assert taken(inbox) == [996, 997, 998, 999]
     assert inbox.dropped == 996
 
@@ -140,6 +140,6 @@ def test_what_a_live_inbox_hands_over_and_what_gave_way_is_everything():
 def test_a_recording_drops_nothing_and_tells_how_much_waits():
     inbox = Inbox(range(10), capacity=64)
     wait_until(lambda: inbox._ended.is_set())
-    assert inbox.waiting == 10
+    assert inbox.pending == 10
     assert taken(inbox) == list(range(10))
-    assert inbox.waiting == inbox.dropped == 0
+    assert inbox.pending == inbox.dropped == 0

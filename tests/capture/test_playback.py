@@ -10,9 +10,9 @@ from PIL import Image
 
 from capture.frame import Frame
 from capture.opening import open_source
-from capture.pace import Pace
-from capture.playback import Playback
-from capture.selection import Selection
+from capture.pace import PacingClock
+from capture.playback import RealtimePlayback
+from capture.selection import FrameSelection
 
 UNEVEN_S = [5.0, 5.04, 5.1, 5.1, 5.7, 5.733]
 """Timestamps of no fixed rate; one comes twice, and the first is not 0."""
@@ -36,7 +36,7 @@ class Time:
 class Recorded:
     """A source of tiny frames at given times."""
 
-    path, size_px, selection = Path("uneven.mp4"), (2, 2), Selection()
+    path, size_px, selection = Path("uneven.mp4"), (2, 2), FrameSelection()
     has_alpha = live = paced = False
     quarter_turns = 0
     started_at = 0.0
@@ -63,7 +63,7 @@ def clock():
 
 
 def played(source, clock):
-    return Playback(source, Pace(clock=clock, wait=clock.wait))
+    return RealtimePlayback(source, PacingClock(clock=clock, wait=clock.wait))
 
 
 def test_each_frame_comes_at_its_own_time_and_the_first_at_once(clock):
@@ -124,7 +124,7 @@ def test_what_is_known_of_the_recording_is_known_of_its_playback(clock):
 
 
 def test_closing_ends_a_wait_at_once():
-    playback = Playback(Recorded([0.0, 3600.0]), Pace())
+    playback = RealtimePlayback(Recorded([0.0, 3600.0]), PacingClock())
     taken = []
     thread = threading.Thread(target=lambda: taken.extend(playback.frames()))
     thread.start()

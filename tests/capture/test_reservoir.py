@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from capture.reservoir import Reservoir
+from capture.reservoir import ReservoirSample
 
 
 def test_of_few_numbers_the_percentiles_are_exact(rng):
     numbers = rng.normal(size=300)
-    reservoir = Reservoir()
+    reservoir = ReservoirSample()
     for number in numbers:
         reservoir.add(float(number))
     for percent in (0.0, 50.0, 95.0, 100.0):
@@ -18,7 +18,7 @@ def test_of_few_numbers_the_percentiles_are_exact(rng):
 
 
 def test_of_many_the_kept_ones_are_a_fair_sample_of_all():
-    reservoir = Reservoir(kept=500)
+    reservoir = ReservoirSample(kept=500)
     for number in range(50_000):
         reservoir.add(float(number))
     assert len(reservoir._kept) == 500
@@ -30,12 +30,12 @@ def test_of_many_the_kept_ones_are_a_fair_sample_of_all():
 
 
 def test_of_none_everything_is_zero():
-    assert Reservoir().percentile(95.0) == Reservoir().largest == 0.0
-    assert Reservoir().count == 0
+    assert ReservoirSample().percentile(95.0) == ReservoirSample().largest == 0.0
+    assert ReservoirSample().count == 0
 
 
 def test_the_largest_of_negative_numbers_is_negative():
-    reservoir = Reservoir()
+    reservoir = ReservoirSample()
     for number in (-3.0, -1.0, -2.0):
         reservoir.add(number)
     assert reservoir.largest == -1.0

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from capture.decoder import CvDecoder, has_alpha_plane
-from capture.decoder_av import AvDecoder
-from capture.errors import BadInput
+from capture.decoder import OpenCvDecoder, has_alpha_plane
+from capture.decoder_av import PyAvDecoder
+from capture.errors import InputError
 from capture.opening import open_source
 
 
@@ -52,7 +52,7 @@ def test_a_selection_keeps_numbers_and_times(write_video, chosen):
 
 @pytest.mark.parametrize("chosen", [slice(-3, None), slice(4, 4), slice(0, 5, 0), slice(50, None)])
 def test_a_selection_of_nothing_is_refused(write_video, chosen):
-    with pytest.raises(BadInput, match=r"nothing|none of them"):
+    with pytest.raises(InputError, match=r"nothing|none of them"):
         open_source(write_video(frames=20), frames=chosen)
 
 
@@ -95,7 +95,7 @@ def test_a_recording_without_its_index_is_refused_with_advice(write_video):
     path = write_video()
     data = path.read_bytes()
     path.write_bytes(data[: data.find(b"moov") - 4])
-    with pytest.raises(BadInput, match="cut off before it was finished"):
+    with pytest.raises(InputError, match="cut off before it was finished"):
         open_source(path)
 
 
@@ -103,13 +103,13 @@ def test_a_recording_without_its_index_is_refused_with_advice(write_video):
 def test_what_is_no_video_is_refused(tmp_path, content, capfd):
     path = tmp_path / "video.mp4"
     path.write_bytes(content)
-    with pytest.raises(BadInput, match="no video that can be opened"):
+    with pytest.raises(InputError, match="no video that can be opened"):
         open_source(path)
     assert capfd.readouterr().err == ""
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         open_source(tmp_path / "video.mp4")
 
 
@@ -177,7 +177,7 @@ def test_formats_with_an_alpha_channel_are_known_by_their_tags(tag, expected):
 
 
 @pytest.mark.parametrize("opaque", [False, True])
-@pytest.mark.parametrize("decoder", [AvDecoder, CvDecoder])
+@pytest.mark.parametrize("decoder", [PyAvDecoder, OpenCvDecoder])
 def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaque):
     """PyAV looks whether it is opaque; OpenCV cannot."""
     av = pytest.importorskip("av", reason="PyAV (extra [video]) writes the test's video")
@@ -190,4 +190,4 @@ def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaqu
         frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format="argb")
         container.mux([*stream.encode(frame), *stream.encode(None)])
     found = decoder(tmp_path / "cut.mov").leaves_alpha
-    assert found == (decoder is CvDecoder or not opaque)
+    assert found == (decoder is OpenCvDecoder or not opaque)

@@ -10,10 +10,10 @@ from scipy.spatial import KDTree
 
 from avatar.rig import Rig
 from capture.camera import Camera
-from export.bake import BakeConfig, bake
+from export.bake import BakeConfig, bake_field
 from export.build import ExportReport, export_field
-from export.tables import Tables
-from preprocess.body_file import load_body
+from export.tables import PlayerTables
+from preprocess.body_file import load_body_model
 from preprocess.kinematics import body_from_rest
 from preprocess.pose import BodyPose
 
@@ -42,7 +42,7 @@ class StandIn:
         """The exact picture: every sample is carried into canonical space by itself."""
         width, height = camera.size_px
         root = self.rig.world_from_body(pose)
-        directions = camera.directions(camera.pixel_centers()).reshape(-1, 3) @ root[:3, :3]
+        directions = camera.ray_directions(camera.pixel_centers()).reshape(-1, 3) @ root[:3, :3]
         origin = (camera.center_world - root[:3, 3]) @ root[:3, :3]
         bones = self.rig.body_from_canonical(pose.joint_rotations)
         skin, nearest = _posed(self.rig, self.rig.seeds, bones), 0.10
@@ -63,7 +63,7 @@ class StandIn:
         return picture.reshape(height, width, 4).astype(np.float32)
 
     def _posed_field(self, points, bones, tree):
-        """Colour and density of the densest of up to three canonical points."""
+        """SrgbColor and density of the densest of up to three canonical points."""
         best_rgb, best = np.zeros((len(points), 3)), np.zeros(len(points))
         if len(points) == 0:
             return best_rgb, best
@@ -126,8 +126,8 @@ def capsule_field(rig: Rig) -> Callable:
 
 @pytest.fixture(scope="session")
 def stand_in() -> StandIn:
-    rig = Rig.of(load_body().with_shape())
-    return StandIn(rig, capsule_field(rig), (rig.distance < 0.10).astype(np.uint8))
+    rig = Rig.from_shaped_body(load_body_model().with_shape())
+    return StandIn(rig, capsule_field(rig), (rig.skin_distance < 0.10).astype(np.uint8))
 
 
 @pytest.fixture(scope="session")
@@ -168,8 +168,8 @@ def coarse() -> BakeConfig:
 
 
 @pytest.fixture(scope="session")
-def tables(stand_in: StandIn, coarse: BakeConfig) -> Tables:
-    return bake(stand_in.field_at, stand_in.rig, occupied=stand_in.occupied, config=coarse)
+def tables(stand_in: StandIn, coarse: BakeConfig) -> PlayerTables:
+    return bake_field(stand_in.field_at, stand_in.rig, occupied=stand_in.occupied, config=coarse)
 
 
 @pytest.fixture(scope="session")

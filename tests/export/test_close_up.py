@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.close_up import CloseUps, coarse, enlarged
-from export.player import Likeness, Player, premultiplied
+from export.close_up import ResolutionLimit, downscale_camera, upscale_picture
+from export.player import PictureDifference, Player, premultiply
 
 
 @pytest.fixture(scope="module")
@@ -14,7 +14,7 @@ def player(exported):
 
 @pytest.fixture(scope="module")
 def close_ups(exported, player, tables):
-    return CloseUps(tables, player.manifest.tiers["hq"].rules)
+    return ResolutionLimit(tables, player.manifest.tiers["hq"].rules)
 
 
 def nearer(view, times):
@@ -51,10 +51,10 @@ def test_what_lies_behind_the_camera_makes_no_close_up(player, close_ups, stand_
 def test_a_coarser_picture_enlarged_shows_what_the_finer_one_shows(player, stand_in, camera):
     view = nearer(camera(160, 160, distance_m=0.75), 12.0)
     fine = player.render(stand_in.canonical, view)
-    rough = enlarged(player.render(stand_in.canonical, coarse(view, 1.7)), (160, 160), 1.7)
-    likeness = Likeness.of(premultiplied(fine), premultiplied(rough))
-    assert np.abs(premultiplied(fine) - premultiplied(rough)).mean() < 1.0 / 255.0
-    assert likeness.close > 0.9
+    rough = upscale_picture(player.render(stand_in.canonical, downscale_camera(view, 1.7)), (160, 160), 1.7)
+    likeness = PictureDifference.of(premultiply(fine), premultiply(rough))
+    assert np.abs(premultiply(fine) - premultiply(rough)).mean() < 1.0 / 255.0
+    assert likeness.close_fraction > 0.9
 
 
 def test_enlarging_keeps_ramps_where_they_are():
@@ -62,7 +62,7 @@ def test_enlarging_keeps_ramps_where_they_are():
     times, (width, height) = 2.5, (50, 20)
     ramp = np.full((8, 20, 4), 255, dtype=np.uint8)
     ramp[..., 0] = 5 + 10 * np.arange(20)
-    fine = enlarged(ramp, (width, height), times)
+    fine = upscale_picture(ramp, (width, height), times)
     expected = 5 + 10 * ((np.arange(width) + 0.5) / times - 0.5)
     inside = slice(2, -2)  # beyond the outer pixels' centres there is nothing to go on with
     assert fine.shape == (height, width, 4)
@@ -73,7 +73,7 @@ def test_enlarging_keeps_ramps_where_they_are():
 def test_colours_do_not_fade_towards_what_is_transparent():
     picture = np.zeros((4, 6, 4), dtype=np.uint8)
     picture[:, :3] = [200, 100, 50, 255]
-    fine = enlarged(picture, (24, 16), 4.0)
+    fine = upscale_picture(picture, (24, 16), 4.0)
     seen = fine[..., 3] > 8
     assert seen.any()
     assert not seen.all()
@@ -83,7 +83,7 @@ def test_colours_do_not_fade_towards_what_is_transparent():
 
 def test_the_coarse_camera_sees_the_same_field_of_view(camera):
     view = camera(333, 200)
-    rough = coarse(view, 3.3)
+    rough = downscale_camera(view, 3.3)
     point = view.directions(np.array([[100.0, 50.0]]))
-    assert np.allclose(point, rough.directions(np.array([[100.0, 50.0]]) / 3.3))
+    assert np.allclose(point, rough.ray_directions(np.array([[100.0, 50.0]]) / 3.3))
     assert rough.size_px == (101, 61)

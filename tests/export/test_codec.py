@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.errors import BadInput
-from export.bake_skin import weight_codes
-from export.codec import Layout, cube_sums, decode, encode
-from export.tables import FULL_WEIGHT, LOG_DENSITY, Bricks, Skin, Surfels, Tables, density_codes
+from capture.errors import InputError
+from export.bake_skin import encode_weights
+from export.codec import TableLayout, cumsum_cubes, decode_tables, encode_tables
+from export.tables import WEIGHT_SCALE, LOG_DENSITY_RANGE, BrickTable, SkinningGrid, SurfelTable, PlayerTables, encode_density
 
 
-def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: float) -> Tables:
+def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: float) -> PlayerTables:
     rng = np.random.default_rng(seed)
     nodes = np.array(counts) * 8 + 1
     lattice = rng.integers(0, 256, (*nodes, 4), dtype=np.uint8)
@@ -24,8 +24,8 @@ def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: 
     voxels = np.zeros((used.sum() + 1, 9, 9, 9, 4), np.uint8)
     for number, block in enumerate(np.argwhere(used), start=1):
         voxels[number] = lattice[tuple(slice(8 * b, 8 * b + 9) for b in block)]
-    return Tables(
-        surfels=Surfels(
+    return PlayerTables(
+        surfels=SurfelTable(
             low=rng.normal(size=3).astype(np.float32),
             extent_m=float(rng.random()),
             spacing_m=0.005,
@@ -33,24 +33,24 @@ def random_tables(seed: int, surfels: int, counts: tuple[int, int, int], share: 
             normal_codes=rng.integers(-127, 128, (surfels, 3), dtype=np.int8),
             thickness_codes=rng.integers(0, 256, surfels, dtype=np.uint8),
         ),
-        bricks=Bricks(
+        bricks=BrickTable(
             low=rng.normal(size=3).astype(np.float32), voxel_m=0.004, index=index, voxels=voxels
         ),
-        skin=random_skin(rng, counts, share),
+        skinning=random_skin(rng, counts, share),
         pelvis=rng.normal(size=3).astype(np.float32),
         reach_m=1.5,
     )
 
 
-def random_skin(rng, counts, share) -> Skin:
+def random_skin(rng, counts, share) -> SkinningGrid:
     stored = rng.random(counts) < share
     stored[0, 0, 0] = True
     index = np.zeros(counts, np.int32)
     index[stored] = np.arange(1, stored.sum() + 1)
-    codes = rng.integers(0, FULL_WEIGHT + 1, (24, stored.sum() + 1), dtype=np.uint16)
+    codes = rng.integers(0, WEIGHT_SCALE + 1, (24, stored.sum() + 1), dtype=np.uint16)
     codes[:, 0] = 0
-    codes[0, 0] = FULL_WEIGHT
-    return Skin(
+    codes[0, 0] = WEIGHT_SCALE
+    return SkinningGrid(
         low=rng.normal(size=3).astype(np.float32),
         step_m=rng.uniform(0.01, 0.03, 3).astype(np.float32),
         index=index,
@@ -76,19 +76,19 @@ def assert_same(a, b):
 )
 def test_tables_come_back_from_their_streams_bit_by_bit(seed, surfels, counts, share):
     tables = random_tables(seed, surfels, counts, share)
-    layout, streams = Layout.of(tables), encode(tables)
-    for name, (dtype, shape) in layout.streams().items():
+    layout, streams = TableLayout.of(tables), encode_tables(tables)
+    for name, (dtype, shape) in layout.stream_types().items():
         assert len(streams[name]) == np.dtype(dtype).itemsize * np.prod(shape)
-    assert_same(tables, decode(streams, layout))
+    assert_same(tables, decode_tables(streams, layout))
 
 
 @pytest.mark.parametrize("stream", ["blocks", "skin_nodes"])
 def test_places_that_do_not_match_what_is_there_are_refused(stream):
     tables = random_tables(0, 5, (2, 2, 2), 0.5)
-    streams = encode(tables)
+    streams = encode_tables(tables)
     streams[stream] = bytes([255])
-    with pytest.raises(BadInput, match="places"):
-        decode(streams, Layout.of(tables))
+    with pytest.raises(InputError, match="places"):
+        decode_tables(streams, TableLayout.of(tables))
 
 
 @given(
@@ -96,18 +96,18 @@ def test_places_that_do_not_match_what_is_there_are_refused(stream):
 )
 def test_weight_codes_sum_to_one_and_stay_close(weights):
     weights = np.array([weights], dtype=np.float32) / np.float32(sum(weights))
-    codes = weight_codes(weights).astype(int)
-    assert codes.sum() == FULL_WEIGHT
+    codes = encode_weights(weights).astype(int)
+    assert codes.sum() == WEIGHT_SCALE
     assert codes.min() >= 0
-    assert np.abs(codes / FULL_WEIGHT - weights).max() < 24 / FULL_WEIGHT
+    assert np.abs(codes / WEIGHT_SCALE - weights).max() < 24 / WEIGHT_SCALE
 
 
 def test_density_codes_are_logarithmic_and_zero_is_empty():
-    low, high = LOG_DENSITY
+    low, high = LOG_DENSITY_RANGE
     density = np.exp(np.linspace(low, high, 1000))
-    restored = np.exp(density_codes(density) / 255.0 * (high - low) + low)
+    restored = np.exp(encode_density(density) / 255.0 * (high - low) + low)
     np.testing.assert_allclose(restored, density, rtol=0.5 * (high - low) / 255 * 1.02)
-    assert density_codes(np.array([0.0, 0.4, 1e9])).tolist() == [0, 0, 255]
+    assert encode_density(np.array([0.0, 0.4, 1e9])).tolist() == [0, 0, 255]
 
 
 def test_sums_of_cubes_are_cumulative_sums_along_three_axes(rng):
@@ -115,6 +115,6 @@ def test_sums_of_cubes_are_cumulative_sums_along_three_axes(rng):
     expected = codes
     for axis in (-3, -2, -1):
         expected = np.cumsum(expected, axis=axis, dtype=np.uint8)
-    np.testing.assert_array_equal(cube_sums(codes), expected)
+    np.testing.assert_array_equal(cumsum_cubes(codes), expected)
     full = np.full((1, 8, 8, 8), 255, dtype=np.uint8)
-    np.testing.assert_array_equal(cube_sums(full)[0, 7, 7, 7], np.uint8(255 * 512 % 256))
+    np.testing.assert_array_equal(cumsum_cubes(full)[0, 7, 7, 7], np.uint8(255 * 512 % 256))

@@ -11,8 +11,8 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from export.gltf import Animation, glb
-from export.mesh import mesh_of
+from export.gltf import SkeletonAnimation, encode_glb
+from export.mesh import extract_mesh
 from export.package import read_package
 from preprocess.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.pose import Motion
@@ -29,7 +29,7 @@ def package(exported):
 
 @pytest.fixture(scope="module")
 def mesh(package):
-    return mesh_of(package.tables["hq"])
+    return extract_mesh(package.tables["hq"])
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +44,14 @@ def motion(bent):
         joint_rotations=share[:, None, None] * bent.joint_rotations,
         valid=np.ones(3, dtype=bool),
         betas=np.zeros(10),
-        model="body24",
+        body_model="body24",
     )
 
 
 @pytest.fixture(scope="module")
 def file(mesh, package, motion):
     rest = package.manifest.rest_joints
-    return glb(mesh, package.manifest, Animation.of(motion, (0, 1, 2), 25.0, rest[0]), name="x")
+    return encode_glb(mesh, package.manifest, SkeletonAnimation.of(motion, (0, 1, 2), 25.0, rest[0]), name="x")
 
 
 class Read:
@@ -178,9 +178,9 @@ def test_quaternions_take_the_short_way(package):
         joint_rotations=np.zeros((60, 23, 3)),
         valid=np.ones(60, dtype=bool),
         betas=np.zeros(10),
-        model="body24",
+        body_model="body24",
     )
-    animation = Animation.of(spin, tuple(range(60)), 30.0, package.manifest.rest_joints[0])
+    animation = SkeletonAnimation.of(spin, tuple(range(60)), 30.0, package.manifest.rest_joints[0])
     steps = np.sum(animation.rotations[:, 1:] * animation.rotations[:, :-1], axis=-1)
     assert (steps > 0.9).all()
 
@@ -201,6 +201,6 @@ def test_colours_are_linear_light(file, mesh):
 
 
 def test_a_still_pose_is_a_motion_too(mesh, package, motion):
-    one = Animation.of(motion, (1,), 30.0, package.manifest.rest_joints[0])
-    read = Read(glb(replace(mesh), package.manifest, one, name="x"))
+    one = SkeletonAnimation.of(motion, (1,), 30.0, package.manifest.rest_joints[0])
+    read = Read(encode_glb(replace(mesh), package.manifest, one, name="x"))
     assert read.skinned(0).shape == mesh.positions.shape

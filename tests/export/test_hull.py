@@ -1,23 +1,23 @@
 import numpy as np
 import pytest
 
-from export.compiled import spread_colors
-from export.hull import MARGIN_M, OPAQUE, find_hull
-from export.isosurface import resampled
-from export.lattice import Lattice
+from export.compiled import dilate_colors
+from export.hull import THICKNESS_MARGIN_M, OPAQUE_OPTICAL_DEPTH, extract_proxy_surface
+from export.isosurface import resample_grid
+from export.lattice import FieldGrid
 
 VOXEL_M = 0.004
 RADIUS_M = 0.08
 
 
-def ball_lattice(density_of_radius, size=65, extra=None) -> Lattice:
+def ball_lattice(density_of_radius, size=65, extra=None) -> FieldGrid:
     axis = (np.arange(size) - size // 2) * VOXEL_M
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     density = density_of_radius(np.linalg.norm(points, axis=-1)).astype(np.float32)
     if extra is not None:
         density = np.maximum(density, extra(points)).astype(np.float32)
     low = np.full(3, axis[0], dtype=np.float32)
-    return Lattice(
+    return FieldGrid(
         low=low, voxel_m=VOXEL_M, density=density, rgb=np.zeros((*density.shape, 3), np.uint8)
     )
 
@@ -34,12 +34,12 @@ def test_a_ramp_is_read_at_any_step_also_where_the_last_one_is_rounded_to_the_en
         step = 401.0 / count
         places = np.arange(0.0, 401.0, step)
         ends += int(places[-1]) == 401
-        np.testing.assert_allclose(resampled(ramp, step)[:, 0, 0], places, rtol=1e-5)
+        np.testing.assert_allclose(resample_grid(ramp, step)[:, 0, 0], places, rtol=1e-5)
     assert ends  # a length over a step that divides it is at times a step too many
 
 
 def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
-    hull = find_hull(ball_lattice(soft_ball), level=20.0, spacing_m=0.005)
+    hull = extract_proxy_surface(ball_lattice(soft_ball), level=20.0, spacing_m=0.005)
     radius = np.linalg.norm(hull.positions, axis=1)
     np.testing.assert_allclose(radius, RADIUS_M, atol=6e-4)
     cosine = (hull.positions / radius[:, None] * hull.normals).sum(axis=1)
@@ -52,13 +52,13 @@ def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
 def test_thickness_is_the_depth_at_which_everything_has_been_seen():
     constant = 200.0
     lattice = ball_lattice(lambda r: np.where(r < RADIUS_M, constant, 0.0))
-    hull = find_hull(lattice, level=20.0, spacing_m=0.005)
-    np.testing.assert_allclose(hull.thickness, OPAQUE / constant + MARGIN_M, atol=0.006)
+    hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
+    np.testing.assert_allclose(hull.thickness, OPAQUE_OPTICAL_DEPTH / constant + THICKNESS_MARGIN_M, atol=0.006)
 
 
 def test_a_hollow_ball_has_no_surfels_inside():
     lattice = ball_lattice(lambda r: np.where((r < RADIUS_M) & (r > 0.04), 300.0, 0.0))
-    hull = find_hull(lattice, level=20.0, spacing_m=0.005)
+    hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
     assert np.linalg.norm(hull.positions, axis=1).min() > RADIUS_M - 0.006
 
 
@@ -74,12 +74,12 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
     lattice = ball_lattice(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
 
     def nearest(place):
-        hull = find_hull(lattice, level=20.0, spacing_m=0.005)
+        hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
         return np.linalg.norm(hull.positions - place, axis=1).min()
 
     assert nearest(floater) > 0.05
     assert nearest(part) < 0.04
-    monkeypatch.setattr("export.hull.SMALLEST_PART", 1e-9)
+    monkeypatch.setattr("export.bake.proxy_surface.MIN_PART_FRACTION", 1e-9)
     assert nearest(floater) < 0.02
 
 
@@ -87,6 +87,6 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
 def test_empty_nodes_beside_visible_ones_take_their_color(color):
     visible, rgb = np.zeros((7, 7, 7), bool), np.zeros((7, 7, 7, 3), np.uint8)
     visible[3, 3, 2:5], rgb[3, 3, 2:5] = True, color
-    spread_colors(visible, rgb)
+    dilate_colors(visible, rgb)
     assert (rgb[2:5, 2:5, 1:6] == color).all()
     assert not rgb[0].any()

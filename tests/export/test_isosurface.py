@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from export.isosurface import isosurface
+from export.isosurface import extract_isosurface
 
 
 def lattice(of, size=33):
@@ -42,7 +42,7 @@ def euler(vertices, faces):
 
 def test_a_sphere_has_its_radius_its_volume_and_faces_that_look_out():
     values, step = lattice(sphere)
-    nodes, faces = isosurface(values)
+    nodes, faces = extract_isosurface(values)
     vertices = nodes * step - 1.0
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.7).max() < 0.1 * step
     assert volume(vertices, faces) == pytest.approx(4.0 / 3.0 * np.pi * 0.7**3, rel=0.01)
@@ -51,14 +51,14 @@ def test_a_sphere_has_its_radius_its_volume_and_faces_that_look_out():
 
 @pytest.mark.parametrize(("shape", "characteristic"), [(sphere, 2), (torus, 0)])
 def test_surfaces_are_closed_and_have_as_many_handles_as_they_should(shape, characteristic):
-    vertices, faces = isosurface(lattice(shape)[0])
+    vertices, faces = extract_isosurface(lattice(shape)[0])
     assert is_closed(faces)
     assert euler(vertices, faces) == characteristic
 
 
 def test_a_plane_between_nodes_is_found_where_it_is():
     values = np.broadcast_to(2.3 - np.arange(6, dtype=np.float32)[:, None, None], (6, 5, 5))
-    vertices, faces = isosurface(np.ascontiguousarray(values))
+    vertices, faces = extract_isosurface(np.ascontiguousarray(values))
     np.testing.assert_allclose(vertices[:, 0], 2.3, atol=1e-6)
     a, b, c = (vertices[corner] for corner in faces.T)
     normals = np.cross(b - a, c - a)
@@ -66,7 +66,7 @@ def test_a_plane_between_nodes_is_found_where_it_is():
 
 
 def test_a_surface_with_a_hole_is_not_closed():
-    _, faces = isosurface(lattice(sphere)[0])
+    _, faces = extract_isosurface(lattice(sphere)[0])
     assert not is_closed(faces[1:])
 
 
@@ -74,6 +74,6 @@ def test_noise_gives_a_closed_surface_too():
     values = np.random.default_rng(3).standard_normal((14, 15, 16)).astype(np.float32)
     inside = np.full((16, 17, 18), -1.0, dtype=np.float32)
     inside[1:-1, 1:-1, 1:-1] = values
-    vertices, faces = isosurface(inside)
+    vertices, faces = extract_isosurface(inside)
     assert is_closed(faces)
     assert ((faces >= 0) & (faces < len(vertices))).all()

@@ -11,13 +11,13 @@ from onnx import TensorProto, helper, numpy_helper
 
 from avatar.config import TrainConfig
 from avatar.trainer import Trainer
-from capture.errors import BadInput
+from capture.errors import InputError
 from export import build
-from export.bake import COARSEST_M, FINEST_M, BakeConfig
+from export.bake import MAX_VOXEL_M, MIN_VOXEL_M, BakeConfig
 from export.build import export_avatar, export_field
-from export.checks import GOOD_PSNR, POOR_PSNR, warnings_for
+from export.checks import GOOD_PSNR, POOR_PSNR, quality_warnings
 from export.errors import ExportRefused
-from export.manifest import LATER, Manifest
+from export.manifest import OPTIONAL_SETTINGS, Manifest
 from export.package import read_package, write_package
 from export.player import Player
 
@@ -72,7 +72,7 @@ def test_every_altered_byte_of_a_stream_is_noticed(exported, tmp_path):
         path.write_bytes(damaged)
         try:
             package = read_package(path)
-        except BadInput as error:
+        except InputError as error:
             noticed.append(str(error))
         else:  # a byte that carries no content, such as a time stamp
             assert package.manifest.to_json() == whole
@@ -92,7 +92,7 @@ def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
         return content[:-1] + b"x" if name == "hq/skin_weights.bin" else content
 
     path = rewritten(exported.path, tmp_path / "x.iavatar", change)
-    with pytest.raises(BadInput, match=r"altered: hq/skin_weights\.bin"):
+    with pytest.raises(InputError, match=r"altered: hq/skin_weights\.bin"):
         read_package(path)
 
 
@@ -101,19 +101,19 @@ def test_a_truncated_package_is_refused(exported, tmp_path, share):
     content = exported.path.read_bytes()
     path = tmp_path / "short.iavatar"
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(BadInput, match="truncated"):
+    with pytest.raises(InputError, match="truncated"):
         read_package(path)
 
 
 def test_a_missing_file_and_a_missing_entry_are_named(exported, tmp_path):
-    with pytest.raises(BadInput, match="no package"):
+    with pytest.raises(InputError, match="no package"):
         read_package(tmp_path / "none.iavatar")
     path = rewritten(
         exported.path,
         tmp_path / "x.iavatar",
         lambda name, content: None if name == "player.onnx" else content,
     )
-    with pytest.raises(BadInput, match=r"player\.onnx is missing"):
+    with pytest.raises(InputError, match=r"player\.onnx is missing"):
         read_package(path)
 
 
@@ -123,7 +123,7 @@ def test_paths_out_of_the_archive_are_refused(exported, tmp_path, name):
     path.write_bytes(exported.path.read_bytes())
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr(name, b"evil")
-    with pytest.raises(BadInput, match="outside"):
+    with pytest.raises(InputError, match="outside"):
         read_package(path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.iavatar"]
 
@@ -133,7 +133,7 @@ def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path)
         return bytes(200 << 20) if name == "hq/thickness.bin" else content
 
     path = rewritten(exported.path, tmp_path / "bomb.iavatar", change)
-    with pytest.raises(BadInput, match=r"thickness\.bin claims 209715200 bytes"):
+    with pytest.raises(InputError, match=r"thickness\.bin claims 209715200 bytes"):
         read_package(path)
 
 
@@ -152,7 +152,7 @@ def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported,
         tiers = json.loads(archive.read("manifest.json"))["tiers"]
     tiers["hq"]["layout"] |= change
     path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(tiers=tiers))
-    with pytest.raises(BadInput, match="claims"):
+    with pytest.raises(InputError, match="claims"):
         read_package(path)
 
 
@@ -171,12 +171,12 @@ def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported,
 )
 def test_a_manifest_that_cannot_be_is_refused(exported, tmp_path, change, message):
     path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(**change))
-    with pytest.raises(BadInput, match=message):
+    with pytest.raises(InputError, match=message):
         read_package(path)
 
 
 def test_a_tier_that_is_not_there_is_named(exported):
-    with pytest.raises(BadInput, match=r"no tier 'best'; it has: hq, lite"):
+    with pytest.raises(InputError, match=r"no tier 'best'; it has: hq, lite"):
         Player.load(exported.path, tier="best")
 
 
@@ -210,7 +210,7 @@ def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(expor
     ("score", "said"), [(GOOD_PSNR, None), (37.9, "simplifies"), (29.9, "poorly"), (8.0, "poorly")]
 )
 def test_what_is_said_of_a_package(score, said):
-    warnings = warnings_for(score)
+    warnings = quality_warnings(score)
     assert [said in warning for warning in warnings] == ([] if said is None else [True])
 
 
@@ -219,7 +219,7 @@ def test_a_graph_that_differs_from_its_twin_is_refused_and_leaves_nothing(
 ):
     right = build.build_graph
     monkeypatch.setattr(
-        build, "build_graph", lambda tables, rules: right(tables, replace(rules, longest_m=0.01))
+        build, "build_graph", lambda tables, rules: right(tables, replace(rules, max_segment_m=0.01))
     )
     with pytest.raises(ExportRefused, match="2/255"):
         export()
@@ -246,9 +246,9 @@ def test_the_fog_of_an_untrained_avatar_is_written_with_a_warning(
 
 
 def test_voxels_follow_the_field_within_bounds():
-    assert BakeConfig.for_cells(0.001).voxel_m == FINEST_M
-    assert FINEST_M < BakeConfig.for_cells(0.009).voxel_m < COARSEST_M
-    assert BakeConfig.for_cells(0.1).voxel_m == COARSEST_M
+    assert BakeConfig.for_cell_size(0.001).voxel_m == MIN_VOXEL_M
+    assert MIN_VOXEL_M < BakeConfig.for_cell_size(0.009).voxel_m < MAX_VOXEL_M
+    assert BakeConfig.for_cell_size(0.1).voxel_m == MAX_VOXEL_M
 
 
 def test_a_hasty_package_is_coarser_and_plays_the_best_quality_alone(export, coarse, views):
@@ -259,7 +259,7 @@ def test_a_hasty_package_is_coarser_and_plays_the_best_quality_alone(export, coa
         read_package(export(config=coarse).path).tables["hq"].surfels.positions
     )
     assert Player(package).render(*views["bent"])[..., 3].max() > 200
-    assert BakeConfig.for_cells(0.1).hasty().voxel_m == COARSEST_M
+    assert BakeConfig.for_cell_size(0.1).quick().voxel_m == MAX_VOXEL_M
 
 
 def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
@@ -285,7 +285,7 @@ def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
     tables = read_package(exported.path).tables["hq"]
     assert manifest["format"] == 3
     np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
-    np.testing.assert_allclose(weights, tables.skin.weights[1:], atol=1e-6)
+    np.testing.assert_allclose(weights, tables.skinning.weights[1:], atol=1e-6)
     np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)
 
 
@@ -303,7 +303,7 @@ def test_encrypted_and_strangely_compressed_entries_are_refused(exported, tmp_pa
     path = tmp_path / "x.iavatar"
     path.write_bytes(exported.path.read_bytes())
     with_flag(path, "preview.png", offset, value)
-    with pytest.raises(BadInput, match="encrypted or compressed in a way"):
+    with pytest.raises(InputError, match="encrypted or compressed in a way"):
         read_package(path)
 
 
@@ -315,7 +315,7 @@ def test_a_list_of_a_million_entries_is_refused_before_it_is_read(tmp_path, monk
     path.write_bytes(directory + end)
     built = []
     monkeypatch.setattr(zipfile, "ZipInfo", lambda *a: built.append(a))
-    with pytest.raises(BadInput, match="longer than any package's"):
+    with pytest.raises(InputError, match="longer than any package's"):
         read_package(path)
     assert not built
 
@@ -324,7 +324,7 @@ def test_a_file_that_is_far_too_large_is_not_opened_as_a_zip(tmp_path):
     path = tmp_path / "x.iavatar"
     with path.open("wb") as file:
         file.truncate(1 << 40)  # a hole: it takes no room
-    with pytest.raises(BadInput, match="no package has"):
+    with pytest.raises(InputError, match="no package has"):
         read_package(path)
 
 
@@ -349,7 +349,7 @@ def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
         for key, value in (("location", place), ("offset", "0"), ("length", "16")):
             stolen.external_data.add(key=key, value=value)
         graph = graph_of([helper.make_node("Identity", ["stolen"], ["rgba"])], [stolen])
-        with pytest.raises(BadInput, match="does not run"):
+        with pytest.raises(InputError, match="does not run"):
             Player(replace(read_package(exported.path), graphs={"hq": graph}))
 
 
@@ -363,19 +363,19 @@ def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, 
     for graph, message in ((graph_of([endless], [size]), "cannot draw"),
                            (graph_of([small], [one]), "instead of one 32-bit number")):  # fmt: skip
         player = Player(replace(read_package(exported.path), graphs={"hq": graph}))
-        with pytest.raises(BadInput, match=message):
+        with pytest.raises(InputError, match=message):
             player.render(*views["bent"])
 
 
 def test_a_package_from_before_later_rules_is_read_and_drawn_without_them(exported):
     text = json.loads(read_package(exported.path).manifest.to_json())
-    rules = text["tiers"]["hq"]["rules"]
-    for name in LATER:
+    rules = text["tiers"]["hq"]["settings"]
+    for name in OPTIONAL_SETTINGS:
         del rules[name]
-    known = Manifest.from_json(json.dumps(text).encode()).tiers["hq"].rules
-    assert known.sheet_gap_m == known.gap_m
-    assert known.fold_setback_m == 0.0
-    assert known.squash_limit > 1e6
-    del rules["gap_m"]
-    with pytest.raises(BadInput, match="damaged"):
+    known = Manifest.from_json(json.dumps(text).encode()).tiers["hq"].settings
+    assert known.other_sheet_gap_m == known.layer_gap_m
+    assert known.fold_depth_offset_m == 0.0
+    assert known.max_compression > 1e6
+    del rules["layer_gap_m"]
+    with pytest.raises(InputError, match="damaged"):
         Manifest.from_json(json.dumps(text).encode())

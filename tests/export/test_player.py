@@ -9,13 +9,13 @@ import onnxruntime
 import pytest
 
 from avatar.metrics import psnr
-from capture.errors import BadInput
+from capture.errors import InputError
 from export.graph import build_graph
 from export.package import read_package
-from export.player import Likeness, Player, premultiplied, verify
-from export.skin import finer_nodes
-from export.twin import Shot, draw
-from export.twin_march import PosedNodes, carried, carried_in_tetrahedra, read
+from export.player import PictureDifference, Player, premultiply, verify_package
+from export.skin import subdivided_skinning_nodes
+from export.twin import PlayerInputs, draw_reference
+from export.twin_march import PosedNodes, skin_trilinear, skin_tetrahedral, sample_bricks
 from preprocess.pose import BodyPose
 
 
@@ -37,18 +37,18 @@ def test_the_graph_draws_what_its_twin_draws(
     player = Player.load(exported.path, tier=tier)
     pose = stand_in.canonical if posed == "canonical" else bent
     view = camera(*size, distance_m=distance_m)
-    rules = player.manifest.tiers[tier].rules
-    shot = Shot(
+    rules = player.manifest.tiers[tier].settings
+    shot = PlayerInputs(
         bones=player.bones(pose, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
         size_px=size,
         samples=5,
     )
-    drawn = premultiplied(player.render(pose, view, samples=5))
-    likeness = Likeness.of(drawn, draw(tables, rules, shot))
+    drawn = premultiply(player.render(pose, view, samples=5))
+    likeness = PictureDifference.of(drawn, draw_reference(tables, rules, shot))
     assert drawn[..., 3].mean() > 0.05
-    assert likeness.alike, likeness
+    assert likeness.matches, likeness
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
@@ -61,29 +61,29 @@ def test_folded_surfels_stand_behind_their_neighbours_in_graph_and_twin(
     pose = replace(BodyPose.rest(), joint_rotations=rotations)
     view = replace(camera(96, 96), focal_px=(800.0, 800.0), center_px=(98.0, 184.0))
     player = Player.load(exported.path, tier=tier)
-    rules = player.manifest.tiers[tier].rules
-    shot = Shot(
+    rules = player.manifest.tiers[tier].settings
+    shot = PlayerInputs(
         bones=player.bones(pose, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
         size_px=view.size_px,
         samples=rules.samples,
     )
-    drawn = premultiplied(player.render(pose, view))
-    assert Likeness.of(drawn, draw(tables, rules, shot)).alike
-    before = draw(tables, replace(rules, fold_setback_m=0.0), shot)
-    assert Likeness.of(drawn, before).close < 0.99
+    drawn = premultiply(player.render(pose, view))
+    assert PictureDifference.of(drawn, draw_reference(tables, rules, shot)).matches
+    before = draw_reference(tables, replace(rules, fold_depth_offset_m=0.0), shot)
+    assert PictureDifference.of(drawn, before).close_fraction < 0.99
 
 
-@pytest.mark.parametrize("sheet_gap_m", [0.01, -0.015])
+@pytest.mark.parametrize("other_sheet_gap_m", [0.01, -0.015])
 @pytest.mark.parametrize("layers", [1, 2, 3, 4])
 def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
-    exported, tables, stand_in, bent, camera, layers, sheet_gap_m
+    exported, tables, stand_in, bent, camera, layers, other_sheet_gap_m
 ):
     package = read_package(exported.path)
     note = package.manifest.tiers["hq"]
-    rules = replace(note.rules, layers=layers, sheet_gap_m=sheet_gap_m)
-    tiers = {**package.manifest.tiers, "hq": replace(note, rules=rules)}
+    rules = replace(note.settings, layers=layers, other_sheet_gap_m=other_sheet_gap_m)
+    tiers = {**package.manifest.tiers, "hq": replace(note, settings=rules)}
     graph = build_graph(tables, rules).SerializeToString()
     player = Player(
         replace(
@@ -93,20 +93,20 @@ def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
         )
     )
     view = camera(131, 120, distance_m=1.6)
-    shot = Shot(
+    shot = PlayerInputs(
         bones=player.bones(bent, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
         size_px=(131, 120),
         samples=rules.samples,
     )
-    drawn = premultiplied(player.render(bent, view))
-    assert Likeness.of(drawn, draw(tables, rules, shot)).alike
+    drawn = premultiply(player.render(bent, view))
+    assert PictureDifference.of(drawn, draw_reference(tables, rules, shot)).matches
 
 
 @pytest.mark.parametrize(("posed", "least"), [("canonical", 44.0), ("bent", 34.5)])
 def test_the_player_shows_what_volume_rendering_shows(player, views, truth, posed, least):
-    drawn, exact = premultiplied(player.render(*views[posed])), truth[posed]
+    drawn, exact = premultiply(player.render(*views[posed])), truth[posed]
     assert psnr(on_white(drawn), on_white(exact)) > least
     assert abs(drawn[..., 3].sum() / exact[..., 3].sum() - 1) < 0.02
 
@@ -119,8 +119,8 @@ def test_rays_do_not_leap_over_cloth_that_a_pose_squashes(exported, stand_in, ca
     flat[2, 3] = view.camera_from_world[2, 3] * (1.0 - 1.0 / times)
     squashed = replace(view, camera_from_world=flat @ view.camera_from_world)
     player = Player.load(exported.path, tier=tier)
-    drawn = premultiplied(player.render(stand_in.canonical, squashed))
-    exact = premultiplied(
+    drawn = premultiply(player.render(stand_in.canonical, squashed))
+    exact = premultiply(
         Player.load(exported.path).render(stand_in.canonical, squashed, samples=200)
     )
     assert exact[..., 3].mean() > 0.1
@@ -141,17 +141,17 @@ def test_moving_person_and_camera_together_changes_nothing(player, stand_in, ben
     moved = replace(view, camera_from_world=view.camera_from_world @ world)
     pose = replace(bent, root_translation=bent.root_translation + shift)
     a, b = player.render(bent, view), player.render(pose, moved)
-    assert Likeness.of(premultiplied(a), premultiplied(b)).close > 0.995
+    assert PictureDifference.of(premultiply(a), premultiply(b)).close_fraction > 0.995
 
 
 def test_shifting_the_centre_by_whole_pixels_shifts_the_picture(player, bent, camera):
     view = camera(90, 90)
     x, y = view.center_px
     shifted = player.render(bent, replace(view, center_px=(x + 6.0, y - 4.0)))
-    likeness = Likeness.of(
-        premultiplied(shifted[:-4, 6:]), premultiplied(player.render(bent, view)[4:, :-6])
+    likeness = PictureDifference.of(
+        premultiply(shifted[:-4, 6:]), premultiply(player.render(bent, view)[4:, :-6])
     )
-    assert likeness.alike
+    assert likeness.matches
 
 
 def test_an_avatar_out_of_sight_leaves_the_picture_empty(player, bent, camera):
@@ -182,15 +182,15 @@ def test_one_does_not_see_between_surfels_however_close(player, stand_in, camera
 
 def test_more_samples_converge(player, bent, camera):
     view = camera(96, 96)
-    pictures = [premultiplied(player.render(bent, view, samples=n)) for n in (2, 8, 32, 128)]
+    pictures = [premultiply(player.render(bent, view, samples=n)) for n in (2, 8, 32, 128)]
     errors = [float(np.abs(p - pictures[-1]).mean()) for p in pictures[:-1]]
     assert errors[0] > errors[1] > errors[2]
 
 
 def test_what_cannot_be_drawn_is_said(player, bent, camera):
-    with pytest.raises(BadInput, match="distortion"):
+    with pytest.raises(InputError, match="distortion"):
         player.render(bent, replace(camera(9, 9), distortion=(0.1,)))
-    with pytest.raises(BadInput, match="samples"):
+    with pytest.raises(InputError, match="samples"):
         player.render(bent, camera(9, 9), samples=0)
 
 
@@ -208,19 +208,19 @@ def test_what_cannot_be_drawn_is_said(player, bent, camera):
 def test_numbers_that_are_none_are_refused_before_they_are_drawn(
     player, bent, camera, change, size, said
 ):
-    with pytest.raises(BadInput, match=said):
+    with pytest.raises(InputError, match=said):
         player.render(bent, replace(camera(9, 9), **change), size=size)
 
 
 def test_a_pose_without_numbers_is_refused(player, bent, camera):
     lost = replace(bent, joint_rotations=np.full((23, 3), np.nan))
-    with pytest.raises(BadInput, match="joint_rotations holds NaN"):
+    with pytest.raises(InputError, match="joint_rotations holds NaN"):
         player.render(lost, camera(9, 9))
 
 
 def test_a_pose_in_degrees_is_refused(player, bent, camera):
     degrees = replace(bent, joint_rotations=np.rad2deg(bent.joint_rotations))
-    with pytest.raises(BadInput, match=r"numpy\.deg2rad"):
+    with pytest.raises(InputError, match=r"numpy\.deg2rad"):
         player.render(degrees, camera(9, 9))
 
 
@@ -232,7 +232,7 @@ def test_an_onnxruntime_that_is_too_old_is_named(exported, monkeypatch):
             pass
 
     monkeypatch.setattr(onnxruntime, "SessionOptions", Older)
-    with pytest.raises(BadInput, match=r"too old for the player; 1\.24 or newer"):
+    with pytest.raises(InputError, match=r"too old for the player; 1\.24 or newer"):
         Player.load(exported.path)
 
 
@@ -246,8 +246,8 @@ def test_a_proof_looks_at_every_entry(exported, tmp_path):
     with zipfile.ZipFile(exported.path) as whole, zipfile.ZipFile(path, "w") as part:
         for name in set(whole.namelist()) - {"lite/player.onnx"}:
             part.writestr(name, whole.read(name))
-    with pytest.raises(BadInput, match=r"lite/player\.onnx is missing"):
-        verify(path)
+    with pytest.raises(InputError, match=r"lite/player\.onnx is missing"):
+        verify_package(path)
 
 
 def test_bricks_give_linear_ramps_back(tables):
@@ -261,26 +261,26 @@ def test_bricks_give_linear_ramps_back(tables):
         voxels=voxels,
     )  # fmt: skip
     points = np.random.default_rng(0).uniform(0, 8, (500, 3)).astype(np.float32)
-    rgb, density = read(one, points)
+    rgb, density = sample_bricks(one, points)
     np.testing.assert_allclose(rgb[:, 0] * 255, points @ [3, 7, 11] + 5, rtol=1e-4)
     assert np.ptp(density) < 1e-3 * density.max()
 
 
 def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
-    nodes = finer_nodes(tables.skin)
+    nodes = subdivided_skinning_nodes(tables.skin)
     matrix = np.array([[0.9, 0.2, 0.1], [-0.3, 1.1, 0.0], [0.2, 0.1, 0.8]], dtype=np.float32)
     posed = PosedNodes(nodes, nodes.positions @ matrix.T)
     points = tables.surfels.positions
-    for carry in (carried_in_tetrahedra, carried):
+    for carry in (skin_tetrahedral, skin_trilinear):
         moved, derivative = carry(posed, points)
         np.testing.assert_allclose(moved, points @ matrix.T, atol=1e-5)
         np.testing.assert_allclose(derivative, np.broadcast_to(matrix, derivative.shape), atol=1e-4)
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):
-    likenesses = verify(exported.path)
+    likenesses = verify_package(exported.path)
     assert len(likenesses) == 2
-    assert all(likeness.alike for likeness in likenesses)
+    assert all(likeness.matches for likeness in likenesses)
 
 
 def test_the_player_needs_numpy_and_onnxruntime_alone(exported):
@@ -307,14 +307,14 @@ def test_resting_is_a_pose_too(player, camera):
 
 def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player, views, truth):
     lite = Player.load(exported.path, tier="lite")
-    drawn, exact = premultiplied(lite.render(*views["canonical"])), truth["canonical"]
-    close = premultiplied(player.render(*views["canonical"]))
+    drawn, exact = premultiply(lite.render(*views["canonical"])), truth["canonical"]
+    close = premultiply(player.render(*views["canonical"]))
     assert psnr(on_white(drawn), on_white(exact)) > 36.0
     assert psnr(on_white(close), on_white(exact)) > psnr(on_white(drawn), on_white(exact))
     assert set(exported.psnr_to_renderer) == {"hq", "lite"}
 
 
-@pytest.mark.parametrize("module", ["export.session", "apps.playing.bench"])
+@pytest.mark.parametrize("module", ["export.onnx_session", "apps.playing.bench"])
 def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     code = f"import {module}, onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     plain = {key: held for key, held in os.environ.items() if not key.startswith(("ORT_", "XDG_"))}

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
-from export.rules import DrawingRules
-from export.skin import finer_nodes, nodes_of
-from export.tables import rounded
-from export.twin_march import PosedNodes, carried
+from capture.errors import InputError
+from export.rules import RenderSettings
+from export.skin import subdivided_skinning_nodes, skinning_nodes
+from export.tables import round_codes
+from export.twin_march import PosedNodes, skin_trilinear
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def test_the_skin_surrounds_the_hull_as_deep_as_one_sees(tables, skin):
 
 
 def test_halving_the_step_changes_no_weight(stand_in, skin):
-    nodes = finer_nodes(skin)
+    nodes = subdivided_skinning_nodes(skin)
     place = np.argwhere(nodes.index > 0)
     rows = nodes.index[tuple(place.T)]
     points = nodes.low + place * nodes.step_m
@@ -41,7 +41,7 @@ def test_halving_the_step_changes_no_weight(stand_in, skin):
 
 
 def test_along_z_rows_follow_each_other(skin):
-    index = finer_nodes(skin).index
+    index = subdivided_skinning_nodes(skin).index
     both = (index[..., :-1] > 0) & (index[..., 1:] > 0)
     assert (np.diff(index, axis=2)[both] == 1).all()
 
@@ -49,7 +49,7 @@ def test_along_z_rows_follow_each_other(skin):
 @pytest.mark.parametrize("per_step", [1, 2])
 def test_no_inverse_is_taken_of_the_skin_beyond_its_stored_cells(skin, per_step):
     """There the derivative is taken between unrelated nodes, and rays go anywhere: stray dots."""
-    nodes, stretch = nodes_of(skin, per_step), DrawingRules().stretch
+    nodes, stretch = skinning_nodes(skin, per_step), RenderSettings().max_volume_ratio
     whole, some = np.ones(np.subtract(skin.index.shape, 1), bool), np.zeros(1, bool)
     x, y, z = skin.index.shape
     for i, j, k in np.ndindex(2, 2, 2):
@@ -59,7 +59,7 @@ def test_no_inverse_is_taken_of_the_skin_beyond_its_stored_cells(skin, per_step)
     def trusted(cells):
         inside = np.random.default_rng(0).uniform(0.01, 0.99, (len(cells), 3))
         points = (skin.low + (cells + inside) * skin.step_m).astype(np.float32)
-        volume = np.linalg.det(carried(PosedNodes(nodes, nodes.positions), points)[1])
+        volume = np.linalg.det(skin_trilinear(PosedNodes(nodes, nodes.positions), points)[1])
         return ((volume > 1 / stretch) & (volume < stretch)).mean()
 
     assert trusted(np.argwhere(whole)) == 1.0
@@ -67,7 +67,7 @@ def test_no_inverse_is_taken_of_the_skin_beyond_its_stored_cells(skin, per_step)
 
 
 def test_all_weights_sum_to_one(skin):
-    np.testing.assert_allclose(finer_nodes(skin).weights.sum(axis=0), 1.0, atol=1e-5)
+    np.testing.assert_allclose(subdivided_skinning_nodes(skin).weights.sum(axis=0), 1.0, atol=1e-5)
 
 
 def test_stored_normals_point_outward_and_are_nearly_unit(tables):
@@ -84,7 +84,7 @@ def test_stored_normals_point_outward_and_are_nearly_unit(tables):
 @pytest.mark.parametrize(("step", "largest"), [(8, 255), (16, 255), (32, 65535), (1, 255)])
 def test_rounding_codes_moves_none_by_more_than_a_step(step, largest):
     codes = np.arange(largest + 1).astype(np.uint16 if largest > 255 else np.uint8)
-    near = rounded(codes, step, largest)
+    near = round_codes(codes, step, largest)
     assert near.dtype == codes.dtype
     assert (near % step == 0).all()
     error = np.abs(near.astype(int) - codes.astype(int))
@@ -93,7 +93,7 @@ def test_rounding_codes_moves_none_by_more_than_a_step(step, largest):
 
 
 def test_stored_nodes_are_the_skins_own(skin):
-    nodes = nodes_of(skin, 1)
+    nodes = skinning_nodes(skin, 1)
     np.testing.assert_array_equal(nodes.weights[:, :-1], skin.weights.T)
     place = np.argwhere(nodes.index > 0)
     rows = nodes.index[tuple(place.T)]
@@ -103,5 +103,5 @@ def test_stored_nodes_are_the_skins_own(skin):
 
 
 def test_steps_cut_in_other_ways_are_refused(skin):
-    with pytest.raises(BadInput, match="7 parts"):
-        nodes_of(skin, 7)
+    with pytest.raises(InputError, match="7 parts"):
+        skinning_nodes(skin, 7)

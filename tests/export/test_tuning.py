@@ -4,24 +4,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.bake import FINER
+from export.bake import FINER_VOXEL_FACTOR
 from export.build import export_field
-from export.descent import pushed, shown
+from export.descent import back_project, composite_segments
 from export.package import read_package
-from export.pieces import Pieces
-from export.seen import Codes
-from export.tables import BRICK
-from export.tiers import TIERS
-from export.tuning import DEEPER, tuned
-from export.twin import Shot, draw, look_at
+from export.pieces import RaySegments
+from export.seen import VoxelCodes
+from export.tables import BRICK_SIZE
+from export.tiers import QUALITY_TIERS
+from export.tuning import DEEPER_SETTINGS, fine_tune
+from export.twin import PlayerInputs, draw_reference, trace_picture
 
-RULES = TIERS["hq"]
+RULES = QUALITY_TIERS["hq"]
 
 
-def shot_of(rig, pose, camera) -> Shot:
+def shot_of(rig, pose, camera) -> PlayerInputs:
     bones = camera.camera_from_world @ rig.world_from_body(pose)
     bones = bones @ rig.body_from_canonical(pose.joint_rotations)
-    return Shot(
+    return PlayerInputs(
         bones=bones[:, :3].astype(np.float32),
         focal=np.array(camera.focal_px, dtype=np.float32),
         center=np.array(camera.center_px, dtype=np.float32),
@@ -30,22 +30,22 @@ def shot_of(rig, pose, camera) -> Shot:
     )
 
 
-def codes_of(tables) -> Codes:
-    core = tables.bricks.voxels[:, :BRICK, :BRICK, :BRICK].reshape(-1, 4).astype(np.float32)
-    return Codes(core[:, 3].copy(), core[:, :3].copy())
+def codes_of(tables) -> VoxelCodes:
+    core = tables.bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE].reshape(-1, 4).astype(np.float32)
+    return VoxelCodes(core[:, 3].copy(), core[:, :3].copy())
 
 
 @pytest.fixture(scope="module")
 def renderer(stand_in, tables):
     """The player itself, by the tables as they were baked: what it shows can be reached."""
-    return lambda pose, camera: draw(tables, RULES, shot_of(stand_in.rig, pose, camera))
+    return lambda pose, camera: draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
 
 
 @pytest.fixture(scope="module")
 def traced(stand_in, tables, views):
-    look = look_at(tables, RULES, shot_of(stand_in.rig, *views["bent"]))
-    first = Pieces.of_first(look.first, look.nodes, tables.bricks, RULES)
-    return look, first.followed_by(Pieces.behind(look, 1, tables.bricks, RULES))
+    look = trace_picture(tables, RULES, shot_of(stand_in.rig, *views["bent"]))
+    first = RaySegments.of_first_layer(look.first_rays, look.nodes, tables.bricks, RULES)
+    return look, first.append_layer(RaySegments.of_further_layer(look, 1, tables.bricks, RULES))
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +62,9 @@ def spoilt(tables):
 def tune(stand_in, views):
     def call(tables, renderer, **more):
         with ThreadPoolExecutor(1) as beside:
-            return tuned(
+            return fine_tune(
                 tables, stand_in.rig, RULES, renderer,
-                views=list(views.values()), pictures=6, beside=beside, **more,
+                views=list(views.values()), max_pictures=6, executor=beside, **more,
             )  # fmt: skip
 
     return call
@@ -74,8 +74,8 @@ def test_what_tuning_thinks_is_shown_is_what_the_player_shows(stand_in, tables, 
     look, pieces = traced
     assert len(look.behind[0].again) > 20
     assert pieces.layer.max() == 1
-    drawn = draw(tables, RULES, shot_of(stand_in.rig, *views["bent"])).reshape(-1, 4)[look.pixel]
-    out = shown(pieces, RULES, tables.bricks.index, *codes_of(tables))
+    drawn = draw_reference(tables, RULES, shot_of(stand_in.rig, *views["bent"])).reshape(-1, 4)[look.pixel]
+    out = composite_segments(pieces, RULES, tables.bricks.index, *codes_of(tables))
     assert np.abs(out - drawn).max() < 2e-3
 
 
@@ -84,11 +84,11 @@ def test_colours_are_pushed_against_the_error_s_gradient(tables, traced):
     generator = np.random.default_rng(2)
     density, color = codes_of(tables)
     wanted = generator.random((pieces.rays, 4)).astype(np.float32)
-    push = pushed(pieces, RULES, tables.bricks.index, density, color, wanted)
+    push = back_project(pieces, RULES, tables.bricks.index, density, color, wanted)
     way = generator.normal(size=color.shape).astype(np.float32)
 
     def loss(size):
-        out = shown(pieces, RULES, tables.bricks.index, density, color + np.float32(size) * way)
+        out = composite_segments(pieces, RULES, tables.bricks.index, density, color + np.float32(size) * way)
         return squares(out - wanted)
 
     slope = (loss(1.0) - loss(-1.0)) / 2.0  # exact: the error is quadratic in colours
@@ -101,14 +101,14 @@ def test_densities_are_pushed_against_the_error_s_gradient(tables, traced):
     density, color = codes_of(tables)
     color[:] = [40.0, 120.0, 200.0]  # one colour: it does not matter where it is read
     density = np.where(density > 0, density - 30.0, 0.0).astype(np.float32)
-    patient = replace(RULES, ended=-1.0)  # no ray ends, or else what is seen would jump
+    patient = replace(RULES, min_transmittance=-1.0)  # no ray ends, or else what is seen would jump
     wanted = np.zeros((pieces.rays, 4), dtype=np.float32)
-    push = pushed(pieces, patient, tables.bricks.index, density, color, wanted)
+    push = back_project(pieces, patient, tables.bricks.index, density, color, wanted)
     way = generator.random(density.shape).astype(np.float32) * (density > 0)
 
     def loss(size):
         moved = density + np.float32(size) * way
-        return squares(shown(pieces, patient, tables.bricks.index, moved, color) - wanted)
+        return squares(composite_segments(pieces, patient, tables.bricks.index, moved, color) - wanted)
 
     slope = (loss(0.25) - loss(-0.25)) / 0.5
     assert (push.density * way).sum() * 2.0 == pytest.approx(slope, rel=2e-2)
@@ -128,7 +128,7 @@ def test_tuning_lowers_the_error_on_a_view_that_it_did_not_see(
     pose = replace(bent, joint_rotations=0.6 * bent.joint_rotations)
     unseen = shot_of(stand_in.rig, pose, camera(96, 120, distance_m=2.6))
     exact = renderer(pose, camera(96, 120, distance_m=2.6))
-    errors = [((draw(t, RULES, unseen) - exact) ** 2).mean() for t in (spoilt, after.tables)]
+    errors = [((draw_reference(t, RULES, unseen) - exact) ** 2).mean() for t in (spoilt, after.tables)]
     assert errors[1] < 0.8 * errors[0]
     assert after.tables.surfels is spoilt.surfels
     assert not after.tables.bricks.voxels[0].any()
@@ -174,10 +174,10 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
         views=list(views.values()),
         metrics={},
         renderer=renderer,
-        config=replace(coarse, tuned=4),
+        config=replace(coarse, fine_tuning_pictures=4),
         progress=interrupted,
     )
-    assert report.tuning is None
+    assert report.fine_tuning_psnr is None
     assert any("interrupted" in warning for warning in report.warnings)
     package = read_package(report.path)
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
@@ -185,13 +185,13 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
 
 @pytest.mark.slow
 def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
-    more = replace(RULES, **DEEPER)
+    more = replace(RULES, **DEEPER_SETTINGS)
 
     def deeper(pose, camera):
-        return draw(tables, more, shot_of(stand_in.rig, pose, camera))
+        return draw_reference(tables, more, shot_of(stand_in.rig, pose, camera))
 
     def as_asked(pose, camera):
-        return draw(tables, RULES, shot_of(stand_in.rig, pose, camera))
+        return draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
 
     assert tune(tables, deeper).rules == RULES
     assert tune(tables, deeper, deepens=True).rules == more
@@ -216,10 +216,10 @@ def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
             views=list(views.values()),
             metrics={},
             renderer=exact,
-            config=replace(coarse, tuned=2),
+            config=replace(coarse, fine_tuning_pictures=2),
         )
         return read_package(report.path).tables["hq"].bricks.voxel_m
 
     usual = tables.bricks.voxel_m
     assert exported(renderer) == pytest.approx(usual)
-    assert exported(paler) == pytest.approx(FINER * usual)
+    assert exported(paler) == pytest.approx(FINER_VOXEL_FACTOR * usual)

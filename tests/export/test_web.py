@@ -7,35 +7,35 @@ import zlib
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
-from export.initialisers import initialisers
+from capture.errors import InputError
+from export.initialisers import graph_initializers
 from export.package import read_package
 from export.web import runtime, site
-from export.web.site import Clip, Look, pose_row
+from export.web.site import PageMotion, StartView, flatten_pose
 
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """A folder with all of onnxruntime-web's files; what is in them is of no matter here."""
     folder = tmp_path_factory.mktemp("runtime")
-    for name in (*runtime.MEMBERS, *runtime.NOTICES):
+    for name in (*runtime.TARBALL_MEMBERS, *runtime.LICENCE_FILES):
         (folder / name).write_bytes(name.encode())
     return folder
 
 
 @pytest.fixture
 def clip(bent):
-    return Clip(
-        poses=np.stack([pose_row(bent)] * 3),
+    return PageMotion(
+        poses=np.stack([flatten_pose(bent)] * 3),
         fps=25.0,
-        look=Look(axes=np.diag([1.0, -1.0, -1.0]), height_m=1.7, middle_m=-0.1),
+        start_view=StartView(axes=np.diag([1.0, -1.0, -1.0]), height_m=1.7, middle_m=-0.1),
     )
 
 
 @pytest.fixture
 def files(exported, clip, kept, monkeypatch):
     monkeypatch.setattr(site, "runtime_files", lambda: runtime.runtime_files(kept))
-    return site.site(exported.path, clip, name="somebody")
+    return site.build_page(exported.path, clip, name="somebody")
 
 
 def unpacked(files, entry):
@@ -50,7 +50,7 @@ def test_every_array_comes_back_as_it_was(files, exported, clip):
     package, told = read_package(exported.path), json.loads(files["avatar.json"])
     assert set(told["tiers"]) == set(package.manifest.tiers)
     tables = {entry["name"]: unpacked(files, entry) for entry in told["tiers"]["hq"]["tables"]}
-    expected = initialisers(package.tables["hq"], package.manifest.tiers["hq"].rules)
+    expected = graph_initializers(package.tables["hq"], package.manifest.tiers["hq"].settings)
     assert tables.keys() == expected.keys()
     for name, array in expected.items():
         assert tables[name].dtype == array.dtype
@@ -86,20 +86,20 @@ def test_every_file_that_the_page_names_is_there(files):
 
 
 def test_a_runtime_that_is_not_there_is_asked_for(tmp_path):
-    with pytest.raises(BadInput, match="make web"):
+    with pytest.raises(InputError, match="make web"):
         runtime.runtime_files(tmp_path)
 
 
 def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path):
     folder = tmp_path / "runtime"
-    with pytest.raises(BadInput, match="Nothing was kept"):
-        runtime.install(b"something else", folder)
+    with pytest.raises(InputError, match="Nothing was kept"):
+        runtime.install_runtime(b"something else", folder)
     assert not folder.exists()
 
 
 def test_what_changes_with_every_picture_is_not_read_aloud():
     """An <output> is a live region, which a screen reader would speak of all the time."""
-    page = site.page_files()["index.html"].decode()
+    page = site.static_page_files()["index.html"].decode()
     outputs = re.findall(r"<output[^>]*>", page)
     assert len(outputs) == 2
     assert all('aria-live="off"' in each for each in outputs)

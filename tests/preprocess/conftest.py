@@ -32,5 +32,5 @@ def motion(rng) -> Motion:
         joint_rotations=0.3 * rng.normal(size=(6, 23, 3)),
         valid=np.ones(6, dtype=bool),
         betas=rng.normal(size=10),
-        model="body24",
+        body_model="body24",
     )

@@ -8,16 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import preprocess
-from preprocess.body import Body
-from preprocess.body_file import load_body
+from preprocess.body import BodyModel
+from preprocess.body_file import load_body_model
 from preprocess.pose import BodyPose
-from preprocess.shape import betas_for
+from preprocess.shape import betas_for_motion
 from preprocess.skeleton import JOINT_NAMES
 
 
 @pytest.fixture(scope="module")
-def body() -> Body:
-    return load_body()
+def body() -> BodyModel:
+    return load_body_model()
 
 
 def pose_with(**changes: np.ndarray) -> BodyPose:
@@ -103,5 +103,5 @@ def test_bending_the_elbow_moves_the_forearm_alone(body):
 
 
 def test_betas_count_only_where_model_and_body_agree(body, motion):
-    np.testing.assert_array_equal(betas_for(body, motion), motion.betas)
-    np.testing.assert_array_equal(betas_for(body, replace(motion, model="smpl")), np.zeros(10))
+    np.testing.assert_array_equal(betas_for_motion(body, motion), motion.betas)
+    np.testing.assert_array_equal(betas_for_motion(body, replace(motion, model="smpl")), np.zeros(10))

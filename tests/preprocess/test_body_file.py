@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
-from preprocess.body import Body
-from preprocess.body_file import load_body
+from capture.errors import InputError
+from preprocess.body import BodyModel
+from preprocess.body_file import load_body_model
 from preprocess.pose import BodyPose
 from preprocess.skeleton import PARENTS
 
@@ -23,7 +23,7 @@ def write_npz(tmp_path, smpl_arrays):
     return write
 
 
-def assert_is(body: Body, arrays: dict[str, np.ndarray]) -> None:
+def assert_is(body: BodyModel, arrays: dict[str, np.ndarray]) -> None:
     np.testing.assert_allclose(body.template, arrays["v_template"], atol=1e-12)
     np.testing.assert_allclose(body.weights, arrays["weights"], atol=1e-12)
     np.testing.assert_array_equal(body.faces, arrays["f"])
@@ -36,7 +36,7 @@ def assert_is(body: Body, arrays: dict[str, np.ndarray]) -> None:
 
 
 def test_smpl_keys_in_an_npz(write_npz, smpl_arrays):
-    body = load_body(write_npz())
+    body = load_body_model(write_npz())
     assert body.family == "smpl"
     assert_is(body, smpl_arrays)
 
@@ -46,13 +46,13 @@ def test_smpl_keys_in_a_pickle_of_any_protocol(tmp_path, smpl_arrays, protocol):
     path = tmp_path / "body.pkl"
     extras = {"bs_style": "lbs", "bs_type": "lrotmin", "gender": np.float64(1.0)}
     path.write_bytes(pickle.dumps({**smpl_arrays, **extras}, protocol))
-    assert_is(load_body(path), smpl_arrays)
+    assert_is(load_body_model(path), smpl_arrays)
 
 
 def test_our_keys_in_an_npz(write_npz, rng):
     joints, directions = rng.normal(size=(24, 3)), rng.normal(size=(24, 3, 10))
     path = write_npz(J_regressor=None, posedirs=None, J=joints, J_shapedirs=directions)
-    body = load_body(path)
+    body = load_body_model(path)
     assert body.family == "body24"
     assert body.pose_directions is None
     np.testing.assert_array_equal(
@@ -64,16 +64,16 @@ def test_our_keys_in_an_npz(write_npz, rng):
 def test_both_spellings_of_no_parent_read_as_minus_one(write_npz, smpl_arrays, root):
     tree = smpl_arrays["kintree_table"].astype(np.int64)
     tree[0, 0] = root
-    assert load_body(write_npz(kintree_table=tree)).parents[0] == -1
+    assert load_body_model(write_npz(kintree_table=tree)).parents[0] == -1
 
 
 def test_half_precision_is_read_as_numbers(write_npz, smpl_arrays):
     halves = smpl_arrays["shapedirs"].astype(np.float16)
-    np.testing.assert_array_equal(load_body(write_npz(shapedirs=halves)).shape_directions, halves)
+    np.testing.assert_array_equal(load_body_model(write_npz(shapedirs=halves)).shape_directions, halves)
 
 
 def test_pose_correctives_add_up_linearly_in_the_rotations(write_npz, smpl_arrays):
-    body = load_body(write_npz())
+    body = load_body_model(write_npz())
     pose = BodyPose(
         root_rotation=np.zeros(3),
         root_translation=np.zeros(3),
@@ -106,21 +106,21 @@ def test_pose_correctives_add_up_linearly_in_the_rotations(write_npz, smpl_array
     ],
 )
 def test_what_is_no_body_is_refused_by_name(write_npz, changes, message):
-    with pytest.raises(BadInput, match=message):
-        load_body(write_npz(**changes))
+    with pytest.raises(InputError, match=message):
+        load_body_model(write_npz(**changes))
 
 
 @pytest.mark.parametrize("name", ["body.npz", "body.pkl"])
 @pytest.mark.parametrize("content", [b"", b"junk", bytes(1000), b"PK\x03\x04junk"])
 def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(BadInput, match="readable"):
-        load_body(tmp_path / name)
+    with pytest.raises(InputError, match="readable"):
+        load_body_model(tmp_path / name)
 
 
 def test_a_missing_file_or_another_suffix_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="no body file"):
-        load_body(tmp_path / "body.npz")
-    (tmp_path / "body.obj").write_text("v 0 0 0")
-    with pytest.raises(BadInput, match=r"\.obj"):
-        load_body(tmp_path / "body.obj")
+    with pytest.raises(InputError, match="no body file"):
+        load_body_model(tmp_path / "body.npz")
+    (tmp_path / "body.obj").write_text_atomically("v 0 0 0")
+    with pytest.raises(InputError, match=r"\.obj"):
+        load_body_model(tmp_path / "body.obj")

@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
-from capture.source import Source
-from preprocess.camera_file import default_cameras, read_cameras
-from preprocess.upright import upright_cameras
+from capture.source import FrameSource
+from preprocess.camera_file import assume_static_camera, read_cameras
+from preprocess.upright import read_upright_cameras
 
 SIZE = (640, 480)
 INTRINSIC = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
@@ -46,7 +46,7 @@ def test_one_camera_serves_all_frames(write):
     path = write()
     assert read_cameras(path.parent, SIZE).source == read_cameras(path, SIZE).source
     track = read_cameras(path, SIZE)
-    assert not track.moves
+    assert not track.is_moving
     assert track.note is None
     np.testing.assert_array_equal(track[99].intrinsic, INTRINSIC)
     np.testing.assert_array_equal(track[99].camera_from_world, placed(1))
@@ -56,7 +56,7 @@ def test_one_camera_serves_all_frames(write):
 def test_many_cameras_serve_a_frame_each(write):
     extrinsics = np.stack([placed(i) for i in range(5)])
     track = read_cameras(write(extrinsic=extrinsics), SIZE)
-    assert track.moves
+    assert track.is_moving
     for row in range(5):
         np.testing.assert_array_equal(track[row].camera_from_world, extrinsics[row])
         np.testing.assert_array_equal(track[row].intrinsic, INTRINSIC)
@@ -99,22 +99,22 @@ def test_distortion_comes_along_where_there_is_any(write):
     ],
 )
 def test_what_is_no_camera_is_refused(write, changes, message):
-    with pytest.raises(BadInput, match=message):
+    with pytest.raises(InputError, match=message):
         read_cameras(write(**changes), SIZE)
 
 
 def test_other_formats_are_refused_by_name(tmp_path):
-    with pytest.raises(BadInput, match=r"COLMAP.*transforms\.json"):
+    with pytest.raises(InputError, match=r"COLMAP.*transforms\.json"):
         read_cameras(tmp_path, SIZE)
-    with pytest.raises(BadInput, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         read_cameras(tmp_path / "cameras.npz", SIZE)
 
 
 def test_without_cameras_the_trackers_matrix_counts_else_a_phones(motion):
-    assumed = default_cameras(motion, SIZE)
+    assumed = assume_static_camera(motion, SIZE)
     np.testing.assert_allclose(assumed[3].intrinsic, [[544, 0, 320], [0, 544, 240], [0, 0, 1]])
     assert "544 px" in assumed.note
-    tracked = default_cameras(replace(motion, intrinsic=INTRINSIC), SIZE)
+    tracked = assume_static_camera(replace(motion, intrinsic=INTRINSIC), SIZE)
     np.testing.assert_array_equal(tracked[0].intrinsic, INTRINSIC)
     assert tracked.source == "K of the poses"
     assert tracked.note is None
@@ -126,7 +126,7 @@ LYING = np.array([[90.0, 0, 63.0], [0, 91.0, 35.0], [0, 0, 1]])
 
 
 @pytest.fixture(params=[6, 8])
-def turned(request, tmp_path) -> Source:
+def turned(request, tmp_path) -> FrameSource:
     """Pictures that are stored lying, with EXIF's word that they stand."""
     (tmp_path / "images").mkdir()
     exif = Image.Exif()
@@ -140,7 +140,7 @@ def turned(request, tmp_path) -> Source:
     return source
 
 
-def shown_at(x: float, y: float, source: Source) -> list[float]:
+def shown_at(x: float, y: float, source: FrameSource) -> list[float]:
     """Where a point of the stored picture is once it was turned."""
     return [STORED_PX[1] - y, x] if source.quarter_turns == 3 else [y, STORED_PX[0] - x]
 
@@ -152,7 +152,7 @@ POINT = np.array([0.2, -0.4, 3.0])
 def test_cameras_of_stored_pictures_turn_with_them(turned, tmp_path, size):
     """Also where only the principal point tells that they lie."""
     np.savez(tmp_path / "c.npz", intrinsic=LYING, extrinsic=np.eye(4), **size)
-    track = upright_cameras(tmp_path / "c.npz", turned)
+    track = read_upright_cameras(tmp_path / "c.npz", turned)
     x, y = read_cameras(tmp_path / "c.npz", STORED_PX).cameras[0].project(POINT)
     np.testing.assert_allclose(track.cameras[0].project(POINT), shown_at(x, y, turned))
     assert track.cameras[0].size_px == turned.size_px
@@ -163,7 +163,7 @@ def test_cameras_of_stored_pictures_turn_with_them(turned, tmp_path, size):
 def test_cameras_of_shown_pictures_stay(turned, tmp_path, size):
     standing = np.array([[91.0, 0, 35.0], [0, 90.0, 63.0], [0, 0, 1]])
     np.savez(tmp_path / "c.npz", intrinsic=standing, **size)
-    track = upright_cameras(tmp_path / "c.npz", turned)
+    track = read_upright_cameras(tmp_path / "c.npz", turned)
     np.testing.assert_array_equal(track.cameras[0].intrinsic, standing)
     assert track.note is None
 
@@ -177,11 +177,11 @@ def test_a_moving_camera_of_stored_pictures_turns_with_each(turned, tmp_path):
         for number, pose in enumerate(poses)
     ]
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({**lenses, "frames": frames}))
-    track, lying = upright_cameras(path, turned), read_cameras(path, STORED_PX, turned)
+    path.write_text_atomically(json.dumps({**lenses, "frames": frames}))
+    track, lying = read_upright_cameras(path, turned), read_cameras(path, STORED_PX, turned)
     for upright, stored in zip(track.cameras, lying.cameras, strict=True):
         np.testing.assert_allclose(upright.center_world, stored.center_world, atol=1e-9)
-        there = stored.center_world + stored.directions(np.array([100.0, 20.0]))
+        there = stored.center_world + stored.ray_directions(np.array([100.0, 20.0]))
         np.testing.assert_allclose(upright.project(there), shown_at(100.0, 20.0, turned))
 
 
@@ -194,10 +194,10 @@ def test_of_photographs_upside_down_colmaps_cameras_are_those_of_the_stored(tmp_
     source = open_source(tmp_path / "images")
     assert (source.size_px, source.quarter_turns) == (STORED_PX, 2)
     np.savez(tmp_path / "c.npz", intrinsic=LYING, width=128, height=72)
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 128 72 90 91 63 35\n")
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 0.jpg\n\n")
+    (tmp_path / "cameras.txt").write_text_atomically("1 PINHOLE 128 72 90 91 63 35\n")
+    (tmp_path / "images.txt").write_text_atomically("1 1 0 0 0 0 0 0 1 0.jpg\n\n")
     path = tmp_path if program == "colmap" else tmp_path / "c.npz"
-    camera = upright_cameras(path, source)[0]
+    camera = read_upright_cameras(path, source)[0]
     x, y = read_cameras(tmp_path / "c.npz", STORED_PX)[0].project(POINT)
     wanted = [128 - x, 72 - y] if program == "colmap" else [x, y]
     np.testing.assert_allclose(camera.project(POINT), wanted)
@@ -205,8 +205,8 @@ def test_of_photographs_upside_down_colmaps_cameras_are_those_of_the_stored(tmp_
 
 def test_cameras_of_another_shape_are_refused_as_the_user_sees_the_pictures(turned, tmp_path):
     np.savez(tmp_path / "c.npz", intrinsic=LYING, width=100, height=100)
-    with pytest.raises(BadInput, match="the video has 72x128"):
-        upright_cameras(tmp_path / "c.npz", turned)
+    with pytest.raises(InputError, match="the video has 72x128"):
+        read_upright_cameras(tmp_path / "c.npz", turned)
 
 
 @pytest.mark.parametrize("program", ["colmap", "stored", "shown"])
@@ -227,9 +227,9 @@ def test_cameras_of_mirrored_photographs_are_mirrored_back_with_their_world(
     stands = program == "shown" and orientation > 4
     width, height = STORED_PX[::-1] if stands else STORED_PX
     np.savez(tmp_path / "c.npz", intrinsic=LYING, width=width, height=height)
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 128 72 90 91 63 35\n")
-    (tmp_path / "images.txt").write_text("1 0.5 -0.5 0.5 0.5 0.1 0.2 0.3 1 0.png\n\n")
-    track = upright_cameras(tmp_path if program == "colmap" else tmp_path / "c.npz", source)
+    (tmp_path / "cameras.txt").write_text_atomically("1 PINHOLE 128 72 90 91 63 35\n")
+    (tmp_path / "images.txt").write_text_atomically("1 0.5 -0.5 0.5 0.5 0.1 0.2 0.3 1 0.png\n\n")
+    track = read_upright_cameras(tmp_path if program == "colmap" else tmp_path / "c.npz", source)
     camera = track.cameras[0]
     assert np.linalg.det(camera.camera_from_world) == pytest.approx(1.0)
     assert camera.size_px == source.size_px
@@ -239,7 +239,7 @@ def test_cameras_of_mirrored_photographs_are_mirrored_back_with_their_world(
         return
     named = tmp_path if program == "colmap" else tmp_path / "c.npz"
     stored = read_cameras(named, STORED_PX, source if program == "colmap" else None).cameras[0]
-    there = stored.center_world + 3.0 * stored.directions(np.array([100.5, 50.5]))
+    there = stored.center_world + 3.0 * stored.ray_directions(np.array([100.5, 50.5]))
     mirrored_back = there * np.array([-1.0, 1.0, 1.0])
     np.testing.assert_allclose(camera.project(mirrored_back), [x + 0.5, y + 0.5], atol=1e-6)
     assert "mirrored with the pictures" in track.note

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
-from capture.pace import Pace
-from preprocess.growing_poses import GrowingPoses
-from preprocess.masks.growing import GrowingMasks
+from capture.pace import PacingClock
+from preprocess.growing_poses import LivePoses
+from preprocess.masks.growing import LiveMasks
 from preprocess.pose import Motion
 from preprocess.pose_file import read_motion, write_motion
 
@@ -35,8 +35,8 @@ def frame(index, *, time_s=0.0, name=None):
 
 
 def poses(path, *, patience_s=0.1, started_at=0.0):
-    return GrowingPoses(
-        path, Pace(), default_model="body24", first_within_s=0.2, patience_s=patience_s,
+    return LivePoses(
+        path, PacingClock(), default_model="body24", first_within_s=0.2, patience_s=patience_s,
         started_at=started_at,
     )  # fmt: skip
 
@@ -55,9 +55,9 @@ def test_a_pose_that_comes_later_is_waited_for(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(2))
     growing = poses(path, patience_s=10.0)
-    assert [row(growing.of(frame(index))) for index in (0, 1)] == [0, 1]
+    assert [row(growing.wait_for_pose(frame(index))) for index in (0, 1)] == [0, 1]
     thread = later(lambda: write_motion(path, moving(4)))
-    assert row(growing.of(frame(3))) == 3
+    assert row(growing.wait_for_pose(frame(3))) == 3
     assert len(growing.motion) == 4
     thread.join()
 
@@ -66,24 +66,24 @@ def test_degrees_are_refused_at_once_and_one_bad_pose_is_left_out(tmp_path):
     path, bent = tmp_path / "poses.npz", np.zeros((3, 23, 3))
     bent[:, 4, 0] = 60.0
     write_motion(path, moving(3, joint_rotations=bent))
-    with pytest.raises(BadInput, match="degrees given"):
-        GrowingPoses(path, Pace(), default_model="body24", first_within_s=3600.0)
+    with pytest.raises(InputError, match="degrees given"):
+        LivePoses(path, PacingClock(), default_model="body24", first_within_s=3600.0)
     bent[:2] = 0.0
     write_motion(path, moving(3, joint_rotations=bent))
     growing = poses(path)
-    assert row(growing.of(frame(1))) == 1
-    assert growing.of(frame(2)) == "pose invalid"
+    assert row(growing.wait_for_pose(frame(1))) == 1
+    assert growing.wait_for_pose(frame(2)) == "pose invalid"
 
 
 def test_a_pose_that_does_not_come_costs_its_frame_and_no_more(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(1))
     growing, began = poses(path), time.perf_counter()
-    assert growing.of(frame(1)) == "no pose within 0.1 s"
+    assert growing.wait_for_pose(frame(1)) == "no pose within 0.1 s"
     assert 0.1 <= time.perf_counter() - began < 2.0
     old = Frame(index=2, time_s=0.0, rgb=frame(0).rgb, due_s=time.perf_counter() - 60.0)
     began = time.perf_counter()
-    assert growing.of(old) == "no pose within 0.1 s"
+    assert growing.wait_for_pose(old) == "no pose within 0.1 s"
     assert time.perf_counter() - began < 0.1  # it has waited long enough elsewhere
 
 
@@ -94,7 +94,7 @@ def test_a_pose_that_does_not_come_costs_its_frame_and_no_more(tmp_path):
 )  # fmt: skip
 def test_what_will_never_come_is_not_waited_for(tmp_path, keys, index, expected):
     write_motion(tmp_path / "poses.npz", moving(2, **keys))
-    found = poses(tmp_path / "poses.npz", patience_s=3600.0).of(frame(index))
+    found = poses(tmp_path / "poses.npz", patience_s=3600.0).wait_for_pose(frame(index))
     assert (found if isinstance(found, str) else row(found)) == expected
 
 
@@ -104,9 +104,9 @@ def test_poses_belong_to_the_frames_of_their_time(tmp_path, epoch):
     times = epoch + np.array([0.0, 0.1, 0.3])
     write_motion(tmp_path / "poses.npz", moving(3, times_s=times))
     growing = poses(tmp_path / "poses.npz", started_at=epoch)
-    assert row(growing.of(frame(7, time_s=0.105))) == 1
-    assert growing.of(frame(8, time_s=0.2)) == "no pose"
-    assert growing.of(frame(9, time_s=0.4)) == "no pose within 0.1 s"
+    assert row(growing.wait_for_pose(frame(7, time_s=0.105))) == 1
+    assert growing.wait_for_pose(frame(8, time_s=0.2)) == "no pose"
+    assert growing.wait_for_pose(frame(9, time_s=0.4)) == "no pose within 0.1 s"
 
 
 def test_a_half_written_file_is_read_at_the_next_look(tmp_path):
@@ -115,21 +115,21 @@ def test_a_half_written_file_is_read_at_the_next_look(tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     thread = later(lambda: path.write_bytes(whole))
-    growing = GrowingPoses(path, Pace(), default_model="body24", first_within_s=10.0)
+    growing = LivePoses(path, PacingClock(), default_model="body24", first_within_s=10.0)
     thread.join()
-    assert row(growing.of(frame(2))) == 2
+    assert row(growing.wait_for_pose(frame(2))) == 2
     path.write_bytes(whole[:100])  # the tracker has begun again
-    assert row(growing.of(frame(1))) == 1
+    assert row(growing.wait_for_pose(frame(1))) == 1
 
 
 def test_without_a_first_pose_it_is_said_why(tmp_path):
-    with pytest.raises(BadInput, match="There are no poses"):
+    with pytest.raises(InputError, match="There are no poses"):
         poses(tmp_path / "none.npz")
     write_motion(tmp_path / "lost.npz", moving(2, valid=np.zeros(2, dtype=bool)))
-    with pytest.raises(BadInput, match="first valid pose was expected"):
+    with pytest.raises(InputError, match="first valid pose was expected"):
         poses(tmp_path / "lost.npz")
     (tmp_path / "bad.npz").write_bytes(b"no archive")
-    with pytest.raises(BadInput, match=r"bad\.npz is no readable"):
+    with pytest.raises(InputError, match=r"bad\.npz is no readable"):
         poses(tmp_path / "bad.npz")
 
 
@@ -139,20 +139,20 @@ def test_lines_of_json_hold_the_same_poses(tmp_path):
          "transl": [i, 0.0, 2.0], "model": "smpl"} for i in range(3)
     ]  # fmt: skip
     path = tmp_path / "poses.jsonl"
-    path.write_text("\n".join(map(json.dumps, lines)) + '\n{"frame": 9, "global_or')
+    path.write_text_atomically("\n".join(map(json.dumps, lines)) + '\n{"frame": 9, "global_or')
     motion = read_motion(path)
-    assert motion.model == "smpl"
+    assert motion.body_model == "smpl"
     assert motion.frames.tolist() == [0, 3, 6]
     np.testing.assert_allclose(motion.root_translations[:, 0], [0, 1, 2])
     np.testing.assert_allclose(motion.root_rotations[:, 2], [0, 1, 2])
     np.testing.assert_allclose(motion.joint_rotations[2], 0.02)
-    assert row(poses(path).of(frame(6))) == 2
+    assert row(poses(path).wait_for_pose(frame(6))) == 2
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]\n", '{"transl": [0, 0, 0]}\n', "no json\n"])
 def test_lines_that_hold_no_poses_are_refused(tmp_path, text):
-    (tmp_path / "poses.jsonl").write_text(text)
-    with pytest.raises(BadInput, match=r"poses\.jsonl"):
+    (tmp_path / "poses.jsonl").write_text_atomically(text)
+    with pytest.raises(InputError, match=r"poses\.jsonl"):
         read_motion(tmp_path / "poses.jsonl")
 
 
@@ -165,26 +165,26 @@ def write_mask(folder, name, *, inverted=False, shape=(6, 4)):
 
 
 def masks(folder, *, invert=None, patience_s=0.1):
-    return GrowingMasks(folder, Pace(), invert=invert, patience_s=patience_s)
+    return LiveMasks(folder, PacingClock(), invert=invert, patience_s=patience_s)
 
 
 def test_a_mask_belongs_to_the_picture_of_its_name_or_to_its_number(tmp_path):
     write_mask(tmp_path, "shot_17")
     growing = masks(tmp_path)
-    by_name = growing.of(frame(3, name="shot_17"), (4, 6))
-    by_number = growing.of(frame(17), (4, 6))
+    by_name = growing.wait_for_mask(frame(3, name="shot_17"), (4, 6))
+    by_number = growing.wait_for_mask(frame(17), (4, 6))
     np.testing.assert_array_equal(by_name, by_number)
     assert by_name[2, 1] == pytest.approx(200 / 255)
     assert by_name[0, 0] == 0.0
-    with pytest.raises(BadInput, match=r"no mask within 0\.1 s"):
-        growing.of(frame(17, name="shot_18"), (4, 6))
+    with pytest.raises(InputError, match=r"no mask within 0\.1 s"):
+        growing.wait_for_mask(frame(17, name="shot_18"), (4, 6))
 
 
 def test_a_mask_that_comes_later_and_half_at_first_is_waited_for(tmp_path):
     whole = write_mask(tmp_path, "0")
     (tmp_path / "0.png").write_bytes(whole[:40])
     thread = later(lambda: write_mask(tmp_path, "0"))
-    assert masks(tmp_path, patience_s=10.0).of(frame(0, name="0"), (4, 6)).max() > 0.7
+    assert masks(tmp_path, patience_s=10.0).wait_for_mask(frame(0, name="0"), (4, 6)).max() > 0.7
     thread.join()
 
 
@@ -193,18 +193,18 @@ def test_which_side_is_the_person_is_what_most_masks_show_so_far(tmp_path):
     for number, inverted in enumerate([True, False, False, False, True]):
         write_mask(tmp_path, str(number), inverted=inverted)
     growing = masks(tmp_path, patience_s=60.0)
-    assert growing.of(frame(0, name="0"), (4, 6))[0, 0] == 0.0
-    with pytest.raises(BadInput, match=r"1\.png is the other way round"):  # one against one
-        growing.of(frame(1, name="1"), (4, 6))
+    assert growing.wait_for_mask(frame(0, name="0"), (4, 6))[0, 0] == 0.0
+    with pytest.raises(InputError, match=r"1\.png is the other way round"):  # one against one
+        growing.wait_for_mask(frame(1, name="1"), (4, 6))
     for number in (2, 3):
-        assert growing.of(frame(number, name=str(number)), (4, 6))[0, 0] == 0.0
-    with pytest.raises(BadInput, match=r"4\.png is the other way round"):
-        growing.of(frame(4, name="4"), (4, 6))
+        assert growing.wait_for_mask(frame(number, name=str(number)), (4, 6))[0, 0] == 0.0
+    with pytest.raises(InputError, match=r"4\.png is the other way round"):
+        growing.wait_for_mask(frame(4, name="4"), (4, 6))
     said = masks(tmp_path, invert=True)
-    assert said.of(frame(1, name="1"), (4, 6))[0, 0] == 1.0  # as was said, whatever it shows
+    assert said.wait_for_mask(frame(1, name="1"), (4, 6))[0, 0] == 1.0  # as was said, whatever it shows
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     write_mask(tmp_path, "0", shape=(4, 6))
-    with pytest.raises(BadInput, match="6x4 px, its picture 4x6"):
-        masks(tmp_path).of(frame(0, name="0"), (4, 6))
+    with pytest.raises(InputError, match="6x4 px, its picture 4x6"):
+        masks(tmp_path).wait_for_mask(frame(0, name="0"), (4, 6))

@@ -5,7 +5,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess import npz
 from preprocess.npz import read_npz
 
@@ -21,7 +21,7 @@ def test_all_keys_or_those_that_are_wanted_and_there(tmp_path):
 
 def test_pickled_objects_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.array([{}]))
-    with pytest.raises(BadInput, match="pickled objects"):
+    with pytest.raises(InputError, match="pickled objects"):
         read_npz(tmp_path / "a.npz")
 
 
@@ -30,7 +30,7 @@ def test_an_archive_that_unpacks_to_too_much_is_not_unpacked(tmp_path, monkeypat
     np.savez_compressed(path, a=np.zeros(100_000))
     assert path.stat().st_size < 10_000
     monkeypatch.setattr(npz, "MAX_BYTES", 10_000)
-    with pytest.raises(BadInput, match="are not read"):
+    with pytest.raises(InputError, match="are not read"):
         read_npz(path)
 
 
@@ -40,7 +40,7 @@ def test_every_cut_of_an_archive_is_refused(tmp_path):
     whole = path.read_bytes()
     for kept in range(0, len(whole), 37):
         path.write_bytes(whole[:kept])
-        with pytest.raises(BadInput):
+        with pytest.raises(InputError):
             read_npz(path)
 
 
@@ -50,7 +50,7 @@ def test_flipped_bytes_in_an_array_are_noticed(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
-    with pytest.raises(BadInput, match="Is the file complete"):
+    with pytest.raises(InputError, match="Is the file complete"):
         read_npz(path)
 
 

@@ -1,4 +1,4 @@
-"""Frames, poses, masks and cameras joined, or refused for a reason."""
+"""EvaluationFrames, poses, masks and cameras joined, or refused for a reason."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
 from capture.quiet import silence_opencv
-from preprocess.camera_file import CameraTrack, default_cameras
+from preprocess.camera_file import CameraTrack, assume_static_camera
 from preprocess.masks.files import open_masks
 from preprocess.observation import Observation
-from preprocess.observe import Dropped, check_motion, observe, shrunk
+from preprocess.observe import DroppedFrame, associate_poses, observe, shrink_to_longer_side
 from preprocess.pose import Motion
 
 SIZE = (48, 64)
@@ -52,7 +52,7 @@ def parts(images):
     def parts(frames=None):
         source = open_source(images / "images", frames=frames)
         masks = open_masks(images / "masks")
-        return source, masks, default_cameras(moving(1), source.size_px)
+        return source, masks, assume_static_camera(moving(1), source.size_px)
 
     return parts
 
@@ -89,7 +89,7 @@ def test_pictures_masks_and_cameras_shrink_together_and_never_grow(parts):
     [((1920, 1080), 640, (640, 360)), ((1080, 1920), 270, (152, 270)), ((9, 9), None, (9, 9))],
 )
 def test_the_longer_side_is_the_dial(size, longer, expected):
-    assert shrunk(size, longer) == expected
+    assert shrink_to_longer_side(size, longer) == expected
 
 
 @pytest.mark.parametrize("rows", [COUNT, 3])
@@ -106,7 +106,7 @@ def test_rows_belong_to_the_frames_that_they_name(parts):
     motion = moving(5, frames=np.array([7, 5, 3, 1, 100]))
     results = list(observe(source, motion, masks, cameras))
     assert rows_of(r for r in results if isinstance(r, Observation)) == [3, 2, 1, 0]
-    dropped = [(r.index, r.reason) for r in results if isinstance(r, Dropped)]
+    dropped = [(r.index, r.reason) for r in results if isinstance(r, DroppedFrame)]
     assert dropped == [(0, "no pose"), (2, "no pose"), (4, "no pose"), (6, "no pose")]
 
 
@@ -126,13 +126,13 @@ def test_rows_belong_to_the_frames_of_their_time(parts):
 @pytest.mark.parametrize("rows", [1, COUNT - 1, COUNT + 1])
 def test_more_or_fewer_rows_than_frames_are_refused_with_both_counts(parts, rows):
     source, masks, cameras = parts()
-    with pytest.raises(BadInput, match=rf"{rows} poses, but {COUNT} frames"):
+    with pytest.raises(InputError, match=rf"{rows} poses, but {COUNT} frames"):
         observe(source, moving(rows), masks, cameras)
 
 
 def test_poses_for_other_frames_are_refused(parts):
     source, masks, cameras = parts(slice(4, None))
-    with pytest.raises(BadInput, match="frames 0 to 3"):
+    with pytest.raises(InputError, match="frames 0 to 3"):
         observe(source, moving(4, frames=np.arange(4)), masks, cameras)
 
 
@@ -140,13 +140,13 @@ def test_invalid_poses_are_dropped_and_listed(parts):
     source, masks, cameras = parts()
     valid = np.arange(COUNT) % 2 == 0
     results = list(observe(source, moving(COUNT, valid=valid), masks, cameras))
-    dropped = [(r.index, r.reason) for r in results if isinstance(r, Dropped)]
+    dropped = [(r.index, r.reason) for r in results if isinstance(r, DroppedFrame)]
     assert dropped == [(i, "pose invalid") for i in (1, 3, 5, 7)]
 
 
 def test_more_than_half_of_the_poses_invalid_is_refused_at_once(parts):
     source, masks, cameras = parts()
-    with pytest.raises(BadInput, match=f"Only 3 of {COUNT} poses"):
+    with pytest.raises(InputError, match=f"Only 3 of {COUNT} poses"):
         observe(source, moving(COUNT, valid=np.arange(COUNT) < 3), masks, cameras)
 
 
@@ -157,7 +157,7 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
     source, _, cameras = parts()
     masks = open_masks(images / "masks", invert=False)
     results = list(observe(source, moving(COUNT), masks, cameras))
-    reasons = {r.index: r.reason for r in results if isinstance(r, Dropped)}
+    reasons = {r.index: r.reason for r in results if isinstance(r, DroppedFrame)}
     assert set(reasons) == {3, 5, 6}
     assert "mask unusable" in reasons[3]
     assert reasons[5] == "mask empty"
@@ -166,7 +166,7 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
 
 def test_without_masks_and_a_segmenter_there_is_nothing_to_do(parts):
     source, _, cameras = parts()
-    with pytest.raises(BadInput, match=r"No masks were found.*--masks.*segmenter:grabcut"):
+    with pytest.raises(InputError, match=r"No masks were found.*--masks.*segmenter:grabcut"):
         observe(source, moving(COUNT), None, cameras)
 
 
@@ -176,7 +176,7 @@ def test_the_alpha_channel_of_the_pictures_serves_as_mask(tmp_path):
     for index in range(2):
         cv2.imwrite(str(tmp_path / f"{index}.png"), rgba)
     source = open_source(tmp_path)
-    cameras = default_cameras(moving(1), source.size_px)
+    cameras = assume_static_camera(moving(1), source.size_px)
     first, _ = observe(source, moving(2), None, cameras, size_px=32)
     np.testing.assert_allclose(first.alpha[8:24, 8:16], 128 / 255, atol=0.5 / 255)
     assert first.frame.alpha.shape == first.alpha.shape
@@ -186,10 +186,10 @@ def test_masks_must_be_one_per_frame_and_of_the_frames_shape(parts, images):
     source, _, cameras = parts()
     stack = [open_masks(images / "masks").alpha(row, source.size_px) for row in range(7)]
     np.savez(images / "short.npz", np.stack(stack))
-    with pytest.raises(BadInput, match=rf"7 masks in .* {COUNT} frames"):
+    with pytest.raises(InputError, match=rf"7 masks in .* {COUNT} frames"):
         observe(source, moving(COUNT), open_masks(images / "short.npz"), cameras)
     np.savez(images / "turned.npz", np.rot90(cv2.imread(str(images / "masks/0.png"))[..., 0])[None])
-    with pytest.raises(BadInput, match="64x48 px, the frames 48x64"):
+    with pytest.raises(InputError, match="64x48 px, the frames 48x64"):
         observe(source, moving(COUNT), open_masks(images / "turned.npz"), cameras)
 
 
@@ -198,7 +198,7 @@ def test_frames_whose_mask_is_missing_are_left_out_where_names_tell(parts, image
         (images / "masks" / f"{number}.png").unlink()
     source, masks, cameras = parts()
     results = list(observe(source, moving(COUNT), masks, cameras))
-    reasons = {r.index: r.reason for r in results if isinstance(r, Dropped)}
+    reasons = {r.index: r.reason for r in results if isinstance(r, DroppedFrame)}
     assert set(reasons) == {2, 7}
     assert "holds none for frame 2" in reasons[2]
     seen = {r.frame.index: r.alpha.max() for r in results if isinstance(r, Observation)}
@@ -210,10 +210,10 @@ def test_masks_that_are_turned_among_others_are_left_out_and_obeyed_where_told(p
     cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     source, masks, cameras = parts()
     results = list(observe(source, moving(COUNT), masks, cameras))
-    assert [r.index for r in results if isinstance(r, Dropped)] == [4]
+    assert [r.index for r in results if isinstance(r, DroppedFrame)] == [4]
     assert "wrong way round" in results[4].reason
     told = open_masks(images / "masks", invert=False)
-    assert not any(isinstance(r, Dropped) for r in observe(source, moving(COUNT), told, cameras))
+    assert not any(isinstance(r, DroppedFrame) for r in observe(source, moving(COUNT), told, cameras))
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1000.0, 0.0), (1.0, 1.7e9), (1e-3, 0.0)])
@@ -221,7 +221,7 @@ def test_times_by_another_clock_are_refused_and_never_taken_for_the_nearest(part
     source, masks, cameras = parts(frames=slice(0, None))
     times = np.arange(20) / 30 * scale + shift
     motion = moving(20, times_s=times)
-    with pytest.raises(BadInput, match=r"frames of .* those of 0 to 0.267 s; .*milliseconds"):
+    with pytest.raises(InputError, match=r"frames of .* those of 0 to 0.267 s; .*milliseconds"):
         observe(source, motion, masks, cameras)
 
 
@@ -232,7 +232,7 @@ def test_moving_cameras_follow_their_frames(parts):
     observations = list(observe(source, moving(COUNT), masks, moving_track))
     assert [o.camera.focal_px[0] for o in observations] == [102.0, 104.0, 106.0]
     short = CameraTrack(cameras=track[:5], source="cameras.npz")
-    with pytest.raises(BadInput, match=r"5 cameras in cameras\.npz"):
+    with pytest.raises(InputError, match=r"5 cameras in cameras\.npz"):
         observe(source, moving(COUNT), masks, short)
 
 
@@ -254,10 +254,10 @@ def test_a_truncated_video_is_used_as_far_as_it_goes(tmp_path):
     mask[16:48, 16:32] = 255
     for index in range(30):
         cv2.imwrite(str(tmp_path / "masks" / f"{index:03}.png"), mask)
-    masks, cameras = open_masks(tmp_path / "masks"), default_cameras(moving(1), source.size_px)
+    masks, cameras = open_masks(tmp_path / "masks"), assume_static_camera(moving(1), source.size_px)
     for rows in (30, there):
         observations = list(observe(source, moving(rows), masks, cameras))
         assert rows_of(observations) == list(range(there))
     assert f"only {there} of 30 frames" in source.warnings[0]
-    with pytest.raises(BadInput, match=f"{there - 1} poses, but {there} frames"):
-        check_motion(moving(there - 1), source)
+    with pytest.raises(InputError, match=f"{there - 1} poses, but {there} frames"):
+        associate_poses(moving(there - 1), source)

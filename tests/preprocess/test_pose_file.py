@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.pose_file import read_motion, write_motion
 from preprocess.poses import read_poses
 
@@ -49,7 +49,7 @@ def test_what_is_written_is_read(tmp_path, motion):
         frames=np.array([0, 2, 4, 7, 8, 9]),
         times_s=np.arange(6) / 25,
         intrinsic=np.diag([500.0, 510.0, 1.0]),
-        model="smpl",
+        body_model="smpl",
     )
     for number, wanted in enumerate((motion, rich)):
         path = tmp_path / f"{number}.npz"
@@ -61,7 +61,7 @@ def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
     """Also their cameras: a file with one of six would not be read."""
     cameras = np.tile(np.eye(4), (6, 1, 1))
     cameras[:, 0, 3] = np.arange(6)
-    whole = replace(motion, camera_from_world=cameras, bridged=np.arange(6) == 4)
+    whole = replace(motion, camera_from_world=cameras, interpolated=np.arange(6) == 4)
     some = whole.taken(np.array([4, 2]), np.array([10, 11]))
     write_motion(tmp_path / "some.npz", some)
     again = read_motion(tmp_path / "some.npz")
@@ -87,9 +87,9 @@ def test_betas_of_one_row_many_rows_or_none(write, motion):
 
 
 def test_the_model_is_what_the_file_says_or_else_the_readers(write):
-    assert read_motion(write()).model == "body24"
-    assert read_motion(write(), default_model="smpl").model == "smpl"
-    assert read_motion(write(model=np.array("smpl"))).model == "smpl"
+    assert read_motion(write()).body_model == "body24"
+    assert read_motion(write(), default_model="smpl").body_model == "smpl"
+    assert read_motion(write(model=np.array("smpl"))).body_model == "smpl"
 
 
 def test_rows_with_nan_or_marked_as_lost_are_not_valid(write, motion):
@@ -124,12 +124,12 @@ def test_a_camera_matrix_per_row_becomes_their_median(write):
     ],
 )
 def test_what_is_no_motion_is_refused_by_name(write, changes, message):
-    with pytest.raises(BadInput, match=message):
+    with pytest.raises(InputError, match=message):
         read_motion(write(**changes))
 
 
 def test_no_rows_are_no_motion(write):
-    with pytest.raises(BadInput):
+    with pytest.raises(InputError):
         read_motion(
             write(
                 global_orient=np.zeros((0, 3)),
@@ -140,13 +140,13 @@ def test_no_rows_are_no_motion(write):
 
 
 def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         read_motion(tmp_path / "poses.npz")
     (tmp_path / "poses.npz").write_bytes(b"PK\x03\x04 and no more")
-    with pytest.raises(BadInput, match="readable"):
+    with pytest.raises(InputError, match="readable"):
         read_motion(tmp_path / "poses.npz")
     (tmp_path / "poses.pkl").write_bytes(b"")
-    with pytest.raises(BadInput, match=r"\.npz"):
+    with pytest.raises(InputError, match=r"\.npz"):
         read_motion(tmp_path / "poses.pkl")
 
 

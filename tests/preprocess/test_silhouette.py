@@ -7,7 +7,7 @@ import pytest
 from capture.camera import Camera
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import BodyPose
-from preprocess.silhouette import SkinPoints, agreement, silhouette
+from preprocess.silhouette import SkinPoints, soft_iou, splat_silhouette
 
 
 @pytest.fixture(scope="module")
@@ -50,34 +50,34 @@ def test_points_move_with_the_skin(skin, shaped, rng):
 
 
 def test_a_silhouette_is_the_meshs_own(skin, shaped, camera):
-    drawn = silhouette(skin.posed(BodyPose.rest()), camera)
+    drawn = splat_silhouette(skin.posed(BodyPose.rest()), camera)
     exact = np.zeros((128 * 8, 128 * 8), np.uint8)
     pixels = (camera.project(shaped.vertices) * 8).astype(np.int32)
     for face in shaped.body.faces:
         cv2.fillConvexPoly(exact, pixels[face], 1)
     alpha = cv2.resize(exact.astype(np.float32), (128, 128), interpolation=cv2.INTER_AREA)
-    assert agreement(drawn, alpha) > 0.88  # the rim's pixels are drawn whole
-    assert agreement(drawn, (alpha > 0).astype(np.float32)) > 0.95
+    assert soft_iou(drawn, alpha) > 0.88  # the rim's pixels are drawn whole
+    assert soft_iou(drawn, (alpha > 0).astype(np.float32)) > 0.95
 
 
 def test_nothing_is_drawn_of_somebody_behind_the_camera(skin, camera):
     behind = skin.posed(BodyPose.rest()) + np.array([0.0, 0.0, 10.0], dtype=np.float32)
-    assert not silhouette(behind, camera).any()
+    assert not splat_silhouette(behind, camera).any()
 
 
 def test_a_lens_bends_the_silhouette_as_it_bends_points(skin, camera):
     bent = Camera(**{**vars(camera), "distortion": (-0.2, 0.0, 0.0, 0.0)})
     points = skin.posed(BodyPose.rest())
     pixels = bent.project(points.astype(np.float64))
-    drawn = silhouette(points, bent)
+    drawn = splat_silhouette(points, bent)
     assert drawn[tuple(np.floor(pixels[:, ::-1]).astype(int).T)].all()
 
 
 def test_agreement_is_that_of_two_sets(rng):
     a, b = rng.random((40, 40)) > 0.5, rng.random((40, 40)) > 0.5
-    assert agreement(a, b.astype(np.float32)) == pytest.approx((a & b).sum() / (a | b).sum())
-    assert agreement(a, a.astype(np.float32)) == 1.0
-    assert agreement(a & False, np.zeros((40, 40), np.float32)) == 0.0
+    assert soft_iou(a, b.astype(np.float32)) == pytest.approx((a & b).sum() / (a | b).sum())
+    assert soft_iou(a, a.astype(np.float32)) == 1.0
+    assert soft_iou(a & False, np.zeros((40, 40), np.float32)) == 0.0
 
 
 def test_turning_world_and_camera_together_changes_nothing(skin, camera):
@@ -88,7 +88,7 @@ def test_turning_world_and_camera_together_changes_nothing(skin, camera):
         **{**vars(camera), "camera_from_world": camera.camera_from_world @ np.linalg.inv(turn)}
     )
     before, after = (
-        silhouette(points, camera),
-        silhouette((points @ turn[:3, :3].T).astype(np.float32), turned),
+        splat_silhouette(points, camera),
+        splat_silhouette((points @ turn[:3, :3].T).astype(np.float32), turned),
     )
-    assert agreement(before, after.astype(np.float32)) > 0.98
+    assert soft_iou(before, after.astype(np.float32)) > 0.98

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.occupancy import FIRM_DENSITY
+from avatar.occupancy import SOLID_DENSITY
 from avatar.render import render
 
 
@@ -38,7 +38,7 @@ def solid_in(bones_of):
 
     def solid(avatar, pose):
         grid = avatar.occupancy.grid
-        cells = (grid.density > FIRM_DENSITY).nonzero()
+        cells = (grid.density > SOLID_DENSITY).nonzero()
         points = ((cells + 0.5) / grid.cells_per_m + grid.low).numpy()
         matrix = (avatar.rig.weights_at(points) @ bones_of(avatar.rig, pose).numpy()).reshape(
             -1, 3, 4

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.cells import WarpCells
+from avatar.cells import CorrespondenceGrid
 from avatar.config import TrainConfig
-from avatar.paper.grids import DECAY, FrameGrids, UnionGrid, occupied_by
+from avatar.paper.grids import GRID_DECAY, PerFrameGrids, SequenceGrid, threshold_and_dilate
 from avatar.paper.posed_field import PosedField
-from avatar.paper.warp import CellWarp, Warped
-from avatar.render import cell_tables
+from avatar.paper.warp import CorrespondenceWarp, CanonicalPoints
+from avatar.render import correspondence_tables
 from avatar.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -27,10 +27,10 @@ def holds(grid, slot, points):
 def test_a_full_cell_fills_its_neighbours_and_nothing_else():
     density = torch.zeros(9, 9, 9)
     density[4, 4, 4] = 100.0
-    occupied = occupied_by(density)
+    occupied = threshold_and_dilate(density)
     assert int(occupied.sum()) == 27
     assert occupied[3:6, 3:6, 3:6].all()
-    assert int(occupied_by(torch.zeros(9, 9, 9)).sum()) == 0
+    assert int(threshold_and_dilate(torch.zeros(9, 9, 9)).sum()) == 0
 
 
 def test_a_cell_counts_from_a_hundredth_of_opacity_in_a_centimetre_or_the_mean():
@@ -38,35 +38,35 @@ def test_a_cell_counts_from_a_hundredth_of_opacity_in_a_centimetre_or_the_mean()
     density[4, 4, 4] = 0.0
     alone = density.clone()
     alone[3:6, 3:6, 3:6] = 0.99  # opacity 0.00985
-    assert not occupied_by(alone)[4, 4, 4]
+    assert not threshold_and_dilate(alone)[4, 4, 4]
     alone[3:6, 3:6, 3:6] = 1.02
-    assert occupied_by(alone)[4, 4, 4]
+    assert threshold_and_dilate(alone)[4, 4, 4]
     faint = torch.zeros(9, 9, 9)  # here the mean is the bar
     faint[4, 4, 4] = 0.5
-    assert int(occupied_by(faint).sum()) == 27
+    assert int(threshold_and_dilate(faint).sum()) == 27
 
 
 def test_the_union_holds_what_every_frame_holds(learnt, avatar, generator, solid_in):
     replay = learnt.trainer.replay
-    field = PosedField(avatar.field, CellWarp(avatar.field, avatar.occupancy))
-    union = UnionGrid(avatar.rig, field, every=16, device=CPU)
+    field = PosedField(avatar.field, CorrespondenceWarp(avatar.field, avatar.occupancy))
+    union = SequenceGrid(avatar.rig, field, interval=16, device=CPU)
     for slot in range(len(replay)):
         union.probe(slot, replay.cells, generator)
-    frames = FrameGrids(field, 1, CPU)
+    frames = PerFrameGrids(field, 1, CPU)
     assert 0.01 < float(union.occupied.float().mean()) < 0.2
     for slot in range(0, len(replay), 5):
         solid = solid_in(avatar, learnt.trainer.poses.pose(slot))
-        assert holds(union.grid(replay.cells), slot, solid) > 0.999
+        assert holds(union.posed_occupancy(replay.cells), slot, solid) > 0.999
         rotations = learnt.trainer.poses.pose(slot).joint_rotations
-        tables = cell_tables(WarpCells.of(avatar.rig, rotations), CPU)
-        frames.admit(0, tables)
+        tables = correspondence_tables(CorrespondenceGrid.solve(avatar.rig, rotations), CPU)
+        frames.add_frame(0, tables)
         for _ in range(5):
             frames.probe(0, tables, generator)
-        assert holds(frames.grid(tables), 0, solid) > 0.999
+        assert holds(frames.posed_occupancy(tables), 0, solid) > 0.999
         # every point of the frame's own grid is in the union, give or take a coarse cell's width
         cell = frames.occupied[0].nonzero() + 0.5
-        centers = cell / frames.grid(tables).cells_per_m[0] + tables.low[0]
-        assert holds(union.grid(replay.cells), slot, centers) > 0.98
+        centers = cell / frames.posed_occupancy(tables).cells_per_m[0] + tables.low[0]
+        assert holds(union.posed_occupancy(replay.cells), slot, centers) > 0.98
 
 
 class Nowhere:
@@ -74,7 +74,7 @@ class Nowhere:
 
     def __call__(self, points, slots, cells):
         found = torch.ones(len(points), dtype=torch.bool)
-        return Warped(points, torch.zeros(len(points), dtype=torch.int32), found)
+        return CanonicalPoints(points, torch.zeros(len(points), dtype=torch.int32), found)
 
     def admit(self, slot, bones):
         pass
@@ -102,14 +102,14 @@ def of_slot(frames, slot):
 
 def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, generator):
     cells, (field, thicken) = learnt.trainer.replay.cells, fog
-    frames = FrameGrids(field, 1, CPU)
-    frames.admit(0, cells)
+    frames = PerFrameGrids(field, 1, CPU)
+    frames.add_frame(0, cells)
     assert frames.occupied.all()  # until it has been probed
     kept = 0.0
     for step, density in ((0, 100.0), (4, 90.0), (8, 1e-6), (12, 1e-6)):
         thicken(density)
         frames.update(step, cells, generator)
-        kept = max(DECAY * kept, density)
+        kept = max(GRID_DECAY * kept, density)
         assert of_slot(frames, 0) == kept
     thicken(100.0)
     frames.update(13, cells, generator)  # not yet its turn
@@ -118,15 +118,15 @@ def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, g
 
 def test_the_frame_whose_grid_is_oldest_is_renewed_first(fog, learnt, generator):
     cells, (field, thicken) = learnt.trainer.replay.cells, fog
-    frames = FrameGrids(field, 3, CPU)
+    frames = PerFrameGrids(field, 3, CPU)
     for slot in (0, 1, 2):
-        frames.admit(slot, cells)
+        frames.add_frame(slot, cells)
     thicken(1.0)
     for step in (0, 4, 8):
         frames.update(step, cells, generator)
     assert [of_slot(frames, slot) for slot in range(3)] == [1.0, 1.0, 1.0]
     thicken(5.0)
-    frames.admit(1, cells)  # another frame took the slot: it is new
+    frames.add_frame(1, cells)  # another frame took the slot: it is new
     assert frames.occupied[1].all()
     frames.update(12, cells, generator)
     assert [of_slot(frames, slot) for slot in range(3)] == [1.0, 5.0, 1.0]
@@ -134,12 +134,12 @@ def test_the_frame_whose_grid_is_oldest_is_renewed_first(fog, learnt, generator)
 
 def test_empty_points_are_empty_in_the_pose_that_was_probed(learnt, avatar, generator):
     """What a grid calls empty has hardly any density, and is drawn from all over the band."""
-    warp = CellWarp(avatar.field, avatar.occupancy)
-    union = UnionGrid(avatar.rig, PosedField(avatar.field, warp), every=16, device=CPU)
-    assert len(union.empty_points(10, generator)) == 0
+    warp = CorrespondenceWarp(avatar.field, avatar.occupancy)
+    union = SequenceGrid(avatar.rig, PosedField(avatar.field, warp), interval=16, device=CPU)
+    assert len(union.sample_empty(10, generator)) == 0
     for slot in range(4):
         union.probe(slot, learnt.trainer.replay.cells, generator)
-    empty = union.empty_points(2000, generator)
+    empty = union.sample_empty(2000, generator)
     assert len(empty) == 2000
     density = torch.exp(avatar.field.raw_at(empty)[:, 3])
     assert float(density.max()) < 1.5

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.hold import HeldOut, compared
-from avatar.paper.variants import rendering
+from avatar.hold import HeldOutFrame, score_rendering
+from avatar.paper.variants import render_sampler
 from avatar.render import render
 
 CPU = torch.device("cpu")
@@ -20,10 +20,10 @@ CPU = torch.device("cpu")
     ],
 )
 def test_every_scheme_draws_the_same_picture(avatar, novel, skipping, roots, least_db):
-    """Cells are exact to a millimetre; a step of 15 mm through a coarse field leaves the rest."""
+    """SolvedCorrespondences are exact to a millimetre; a step of 15 mm through a coarse field leaves the rest."""
     ours, seen, cells = novel
-    along = rendering(avatar, seen.pose, cells, skipping=skipping, roots=roots)
-    theirs = render(avatar, seen.pose, seen.camera, cells=cells, samples_along=along)
+    along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots=roots)
+    theirs = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
     assert theirs[..., 3].max() > 0.99
     assert -10.0 * np.log10(np.mean((ours - theirs) ** 2) + 1e-12) > least_db
 
@@ -33,21 +33,21 @@ def test_the_pictures_of_broyden_do_not_change_with_the_grid(avatar, novel):
     _, seen, cells = novel
     pictures = []
     for skipping in ("frame", "none"):
-        along = rendering(avatar, seen.pose, cells, skipping=skipping, roots="broyden")
-        pictures.append(render(avatar, seen.pose, seen.camera, cells=cells, samples_along=along))
+        along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots="broyden")
+        pictures.append(render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along))
     assert -10.0 * np.log10(np.mean((pictures[0] - pictures[1]) ** 2) + 1e-12) > 35.0
 
 
 def test_the_paper_s_way_of_rendering_scores_as_ours_does(avatar, novel):
     ours, seen, cells = novel
-    along = rendering(avatar, seen.pose, cells, skipping="frame")
-    theirs = render(avatar, seen.pose, seen.camera, cells=cells, samples_along=along)
-    held = HeldOut(observation=seen)
-    assert compared(theirs, held).psnr == pytest.approx(compared(ours, held).psnr, abs=0.3)
+    along = render_sampler(avatar, seen.pose, cells, skipping="frame")
+    theirs = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
+    held = HeldOutFrame(observation=seen)
+    assert score_rendering(theirs, held).psnr == pytest.approx(score_rendering(ours, held).psnr, abs=0.3)
 
 
 def test_our_own_scheme_is_the_renderer_s_and_a_union_is_refused(avatar, novel):
     _, seen, cells = novel
-    assert rendering(avatar, seen.pose, cells, skipping="canonical") is None
+    assert render_sampler(avatar, seen.pose, cells, skipping="canonical") is None
     with pytest.raises(ValueError, match="skipping='frame'"):
-        rendering(avatar, seen.pose, cells, skipping="union")
+        render_sampler(avatar, seen.pose, cells, skipping="union")

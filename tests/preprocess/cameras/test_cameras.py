@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
-from capture.source import Source
+from capture.source import FrameSource
 from preprocess.camera_file import read_cameras
-from preprocess.cameras.door import read_named
+from preprocess.cameras.door import read_named_cameras
 
 SIZE = (640, 480)
 COUNT = 5
@@ -90,11 +90,11 @@ def colmap(tmp_path, cameras):
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp_path):
     folder, model = colmap()
-    model.write_binary(folder) if kind == "binary" else model.write_text(folder)
+    model.write_binary(folder) if kind == "binary" else model.write_text_atomically(folder)
     if version == "3.x":
         for part in ("rigs", "frames"):
             (folder / f"{part}.{'bin' if kind == 'binary' else 'txt'}").unlink()
-    found = read_named(tmp_path)
+    found = read_named_cameras(tmp_path)
     assert [each.name for each in found] == [f"frames/frame_{n:05d}" for n in range(1, COUNT + 1)]
     for number, each in enumerate(found, 1):
         local = model.image(number).cam_from_world() * points
@@ -115,7 +115,7 @@ def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp
 def test_every_lens_that_opencv_has_is_colmaps(colmap, points, kind, params):
     folder, model = colmap(kind, params)
     model.write_binary(folder)
-    camera = read_named(folder)[0].camera
+    camera = read_named_cameras(folder)[0].camera
     local = model.image(1).cam_from_world() * points
     pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
     np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
@@ -124,8 +124,8 @@ def test_every_lens_that_opencv_has_is_colmaps(colmap, points, kind, params):
 def test_a_fisheye_is_refused_with_what_to_do(colmap):
     folder, model = colmap("OPENCV_FISHEYE", (500.0, 505.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0))
     model.write_binary(folder)
-    with pytest.raises(BadInput, match=r"OPENCV_FISHEYE.*undistort"):
-        read_named(folder)
+    with pytest.raises(InputError, match=r"OPENCV_FISHEYE.*undistort"):
+        read_named_cameras(folder)
 
 
 def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
@@ -139,9 +139,9 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
             for n, camera in reversed(list(enumerate(cameras, 1)))
         ],
     }  # fmt: skip
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
     for path in (tmp_path, tmp_path / "transforms.json"):
-        found = read_named(path)
+        found = read_named_cameras(path)
         names = [f"images/frame_{n:05d}" for n in range(1, COUNT + 1)]
         assert [each.name for each in found] == names
         for each, camera in zip(found, cameras, strict=True):
@@ -152,13 +152,13 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
 def test_a_frame_may_have_a_lens_of_its_own_or_an_angle_of_view(cameras, tmp_path):
     frame = {"file_path": "a_1.png", "transform_matrix": opengl_pose(cameras[0]).tolist()}
     content = {"w": 640, "h": 480, "camera_angle_x": 2 * np.arctan(0.5), "frames": [frame]}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    camera = read_named(tmp_path)[0].camera
+    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
+    camera = read_named_cameras(tmp_path)[0].camera
     assert camera.focal_px == pytest.approx((640.0, 640.0))
     assert camera.center_px == (320.0, 240.0)
     frame |= {"fl_x": 300.0, "fl_y": 301.0, "cx": 1.0, "cy": 2.0}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    assert read_named(tmp_path)[0].camera.focal_px == (300.0, 301.0)
+    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
+    assert read_named_cameras(tmp_path)[0].camera.focal_px == (300.0, 301.0)
 
 
 def test_record3d_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
@@ -168,11 +168,11 @@ def test_record3d_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
     ]
     columns = [500.0, 0, 0, 0, 505.0, 0, 318.5, 243.0, 1.0]
     content = {"poses": poses, "K": columns, "w": 640, "h": 480, "fps": 60, "dw": 192, "dh": 256}
-    (tmp_path / "metadata").write_text(json.dumps(content))
+    (tmp_path / "metadata").write_text_atomically(json.dumps(content))
     with zipfile.ZipFile(tmp_path / "walk.r3d", "w") as archive:
         archive.writestr("metadata", json.dumps(content))
     for path in (tmp_path, tmp_path / "metadata", tmp_path / "walk.r3d"):
-        for each, camera in zip(read_named(path), cameras, strict=True):
+        for each, camera in zip(read_named_cameras(path), cameras, strict=True):
             wanted = seen(opengl_pose(camera), camera, points)
             np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
 
@@ -185,8 +185,8 @@ def test_polycam_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
         numbers = {f"t_{r}{c}": matrix[r, c] for r in range(3) for c in range(4)}
         numbers |= {"fx": 500.0, "fy": 505.0, "cx": 318.5, "cy": 243.0}
         numbers |= {"width": 640, "height": 480, "blur_score": 100.0}
-        (folder / f"{98000 + number}.json").write_text(json.dumps(numbers))
-    found = read_named(tmp_path)
+        (folder / f"{98000 + number}.json").write_text_atomically(json.dumps(numbers))
+    found = read_named_cameras(tmp_path)
     assert [each.name for each in found] == [str(98000 + n) for n in range(COUNT)]
     for each, camera in zip(found, cameras, strict=True):
         wanted = seen(opengl_pose(camera), camera, points)
@@ -200,12 +200,12 @@ def transforms(path: Path, cameras: list[Camera], names: list[str]) -> Path:
         for name, camera in zip(names, cameras, strict=True)
     ]
     content = {"w": 640, "h": 480, "fl_x": 500.0, "cx": 318.5, "cy": 243.0, "frames": frames}
-    path.write_text(json.dumps(content))
+    path.write_text_atomically(json.dumps(content))
     return path
 
 
 @pytest.fixture
-def folder(tmp_path) -> Source:
+def folder(tmp_path) -> FrameSource:
     """A folder of seven pictures."""
     (tmp_path / "images").mkdir()
     for number in range(7):
@@ -218,7 +218,7 @@ def folder(tmp_path) -> Source:
 def video(tmp_path):
     """A video of so many frames."""
 
-    def make(frames: int) -> Source:
+    def make(frames: int) -> FrameSource:
         path = tmp_path / f"{frames}.avi"
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (32, 24))
         for _ in range(frames):
@@ -234,7 +234,7 @@ def test_cameras_find_their_pictures_by_name(cameras, folder, tmp_path):
     path = transforms(tmp_path / "transforms.json", cameras, names)
     track = read_cameras(path, SIZE, folder)
     assert len(track.cameras) == 7
-    assert track.missing == {6}
+    assert track.frames_without_camera == {6}
     for frame, camera in zip((0, 1, 3, 4, 5), cameras, strict=True):
         np.testing.assert_allclose(track[frame].camera_from_world, camera.camera_from_world)
     assert "5 have a camera" in (track.note or "")
@@ -266,7 +266,7 @@ def test_consecutive_numbers_of_a_few_frames_say_nothing_about_a_longer_video(
 ):
     names = [f"frame_{n:05d}" for n in range(1, 6)]
     path = transforms(tmp_path / "transforms.json", cameras, names)
-    with pytest.raises(BadInput, match=r"5 cameras.*40 frames"):
+    with pytest.raises(InputError, match=r"5 cameras.*40 frames"):
         read_cameras(path, SIZE, video(40))
     assert len(read_cameras(path, SIZE, video(5)).cameras) == 5
 
@@ -276,7 +276,7 @@ def test_cameras_of_larger_pictures_are_scaled_and_of_other_shapes_refused(camer
     small = read_cameras(path, (320, 240))
     assert small[0].focal_px == (250.0, 250.0)
     assert "scaled" in (small.note or "")
-    with pytest.raises(BadInput, match="same shape"):
+    with pytest.raises(InputError, match="same shape"):
         read_cameras(path, (480, 640))
 
 
@@ -293,9 +293,9 @@ def test_cameras_of_larger_pictures_are_scaled_and_of_other_shapes_refused(camer
     ],
 )
 def test_strange_json_is_refused_with_what_is_wrong(content, words, tmp_path):
-    (tmp_path / "transforms.json").write_text(content)
-    with pytest.raises(BadInput, match=words):
-        read_named(tmp_path)
+    (tmp_path / "transforms.json").write_text_atomically(content)
+    with pytest.raises(InputError, match=words):
+        read_named_cameras(tmp_path)
 
 
 @given(
@@ -312,10 +312,10 @@ def test_strange_json_is_refused_with_what_is_wrong(content, words, tmp_path):
 )  # fmt: skip
 def test_any_json_is_read_or_refused(tmp_path_factory, content):
     path = tmp_path_factory.mktemp("json") / "transforms.json"
-    path.write_text(json.dumps(content))
+    path.write_text_atomically(json.dumps(content))
     try:
-        found = read_named(path)
-    except BadInput:
+        found = read_named_cameras(path)
+    except InputError:
         return
     assert found
     assert all(np.isfinite(each.camera.camera_from_world).all() for each in found)
@@ -326,8 +326,8 @@ def test_a_damaged_colmap_model_is_refused(colmap, rng):
     model.write_binary(folder)
     for size in (0, 7, 100):
         (folder / "images.bin").write_bytes(rng.bytes(size))
-        with pytest.raises(BadInput, match="COLMAP"):
-            read_named(folder)
+        with pytest.raises(InputError, match="COLMAP"):
+            read_named_cameras(folder)
 
 
 def test_counts_that_a_damaged_colmap_model_claims_are_not_believed(colmap):
@@ -337,17 +337,17 @@ def test_counts_that_a_damaged_colmap_model_claims_are_not_believed(colmap):
     huge = (1 << 60).to_bytes(8, "little")
     for part in ("points3D", "frames", "rigs"):  # are not read at all
         (folder / f"{part}.bin").write_bytes(huge)
-    assert len(read_named(folder)) == COUNT
+    assert len(read_named_cameras(folder)) == COUNT
     whole = (folder / "images.bin").read_bytes()
     name_ends = whole.find(b"\0", 8 + 64)
     for damaged in (huge + whole[8:], whole[: name_ends + 1] + huge + whole[name_ends + 9 :]):
         (folder / "images.bin").write_bytes(damaged)
-        with pytest.raises(BadInput, match="cut off"):
-            read_named(folder)
+        with pytest.raises(InputError, match="cut off"):
+            read_named_cameras(folder)
     (folder / "images.bin").write_bytes(whole)
     (folder / "cameras.bin").write_bytes(huge)
-    with pytest.raises(BadInput, match="cut off"):
-        read_named(folder)
+    with pytest.raises(InputError, match="cut off"):
+        read_named_cameras(folder)
 
 
 def test_a_world_that_is_turned_with_its_cameras_looks_the_same(cameras, points, tmp_path):

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
 from preprocess.camera_file import read_cameras
-from preprocess.cameras.door import read_named
+from preprocess.cameras.door import read_named_cameras
 
 POSES = [np.diag([1.0, 1, 1, 1]) + np.outer([0, 0, 1, 0], [0, 0, 0, n]) for n in range(3)]
 
@@ -20,7 +20,7 @@ def written(path: Path, content: dict, names: str = "./train/r_{}") -> Path:
         {"file_path": names.format(n), "transform_matrix": pose.tolist()}
         for n, pose in enumerate(POSES)
     ]
-    path.write_text(json.dumps({**content, "frames": frames}))
+    path.write_text_atomically(json.dumps({**content, "frames": frames}))
     return path
 
 
@@ -30,8 +30,8 @@ def test_an_angle_of_view_alone_is_enough_where_the_pictures_are_known(tmp_path)
         camera = read_cameras(path, (80, 60))[0]
         assert camera.focal_px == pytest.approx((80.0, 80.0))
         assert (camera.center_px, camera.size_px) == ((40.0, 30.0), (80, 60))
-    with pytest.raises(BadInput, match="expected w, h"):
-        read_named(tmp_path)
+    with pytest.raises(InputError, match="expected w, h"):
+        read_named_cameras(tmp_path)
 
 
 @pytest.mark.parametrize(("size", "focal"), [((80, 60), 90.0), ((40, 30), 45.0)])
@@ -46,10 +46,10 @@ def test_a_principal_point_in_the_middle_tells_the_size_that_is_not_stated(tmp_p
 def test_a_fisheye_is_never_read_as_another_lens(tmp_path, said):
     lens = {"w": 80, "h": 60, "fl_x": 90.0, "k1": 0.1}
     path = written(tmp_path / "transforms.json", {**lens, **said})
-    with pytest.raises(BadInput, match=r"(?i)fisheye.*Undistort"):
-        read_named(path)
+    with pytest.raises(InputError, match=r"(?i)fisheye.*Undistort"):
+        read_named_cameras(path)
     path = written(tmp_path / "transforms.json", {**lens, "is_fisheye": False})
-    assert read_named(path)[0].camera.distortion[0] == 0.1
+    assert read_named_cameras(path)[0].camera.distortion[0] == 0.1
 
 
 def test_pictures_of_one_name_in_several_folders_are_told_apart(tmp_path):
@@ -60,7 +60,7 @@ def test_pictures_of_one_name_in_several_folders_are_told_apart(tmp_path):
         for n, pose in enumerate(np.array(POSES) * np.array([1, 1, 1, sign]))
     ]
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({**content, "frames": both}))
+    path.write_text_atomically(json.dumps({**content, "frames": both}))
     for side in ("left", "right", "third"):
         folder = tmp_path / side
         folder.mkdir()
@@ -70,7 +70,7 @@ def test_pictures_of_one_name_in_several_folders_are_told_apart(tmp_path):
         track = read_cameras(path, (80, 60), open_source(tmp_path / side))
         depths = [camera.center_world[2] for camera in track.cameras]
         np.testing.assert_allclose(depths, [0.0, sign, 2.0 * sign])
-    with pytest.raises(BadInput, match=r"images/left, images/right; .*third is none of them"):
+    with pytest.raises(InputError, match=r"images/left, images/right; .*third is none of them"):
         read_cameras(path, (80, 60), open_source(tmp_path / "third"))
 
 
@@ -80,9 +80,9 @@ def test_record3d_has_a_focal_length_for_each_frame(tmp_path):
         "h": 60, "perFrameIntrinsicCoeffs": [[50 + n, 50 + n, 40, 31] for n in range(3)],
     }  # fmt: skip
     path = tmp_path / "metadata"
-    path.write_text(json.dumps(content))
-    assert [each.camera.focal_px[0] for each in read_named(path)] == [50.0, 51.0, 52.0]
-    assert read_named(path)[0].camera.center_px == (40.0, 31.0)
+    path.write_text_atomically(json.dumps(content))
+    assert [each.camera.focal_px[0] for each in read_named_cameras(path)] == [50.0, 51.0, 52.0]
+    assert read_named_cameras(path)[0].camera.center_px == (40.0, 31.0)
     for broken in ([[1, 2]] * 3, "x", [[0, 0, 0, 0]] * 3, None):
-        path.write_text(json.dumps({**content, "perFrameIntrinsicCoeffs": broken}))
-        assert {each.camera.focal_px for each in read_named(path)} == {(50.0, 50.0)}
+        path.write_text_atomically(json.dumps({**content, "perFrameIntrinsicCoeffs": broken}))
+        assert {each.camera.focal_px for each in read_named_cameras(path)} == {(50.0, 50.0)}

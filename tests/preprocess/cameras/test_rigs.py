@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
 from preprocess.camera_file import read_cameras
-from preprocess.cameras.rigs import find_rig, read_rig
+from preprocess.cameras.rigs import find_multi_view_cameras, read_multi_view_camera
 
 NAMES, SIZE = ("01", "02", "B3"), (64, 48)
 BENDS = np.array([[0.1, -0.02, 0.001, 0.002, 0.003]])
@@ -72,14 +72,14 @@ def test_a_folder_of_pictures_takes_the_camera_that_it_is_named_like(studio, cam
     source = open_source(studio / "images" / name)
     for given_as in (studio, studio / "intri.yml", studio / "extri.yml"):
         track = read_cameras(given_as, SIZE, source)
-        assert not track.moves
+        assert not track.is_moving
         assert track[0].size_px == SIZE
         assert same(track[0], cameras[name])
 
 
 def test_a_video_of_another_name_is_told_the_names(studio):
-    with pytest.raises(BadInput, match=r"3 cameras \(01, 02, B3\).*named like none.*Name"):
-        read_rig(studio, studio / "dance.mp4", SIZE)
+    with pytest.raises(InputError, match=r"3 cameras \(01, 02, B3\).*named like none.*Name"):
+        read_multi_view_camera(studio, studio / "dance.mp4", SIZE)
 
 
 def test_one_camera_alone_needs_no_name(studio, cameras):
@@ -87,8 +87,8 @@ def test_one_camera_alone_needs_no_name(studio, cameras):
         text = (studio / file).read_text()
         for name in NAMES[1:]:
             text = text.replace(f"_{name}:", f"_{name}x:")
-        (studio / file).write_text(text.replace("K_02x", "k_").replace("K_B3x", "k_"))
-    assert same(read_rig(studio, None, SIZE), cameras["01"])
+        (studio / file).write_text_atomically(text.replace("K_02x", "k_").replace("K_B3x", "k_"))
+    assert same(read_multi_view_camera(studio, None, SIZE), cameras["01"])
 
 
 def test_zju_mocap_speaks_in_millimetres_and_names_cameras_by_folders(tmp_path, cameras):
@@ -103,9 +103,9 @@ def test_zju_mocap_speaks_in_millimetres_and_names_cameras_by_folders(tmp_path, 
         "ims": [{"ims": [f"Camera_{name}/000000.jpg" for name in cameras]}],
     }
     np.save(path, np.array(content, dtype=object), allow_pickle=True)
-    assert find_rig(tmp_path) == path
+    assert find_multi_view_cameras(tmp_path) == path
     for name, camera in cameras.items():
-        assert same(read_rig(path, tmp_path / f"Camera_{name}", SIZE), camera)
+        assert same(read_multi_view_camera(path, tmp_path / f"Camera_{name}", SIZE), camera)
 
 
 @pytest.mark.parametrize(
@@ -121,9 +121,9 @@ def test_zju_mocap_speaks_in_millimetres_and_names_cameras_by_folders(tmp_path, 
 def test_what_is_wrong_in_a_file_is_said(studio, file, old, new, words):
     text = (studio / file).read_text()
     assert old in text
-    (studio / file).write_text(text.replace(old, new))
-    with pytest.raises(BadInput, match=words):
-        read_rig(studio, studio / "images" / "01", SIZE)
+    (studio / file).write_text_atomically(text.replace(old, new))
+    with pytest.raises(InputError, match=words):
+        read_multi_view_camera(studio, studio / "images" / "01", SIZE)
 
 
 @given(st.binary(max_size=300), st.integers(0, 2000), st.integers(0, 60))
@@ -139,8 +139,8 @@ def test_any_bytes_inside_are_read_or_refused(tmp_path_factory, noise, place, le
     (folder / "intri.yml").write_bytes(cut)
     (folder / "extri.yml").write_bytes(whole)
     try:
-        camera = read_rig(folder, None, SIZE)
-    except BadInput:
+        camera = read_multi_view_camera(folder, None, SIZE)
+    except InputError:
         return
     assert np.isfinite(camera.camera_from_world).all()
 
@@ -151,5 +151,5 @@ def test_a_pickle_that_runs_something_is_refused(tmp_path):
             return print, ("run",)
 
     (tmp_path / "annots.npy").write_bytes(pickle.dumps(Calls()))
-    with pytest.raises(BadInput, match="print"):
-        read_rig(tmp_path / "annots.npy", None, SIZE)
+    with pytest.raises(InputError, match="print"):
+        read_multi_view_camera(tmp_path / "annots.npy", None, SIZE)

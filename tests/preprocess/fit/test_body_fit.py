@@ -9,18 +9,18 @@ from PIL import Image
 from capture.camera import Camera
 from capture.frame import Frame
 from capture.opening import open_source
-from preprocess.body import Body, ShapedBody
-from preprocess.body_file import load_body
+from preprocess.body import BodyModel, ShapedBody
+from preprocess.body_file import load_body_model
 from preprocess.camera_file import CameraTrack
-from preprocess.fit.body_fit import BodyFit, fit_body, fit_to_person
-from preprocess.fit.growing import GrowingFit
-from preprocess.fit.stature import as_tall, height_of
+from preprocess.fit.body_fit import BodyAlignment, align_body, align_to_person
+from preprocess.fit.growing import LiveAlignment
+from preprocess.fit.stature import scale_to_height, body_height_m
 from preprocess.masks.files import open_masks
 from preprocess.observation import Observation
-from preprocess.person_file import read_person, write_person
+from preprocess.person_file import read_shaped_body, write_shaped_body
 from preprocess.pose import Motion
-from preprocess.shape import shaped_for
-from preprocess.silhouette import SkinPoints, silhouette
+from preprocess.shape import shape_for_motion
+from preprocess.silhouette import SkinPoints, splat_silhouette
 
 SIZE = (96, 128)
 FRAMES = 8
@@ -43,13 +43,13 @@ def motion_of(model: str, count: int = FRAMES) -> Motion:
         joint_rotations=0.15 * rng.normal(size=(1, 23, 3)) + 0.1 * waves,
         valid=np.ones(count, dtype=bool),
         betas=np.zeros(10),
-        model=model,
+        body_model=model,
     )
 
 
 @pytest.fixture(scope="module")
-def body() -> Body:
-    return load_body()
+def body() -> BodyModel:
+    return load_body_model()
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def strangers() -> Motion:
 
 @pytest.fixture(scope="module")
 def own(body, strangers) -> ShapedBody:
-    return shaped_for(body, strangers)
+    return shape_for_motion(body, strangers)
 
 
 def film(folder, person: ShapedBody, motion: Motion):
@@ -69,7 +69,7 @@ def film(folder, person: ShapedBody, motion: Motion):
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     for row in range(len(motion)):
-        seen = silhouette(skin.posed(motion[row]), CAMERA)
+        seen = splat_silhouette(skin.posed(motion[row]), CAMERA)
         alpha = (255 * seen).astype(np.uint8)
         rgba = np.dstack([np.full((*alpha.shape, 3), 90 + row, np.uint8), alpha])
         Image.fromarray(rgba).save(folder / "images" / f"{row:02d}.png")
@@ -87,7 +87,7 @@ def taller(person: ShapedBody, factor: float) -> ShapedBody:
     )
 
 
-def pixels_off(fit: BodyFit, person: ShapedBody, motion: Motion) -> float:
+def pixels_off(fit: BodyAlignment, person: ShapedBody, motion: Motion) -> float:
     """How far a joint lands from where the person has it, pixels of 2 cm."""
     return max(
         float(np.abs(
@@ -102,41 +102,41 @@ def test_an_alpha_channel_says_as_much_as_masks(tmp_path, own, strangers):
     person = taller(own, 1.1)
     source, masks = film(tmp_path, person, strangers)
     assert source.has_alpha
-    by_alpha = fit_body(strangers, own, CAMERAS, source, None)
-    by_masks = fit_body(strangers, own, CAMERAS, source, masks)
-    assert by_alpha.refit is not None
-    assert by_alpha.refit.nearer == pytest.approx(1.1, rel=0.02)
+    by_alpha = align_body(strangers, own, CAMERAS, source, None)
+    by_masks = align_body(strangers, own, CAMERAS, source, masks)
+    assert by_alpha.placement is not None
+    assert by_alpha.placement.distance_divisor == pytest.approx(1.1, rel=0.02)
     np.testing.assert_array_equal(
         by_alpha.motion.root_translations, by_masks.motion.root_translations
     )
-    assert by_alpha.words == by_masks.words
+    assert by_alpha.description == by_masks.description
     assert pixels_off(by_alpha, person, strangers) < 1.2
 
 
 def test_without_masks_it_is_said_that_nothing_was_fitted(tmp_path, own, strangers):
     Image.new("RGB", SIZE).save(tmp_path / "0.png")
-    fit = fit_body(strangers, own, CAMERAS, open_source(tmp_path), None)
+    fit = align_body(strangers, own, CAMERAS, open_source(tmp_path), None)
     assert fit.motion is strangers
-    assert "--masks" in fit.words
-    assert "--body" in fit.words
+    assert "--masks" in fit.description
+    assert "--body" in fit.description
 
 
 def test_poses_of_the_bodys_own_are_left_alone(tmp_path, body):
     motion = motion_of("body24")
     source, masks = film(tmp_path, body.with_shape(), motion)
-    fit = fit_body(motion, body.with_shape(), CAMERAS, source, masks)
+    fit = align_body(motion, body.with_shape(), CAMERAS, source, masks)
     assert fit.motion is motion
-    assert not fit.words
+    assert not fit.description
 
 
 # --- a finished avatar's person ------------------------------------------------------------------
 
 
-def betas_of(body: Body, amount: float) -> np.ndarray:
+def betas_of(body: BodyModel, amount: float) -> np.ndarray:
     """Betas that make this body taller, or smaller."""
-    heights = np.array([height_of(body.with_shape(row)) for row in np.eye(10)])
-    chosen = int(np.argmax(np.abs(heights - height_of(body.with_shape()))))
-    sign = np.sign(heights[chosen] - height_of(body.with_shape()))
+    heights = np.array([body_height_m(body.with_shape(row)) for row in np.eye(10)])
+    chosen = int(np.argmax(np.abs(heights - body_height_m(body.with_shape()))))
+    sign = np.sign(heights[chosen] - body_height_m(body.with_shape()))
     return amount * sign * np.eye(10)[chosen]
 
 
@@ -146,50 +146,50 @@ def test_an_added_clips_poses_are_for_the_person_that_the_avatar_has(tmp_path, b
     person, other = body.with_shape(), body.with_shape(betas_of(body, amount))
     motion = motion_of("body24")
     source, masks = film(tmp_path, person, motion)
-    ratio = height_of(other) / height_of(person)
+    ratio = body_height_m(other) / body_height_m(person)
     assert abs(ratio - 1.0) > 0.02
     pelves = person.joints[0] + motion.root_translations
     claimed = replace(motion, root_translations=ratio * pelves - other.joints[0])
     for given in (masks, None):  # pictures with alpha channels
-        fit = fit_to_person(claimed, other, person, CAMERAS, source, given)
+        fit = align_to_person(claimed, other, person, CAMERAS, source, given)
         assert fit.shaped is person
-        assert f"{100 * height_of(other):.0f} cm" in fit.words
-        assert f"{100 * height_of(person):.0f} cm" in fit.words
+        assert f"{100 * body_height_m(other):.0f} cm" in fit.description
+        assert f"{100 * body_height_m(person):.0f} cm" in fit.description
         assert pixels_off(fit, person, motion) < 1.2
 
 
 def test_without_masks_an_added_clips_distances_follow_the_height(tmp_path, body):
     person, other = body.with_shape(), body.with_shape(betas_of(body, 2.0))
     motion = motion_of("body24")
-    ratio = height_of(other) / height_of(person)
+    ratio = body_height_m(other) / body_height_m(person)
     pelves = person.joints[0] + motion.root_translations
     claimed = replace(motion, root_translations=ratio * pelves - other.joints[0])
     Image.new("RGB", SIZE).save(tmp_path / "0.png")
-    fit = fit_to_person(claimed, other, person, CAMERAS, open_source(tmp_path), None)
+    fit = align_to_person(claimed, other, person, CAMERAS, open_source(tmp_path), None)
     np.testing.assert_allclose(fit.motion.root_translations, motion.root_translations, atol=1e-9)
 
 
 def test_a_strangers_added_clip_is_fitted_to_the_persons_own_proportions(
     tmp_path, body, own, strangers
 ):
-    person = as_tall(body.with_shape(), 1.1 * height_of(body.with_shape()))
+    person = scale_to_height(body.with_shape(), 1.1 * body_height_m(body.with_shape()))
     source, masks = film(tmp_path, person, strangers)
     pelves = person.joints[0] + strangers.root_translations
     nearer = replace(strangers, root_translations=pelves / 1.12 - own.joints[0])
-    fit = fit_to_person(nearer, own, person, CAMERAS, source, masks)
-    assert fit.refit is not None
-    assert fit.refit.nearer == pytest.approx(1.0 / 1.12, rel=0.02)
+    fit = align_to_person(nearer, own, person, CAMERAS, source, masks)
+    assert fit.placement is not None
+    assert fit.placement.distance_divisor == pytest.approx(1.0 / 1.12, rel=0.02)
     assert pixels_off(fit, person, strangers) < 1.2
 
 
 def test_the_same_person_again_changes_nothing(tmp_path, body):
     motion = motion_of("body24")
     source, masks = film(tmp_path / "film", body.with_shape(), motion)
-    write_person(tmp_path / "person.npz", body.with_shape())
-    person = read_person(tmp_path / "person.npz", body)
-    fit = fit_to_person(motion, body.with_shape(), person, CAMERAS, source, masks)
+    write_shaped_body(tmp_path / "person.npz", body.with_shape())
+    person = read_shaped_body(tmp_path / "person.npz", body)
+    fit = align_to_person(motion, body.with_shape(), person, CAMERAS, source, masks)
     assert fit.motion is motion
-    assert not fit.words
+    assert not fit.description
 
 
 # --- live ----------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def test_the_same_person_again_changes_nothing(tmp_path, body):
 def observations(person: ShapedBody, motion: Motion):
     skin = SkinPoints.of(person)
     for row in range(len(motion)):
-        alpha = silhouette(skin.posed(motion[row]), CAMERA).astype(np.float32)
+        alpha = splat_silhouette(skin.posed(motion[row]), CAMERA).astype(np.float32)
         rgb = np.zeros((*alpha.shape, 3), np.uint8)
         frame = Frame(index=row, time_s=row / 30.0, rgb=rgb)
         yield Observation(frame=frame, alpha=alpha, pose=motion[row], camera=CAMERA)
@@ -207,21 +207,21 @@ def observations(person: ShapedBody, motion: Motion):
 def test_while_frames_come_the_fit_becomes_that_of_all(own):
     factor = 1.1
     motion, person = motion_of("smpl", 40), taller(own, factor)
-    fit, agreed = GrowingFit(own, "smpl"), []
+    fit, agreed = LiveAlignment(own, "smpl"), []
     for seen in observations(person, motion):
-        fitted = fit.of(seen)
+        fitted = fit.align(seen)
         np.testing.assert_array_equal(fitted.pose.joint_rotations, seen.pose.joint_rotations)
         true = CAMERA.project(person.with_pose(seen.pose).joints())
         found = CAMERA.project(own.with_pose(fitted.pose).joints())
         agreed.append(float(np.abs(true - found).max()))
     assert agreed[0] < 4.0  # one picture: 12 px without
     assert max(agreed[16:]) < 1.2
-    assert fit.refit is not None
-    assert fit.refit.nearer == pytest.approx(factor, rel=0.02)
-    assert fit.frames == 32  # of 40: it is made again when there are twice as many
+    assert fit.placement is not None
+    assert fit.placement.distance_divisor == pytest.approx(factor, rel=0.02)
+    assert fit.frame_count == 32  # of 40: it is made again when there are twice as many
 
 
 def test_poses_that_fit_already_are_left_as_they_come(own):
-    fit = GrowingFit(own, "smpl")
+    fit = LiveAlignment(own, "smpl")
     for seen in observations(own, motion_of("smpl", 10)):
-        assert fit.of(seen).pose is seen.pose
+        assert fit.align(seen).pose is seen.pose

@@ -9,13 +9,13 @@ from PIL import Image
 
 from capture.camera import Camera
 from capture.opening import open_source
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 from preprocess.camera_file import CameraTrack
-from preprocess.fit.family import with_family
+from preprocess.fit.family import detect_body_model
 from preprocess.masks.files import open_masks
 from preprocess.pose import Motion
-from preprocess.shape import shaped_for
-from preprocess.silhouette import SkinPoints, silhouette
+from preprocess.shape import shape_for_motion
+from preprocess.silhouette import SkinPoints, splat_silhouette
 
 SIZE, FRAMES = (96, 128), 6
 CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,
@@ -35,8 +35,8 @@ def unnamed(model: str) -> Motion:
         * np.ones((6, 1, 1)),
         valid=np.ones(FRAMES, dtype=bool),
         betas=BETAS,
-        model=model,
-        model_said=False,
+        body_model=model,
+        model_is_stated=False,
     )
 
 
@@ -45,12 +45,12 @@ def filmed(tmp_path):
     """Masks of the person of a motion; SMPL's betas are unknown here: the mean shape is filmed."""
 
     def make(motion: Motion) -> Path:
-        shaped = shaped_for(load_body(), motion)
+        shaped = shape_for_motion(load_body_model(), motion)
         skin = SkinPoints.of(shaped)
         for folder in ("images", "masks"):
             (tmp_path / folder).mkdir()
         for row in range(FRAMES):
-            alpha = silhouette(skin.posed(motion[row]), CAMERA)
+            alpha = splat_silhouette(skin.posed(motion[row]), CAMERA)
             picture = (255.0 * np.asarray(alpha)).astype(np.uint8)
             Image.fromarray(picture).save(tmp_path / "masks" / f"{row}.png")
             Image.fromarray(picture).convert("RGB").save(tmp_path / "images" / f"{row}.png")
@@ -64,8 +64,8 @@ def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth)
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     read = unnamed("body24")
-    found = with_family(read, load_body(), CAMERAS, source, masks, cameras_given=True)
-    assert found.model == truth
+    found = detect_body_model(read, load_body_model(), CAMERAS, source, masks, cameras_given=True)
+    assert found.body_model == truth
     assert (found.note is not None) == (truth == "smpl")
     if truth == "smpl":
         assert "taken for SMPL's" in found.note
@@ -75,10 +75,10 @@ def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth)
 def test_what_a_file_says_is_never_doubted_and_without_masks_pictures_tell(filmed, truth):
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
-    said = replace(unnamed("body24"), model_said=True)
-    body = load_body()
-    assert with_family(said, body, CAMERAS, source, masks, cameras_given=True) is said
+    said = replace(unnamed("body24"), model_is_stated=True)
+    body = load_body_model()
+    assert detect_body_model(said, body, CAMERAS, source, masks, cameras_given=True) is said
     read = unnamed("body24")
-    found = with_family(read, body, CAMERAS, source, None, cameras_given=True)
-    assert found.model == truth
+    found = detect_body_model(read, body, CAMERAS, source, None, cameras_given=True)
+    assert found.body_model == truth
     assert (found is read) == (truth == "body24")

@@ -7,13 +7,13 @@ import pytest
 
 from capture.camera import Camera
 from preprocess.body import ShapedBody
-from preprocess.body_file import load_body
-from preprocess.doctor.claim import Claim
-from preprocess.doctor.evidence import Evidence, Witness
-from preprocess.fit.refit import Refit, refitted
+from preprocess.body_file import load_body_model
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.doctor.evidence import SilhouetteObjective, MaskSample
+from preprocess.fit.refit import BodyPlacement, place_body_on_masks
 from preprocess.pose import Motion
-from preprocess.shape import on_smpl, shaped_for, smpl_joints
-from preprocess.silhouette import SkinPoints, silhouette
+from preprocess.shape import with_smpl_joints, shape_for_motion, smpl_rest_joints
+from preprocess.silhouette import SkinPoints, splat_silhouette
 
 SIZE = (96, 128)
 FRAMES = 6
@@ -33,7 +33,7 @@ def turning() -> Motion:
         joint_rotations=0.15 * rng.normal(size=(FRAMES, 23, 3)),
         valid=np.ones(FRAMES, dtype=bool),
         betas=np.ones(10),
-        model="smpl",
+        body_model="smpl",
     )
 
 
@@ -48,36 +48,36 @@ def scaled(shaped: ShapedBody, factor: float) -> ShapedBody:
 
 
 @pytest.fixture(scope="module", params=[1.12, 0.9])
-def filmed(request, turning) -> tuple[ShapedBody, Claim, Evidence, Refit]:
+def filmed(request, turning) -> tuple[ShapedBody, CaptureGeometry, SilhouetteObjective, BodyPlacement]:
     """Somebody with SMPL's proportions and another height; the claim; masks; what was found."""
-    body = load_body()
-    own = shaped_for(body, turning)
+    body = load_body_model()
+    own = shape_for_motion(body, turning)
     person = scaled(own, request.param)
-    claim = Claim(
+    claim = CaptureGeometry(
         motion=turning,
-        places=np.arange(FRAMES, dtype=np.float64),
+        row_frames=np.arange(FRAMES, dtype=np.float64),
         intrinsics=np.array([[[190.0, 0.0, 48.0], [0.0, 190.0, 64.0], [0.0, 0.0, 1.0]]]),
         extrinsics=np.eye(4)[None],
         size_px=SIZE,
     )
     skin = SkinPoints.of(person)
-    masks = [silhouette(skin.posed(turning[i]), claim.camera(0, SIZE)) for i in range(FRAMES)]
+    masks = [splat_silhouette(skin.posed(turning[i]), claim.camera_at(0, SIZE)) for i in range(FRAMES)]
     witnesses = tuple(
-        Witness(index=i, camera_row=0, alpha=mask.astype(np.float32))
+        MaskSample(index=i, camera_row=0, alpha=mask.astype(np.float32))
         for i, mask in enumerate(masks)
     )
-    evidence = Evidence(witnesses=witnesses, skin=SkinPoints.of(own))
-    return person, claim, evidence, refitted(claim, evidence)
+    evidence = SilhouetteObjective(samples=witnesses, skin=SkinPoints.of(own))
+    return person, claim, evidence, place_body_on_masks(claim, evidence)
 
 
 def test_the_bodys_joints_move_exactly_as_smpls_do(turning):
-    shaped = shaped_for(load_body(), turning)
-    offset = shaped.joints - smpl_joints()
+    shaped = shape_for_motion(load_body_model(), turning)
+    offset = shaped.joints - smpl_rest_joints()
     np.testing.assert_allclose(offset, np.broadcast_to(offset[0], (24, 3)), atol=1e-12)
 
 
 def test_the_skin_goes_along_with_its_joints(shaped):
-    moved = on_smpl(shaped)
+    moved = with_smpl_joints(shaped)
     rigid = shaped.body.weights.max(axis=1) > 0.999
     joint = shaped.body.weights[rigid].argmax(axis=1)
     before = shaped.vertices[rigid] - shaped.joints[joint]
@@ -86,15 +86,15 @@ def test_the_skin_goes_along_with_its_joints(shaped):
 
 
 def test_poses_of_the_bodys_own_family_change_nothing(turning):
-    body = load_body()
-    own = shaped_for(body, replace(turning, model="body24", betas=np.zeros(10)))
+    body = load_body_model()
+    own = shape_for_motion(body, replace(turning, body_model="body24", betas=np.zeros(10)))
     np.testing.assert_array_equal(own.joints, body.joints)
 
 
 def test_the_height_is_found_in_the_masks(filmed):
     person, _, evidence, refit = filmed
     factor = np.ptp(person.joints[:, 1]) / np.ptp(evidence.skin.shaped.joints[:, 1])
-    assert refit.worth_it
+    assert refit.is_improvement
     assert refit.nearer == pytest.approx(factor, rel=0.02)
     assert refit.after > 0.93 > refit.before + 0.1
 
@@ -112,5 +112,5 @@ def test_joints_land_where_the_person_has_them(filmed):
 
 def test_what_fits_already_is_left_as_it_is(filmed):
     _, claim, evidence, refit = filmed
-    again = refitted(replace(claim, motion=refit.motion), evidence)
-    assert not again.worth_it
+    again = place_body_on_masks(replace(claim, motion=refit.motion), evidence)
+    assert not again.is_improvement

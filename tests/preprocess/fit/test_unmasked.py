@@ -12,18 +12,18 @@ from capture.camera import Camera
 from capture.frame import Frame
 from capture.opening import open_source
 from preprocess.body import ShapedBody
-from preprocess.body_file import load_body
+from preprocess.body_file import load_body_model
 from preprocess.camera_file import CameraTrack
-from preprocess.doctor.claim import Claim
-from preprocess.fit.body_fit import fit_body
-from preprocess.fit.growing import GrowingFit
-from preprocess.fit.pictures import Picture, edges
-from preprocess.fit.refit import Refit, moved_pelvis
-from preprocess.fit.unmasked import fitted_to_pictures
+from preprocess.doctor.claim import CaptureGeometry
+from preprocess.fit.body_fit import align_body
+from preprocess.fit.growing import LiveAlignment
+from preprocess.fit.pictures import ImageSample, edge_contrast
+from preprocess.fit.refit import BodyPlacement, move_pelvis
+from preprocess.fit.unmasked import place_body_on_images
 from preprocess.kinematics import rotation_matrices
-from preprocess.masks.outline import Outline
+from preprocess.masks.outline import MeshSilhouette
 from preprocess.pose import Motion
-from preprocess.shape import shaped_for
+from preprocess.shape import shape_for_motion
 from preprocess.silhouette import SkinPoints
 
 SIZE, FRAMES = (96, 128), 4
@@ -44,7 +44,7 @@ def turning(yaw: float = np.pi) -> Motion:
         joint_rotations=joints,
         valid=np.ones(FRAMES, dtype=bool),
         betas=np.ones(10),
-        model="smpl",
+        body_model="smpl",
     )
 
 
@@ -59,11 +59,11 @@ def scaled(shaped: ShapedBody, factor: float) -> ShapedBody:
 
 def filmed(person: ShapedBody, motion: Motion) -> list[np.ndarray]:
     """A person of two colours before a wall of many: the pictures."""
-    rng, outline = np.random.default_rng(5), Outline(person)
+    rng, outline = np.random.default_rng(5), MeshSilhouette(person)
     wall = cv2.resize(rng.integers(30, 225, (16, 12, 3), dtype=np.uint8), SIZE)
     pictures = []
     for row in range(len(motion)):
-        body = outline.drawn(motion[row], CAMERA)
+        body = outline.draw_pose(motion[row], CAMERA)
         cloth = rng.integers(0, 50, (*SIZE[::-1], 3)) + np.array([30, 40, 180])
         cloth[: SIZE[1] // 2] += np.array([150, 0, -120])
         rgb = np.where(body[..., None], cloth, wall) + rng.normal(0.0, 4.0, (*SIZE[::-1], 3))
@@ -73,21 +73,21 @@ def filmed(person: ShapedBody, motion: Motion) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def own() -> ShapedBody:
-    return shaped_for(load_body(), turning())
+    return shape_for_motion(load_body_model(), turning())
 
 
-def claim_of(motion: Motion) -> Claim:
-    return Claim(
+def claim_of(motion: Motion) -> CaptureGeometry:
+    return CaptureGeometry(
         motion=motion,
-        places=np.arange(FRAMES, dtype=np.float64),
+        row_frames=np.arange(FRAMES, dtype=np.float64),
         intrinsics=CAMERA.intrinsic[None],
         extrinsics=np.eye(4)[None],
         size_px=SIZE,
     )
 
 
-def seen(pictures: list[np.ndarray]) -> list[Picture]:
-    return [Picture(index=i, camera_row=0, rgb=rgb) for i, rgb in enumerate(pictures)]
+def seen(pictures: list[np.ndarray]) -> list[ImageSample]:
+    return [ImageSample(index=i, camera_row=0, rgb=rgb) for i, rgb in enumerate(pictures)]
 
 
 def pixels_off(own: ShapedBody, motion: Motion, person: ShapedBody, true: Motion) -> float:
@@ -107,56 +107,56 @@ def test_pictures_alone_tell_how_tall_somebody_is_and_where_the_pelvis_is(own):
     pictures = seen(filmed(person, motion))
     off = replace(motion, root_translations=motion.root_translations + np.array([0.0, 0.06, 0.0]))
     skin = SkinPoints.of(own)
-    fit = fitted_to_pictures(claim_of(off), skin, pictures)
+    fit = place_body_on_images(claim_of(off), skin, pictures)
     before = pixels_off(own, off, person, motion)
-    assert fit.worth_it
-    assert fit.nearer == pytest.approx(0.88, rel=0.03)
+    assert fit.is_improvement
+    assert fit.distance_divisor == pytest.approx(0.88, rel=0.03)
     assert pixels_off(own, fit.motion, person, motion) < 1.5 < 5.0 < before
-    there = moved_pelvis(
+    there = move_pelvis(
         own.joints[0] + off.root_translations, np.zeros((FRAMES, 3)),
-        rotation_matrices(motion.root_rotations), fit.nearer, fit.shift_m,
+        rotation_matrices(motion.root_rotations), fit.distance_divisor, fit.pelvis_shift_m,
     )  # fmt: skip
     np.testing.assert_allclose(there - own.joints[0], fit.motion.root_translations, atol=1e-9)
-    assert fit.edges is not None
-    assert fit.edges[1] > 1.5 * fit.edges[0]
-    assert fit.edges[1] == edges(claim_of(fit.motion), skin, pictures)
-    assert "pictures" in fit.in_words()
-    assert fit.as_json()["edges_after"] == round(fit.edges[1], 2)
+    assert fit.edge_contrast is not None
+    assert fit.edge_contrast[1] > 1.5 * fit.edge_contrast[0]
+    assert fit.edge_contrast[1] == edge_contrast(claim_of(fit.motion), skin, pictures)
+    assert "pictures" in fit.describe()
+    assert fit.as_json()["edges_after"] == round(fit.edge_contrast[1], 2)
 
 
 @pytest.fixture(scope="module")
-def elsewhere(own) -> Refit:
+def elsewhere(own) -> BodyPlacement:
     """What is found where somebody else stands half a metre beside the poses."""
     motion = turning()
     beside = replace(motion, root_translations=motion.root_translations + np.array([0.6, 0.0, 0.0]))
     pictures = seen(filmed(own, beside))
-    return fitted_to_pictures(claim_of(motion), SkinPoints.of(own), pictures)
+    return place_body_on_images(claim_of(motion), SkinPoints.of(own), pictures)
 
 
 def test_where_nobody_stands_nobody_is_found(elsewhere):
     """Masks that were found around the body agree with it all the same; edges do not."""
     assert elsewhere.after > 0.6
     assert not elsewhere.believed
-    assert not elsewhere.worth_it
-    assert "no person was found" in elsewhere.in_words()
+    assert not elsewhere.is_improvement
+    assert "no person was found" in elsewhere.describe()
 
 
 def test_a_video_without_masks_is_looked_at(tmp_path: Path, own):
     motion, person = turning(), scaled(own, 1.12)
     for row, rgb in enumerate(filmed(person, motion)):
         Image.fromarray(rgb).save(tmp_path / f"{row}.png")
-    fit = fit_body(motion, own, CAMERAS, open_source(tmp_path), None)
-    assert fit.refit is not None
-    assert fit.refit.edges is not None
-    assert fit.refit.nearer == pytest.approx(1.12, rel=0.03)
+    fit = align_body(motion, own, CAMERAS, open_source(tmp_path), None)
+    assert fit.placement is not None
+    assert fit.placement.edge_contrast is not None
+    assert fit.placement.distance_divisor == pytest.approx(1.12, rel=0.03)
     assert pixels_off(own, fit.motion, person, motion) < 2.0
-    assert fit.words == fit.refit.in_words()
+    assert fit.description == fit.placement.describe()
 
 
 def test_while_pictures_come_poses_are_fitted_before_masks_are_estimated(own):
     motion, person = turning(), scaled(own, 1.12)
-    fit = GrowingFit(own, "smpl", masked=False)
-    pose_of = fit.posing(lambda frame: motion[frame.index] if frame.index else "no pose", CAMERA)
+    fit = LiveAlignment(own, "smpl", masked=False)
+    pose_of = fit.align_poses(lambda frame: motion[frame.index] if frame.index else "no pose", CAMERA)
     off, unfitted = [], []
     for row, rgb in enumerate(filmed(person, motion)):
         pose = pose_of(Frame(index=row, time_s=row / 30.0, rgb=rgb))
@@ -170,5 +170,5 @@ def test_while_pictures_come_poses_are_fitted_before_masks_are_estimated(own):
             found.append(float(np.abs(CAMERA.project(own.with_pose(poses).joints()) - true).max()))
     assert off[0] < 0.5 * unfitted[0]  # from one picture
     assert max(off[1:]) < 1.5 < 5.0 < min(unfitted)
-    assert fit.refit is not None
-    assert fit.frames == 2  # of 3: it is made again when there are twice as many
+    assert fit.placement is not None
+    assert fit.frame_count == 2  # of 3: it is made again when there are twice as many

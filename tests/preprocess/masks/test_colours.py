@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from preprocess.masks.colours import LEAST_SPREAD, Colours, Sight
-from preprocess.masks.shell import Around, Shell
+from preprocess.masks.colours import MIN_COLOR_SPREAD, AppearanceModel, VertexVisibility
+from preprocess.masks.shell import ClothedBody, ClothingOffset
 from preprocess.pose import BodyPose
 
 SIZE = (160, 200)
@@ -23,17 +23,17 @@ def camera() -> Camera:
 
 @pytest.fixture
 def turned(shaped, camera):
-    shell = Shell(shaped)
+    shell = ClothingOffset(shaped)
 
-    def turned(yaw: float) -> tuple[Around, Sight]:
+    def turned(yaw: float) -> tuple[ClothedBody, VertexVisibility]:
         pose = BodyPose(
             root_rotation=np.array([0.0, yaw, 0.0]),
             root_translation=np.zeros(3),
             joint_rotations=np.zeros((23, 3)),
         )
-        around = shell.around(pose, camera)
+        around = shell.clothe(pose, camera)
         assert around is not None
-        return around, Sight.of(around, camera)
+        return around, VertexVisibility.of(around, camera)
 
     return turned
 
@@ -53,7 +53,7 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
 ):
     """One half of the body is red, the other blue: of the rim one side is red, then the other."""
     left = shaped.vertices[:, 0] > 0.0
-    colours = Colours(len(left))
+    colours = AppearanceModel(len(left))
     inside = np.full(SIZE[::-1], 9.0, np.float32)
     for yaw in (0.0, np.pi) * 3:
         _, sight = turned(yaw)
@@ -61,14 +61,14 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
         columns = np.arange(SIZE[0]) + 0.5 > camera.center_px[0]
         picture = np.where((columns != swapped)[:, None], FRONT, BACK)
         rgb = np.broadcast_to(picture, (*SIZE[::-1], 3)).astype(np.uint8)
-        colours.learn(sight, rgb, inside)
+        colours.update(sight, rgb, inside)
     for yaw, expected in ((0.5 * np.pi, BACK), (-0.5 * np.pi, FRONT)):
         _, sight = turned(yaw)
-        told, spread = colours.along(sight, SIZE)
+        told, spread = colours.predict(sight, SIZE)
         # now the one half is before the other
         rim = sight.seen & (sight.facing > 0.2) & (sight.facing < 0.6) & (left == (yaw < 0))
         column, row = sight.pixels[rim].astype(int).T
-        known = spread[row, column] < 1.2 * LEAST_SPREAD
+        known = spread[row, column] < 1.2 * MIN_COLOR_SPREAD
         assert known.mean() > 0.2
         np.testing.assert_allclose(np.median(told[row, column][known], axis=0), expected, atol=2.0)
         assert np.isinf(spread[0]).all()
@@ -76,8 +76,8 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
 
 def test_nothing_is_learnt_so_near_to_the_border_that_it_may_be_background(turned, camera):
     _, sight = turned(0.0)
-    colours = Colours(len(sight.seen))
+    colours = AppearanceModel(len(sight.seen))
     rgb = np.full((*SIZE[::-1], 3), 99, np.uint8)
-    colours.learn(sight, rgb, np.full(SIZE[::-1], 1.0, np.float32))
-    _, spread = colours.along(sight, SIZE)
+    colours.update(sight, rgb, np.full(SIZE[::-1], 1.0, np.float32))
+    _, spread = colours.predict(sight, SIZE)
     assert np.isinf(spread).all()

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.frame import Frame
 from preprocess.kinematics import rotation_matrices
 from preprocess.masks import segmenter
-from preprocess.masks.behind import BRIGHTEST, DARKEST, GRAIN, UNLIKE, Behind
-from preprocess.masks.grabcut import GrabCut, _Cut, _Shape
-from preprocess.masks.hair import knots
-from preprocess.masks.outline import Outline, away_px
+from preprocess.masks.behind import MAX_LIGHT_GAIN, MIN_LIGHT_GAIN, MIN_BACKGROUND_SPREAD, FOREGROUND_MIN_DIFFERENCE, BackgroundModel
+from preprocess.masks.grabcut import GrabCutSegmenter, _Segmentation, _ExpectedShape
+from preprocess.masks.hair import solid_hair
+from preprocess.masks.outline import MeshSilhouette, signed_distance_px
 from preprocess.masks.segmenter import make_segmenter, segmenter_name
-from preprocess.masks.shell import FEET, Around, Shell
+from preprocess.masks.shell import FOOT_JOINTS, ClothedBody, ClothingOffset
 from preprocess.pose import BodyPose
 
 SIZE = (160, 200)
@@ -46,14 +46,14 @@ def standing(shaped, yaw: float = 0.0) -> BodyPose:
 @pytest.fixture
 def film(shaped, camera, rng):
     """A person in a blue suit, wider than the body, before a wall of many colours."""
-    outline = Outline(shaped)
+    outline = MeshSilhouette(shaped)
     wall = cv2.resize(rng.integers(40, 220, (25, 20, 3), dtype=np.uint8), SIZE)
     wall[..., 2] //= 2
     cloth = rng.integers(0, 40, (*SIZE[::-1], 3), dtype=np.uint8) + np.uint8([20, 30, 190])
 
     def film(yaw: float, index: int = 0) -> tuple[Frame, BodyPose, np.ndarray]:
         pose = standing(shaped, yaw)
-        body = outline.drawn(pose, camera).astype(np.uint8)
+        body = outline.draw_pose(pose, camera).astype(np.uint8)
         true = cv2.dilate(body, np.ones((5, 5), np.uint8)) > 0
         rgb = np.where(true[..., None], cloth, wall).astype(np.uint8)
         noise = rng.normal(0.0, 3.0, rgb.shape)
@@ -69,7 +69,7 @@ def agreement(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_the_outline_covers_what_points_of_the_skin_cover(shaped, camera):
     pose = standing(shaped, 0.4)
-    drawn = Outline(shaped).drawn(pose, camera)
+    drawn = MeshSilhouette(shaped).draw_pose(pose, camera)
     at = np.floor(camera.project(shaped.with_pose(pose).vertices())).astype(int)
     assert drawn[at[:, 1], at[:, 0]].mean() > 0.99
     points = np.zeros(drawn.shape, np.uint8)
@@ -82,17 +82,17 @@ def test_nothing_is_drawn_of_a_body_behind_the_camera(shaped, camera):
     away = np.eye(4)
     away[2, 3] = -5.0
     assert (
-        not Outline(shaped).drawn(standing(shaped), replace(camera, camera_from_world=away)).any()
+        not MeshSilhouette(shaped).draw_pose(standing(shaped), replace(camera, camera_from_world=away)).any()
     )
 
 
 def test_clothes_that_are_wider_than_the_body_are_found(shaped, camera, film):
-    find = GrabCut(shaped)
+    find = GrabCutSegmenter(shaped)
     frame, pose, true = film(0.0)
-    body = Outline(shaped).drawn(pose, camera)
+    body = MeshSilhouette(shaped).draw_pose(pose, camera)
     assert agreement(body, true) < 0.85
     assert agreement(find(frame, pose, camera), true) > 0.95
-    assert find.found == 1
+    assert find.mask_count == 1
     assert 0.6 < find.agreement < 0.95
 
 
@@ -100,28 +100,28 @@ def test_what_was_seen_behind_the_person_helps_where_poses_are_off(shaped, camer
     def shifted(pose: BodyPose) -> BodyPose:
         return replace(pose, root_translation=pose.root_translation + np.array([0.03, 0.0, 0.0]))
 
-    find = GrabCut(shaped)
+    find = GrabCutSegmenter(shaped)
     for index, yaw in enumerate(np.linspace(0.0, 6.0, 10)):
         frame, pose, true = film(float(yaw), index)
         last = agreement(find(frame, shifted(pose), camera), true)
-        alone = agreement(GrabCut(shaped)(frame, shifted(pose), camera), true)
+        alone = agreement(GrabCutSegmenter(shaped)(frame, shifted(pose), camera), true)
     assert last > 0.93
     assert last > alone - 0.01
 
 
 def test_a_camera_that_moves_forgets_what_lay_behind(camera, rng):
-    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
 
     def remembers(now: Camera, picture: np.ndarray) -> bool:
-        before = Behind()
+        before = BackgroundModel()
         for _ in range(3):
-            before.seen_by(camera, wall, free)
-            before.learn(wall, free)
-        before.seen_by(now, picture, free)
-        return before.known
+            before.reset_if_moved(camera, wall, free)
+            before.update(wall, free)
+        before.reset_if_moved(now, picture, free)
+        return before.is_initialized
 
-    assert not behind.known
+    assert not behind.is_initialized
     noise = np.clip(wall + rng.normal(0.0, 3.0, wall.shape), 0, 255).astype(np.uint8)
     assert remembers(camera, noise)
     turned = camera.camera_from_world.copy()
@@ -131,35 +131,35 @@ def test_a_camera_that_moves_forgets_what_lay_behind(camera, rng):
 
 
 def test_what_lay_behind_tells_who_stands_before_it(camera, rng):
-    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
     for _ in range(3):
-        behind.learn(wall, free)
+        behind.update(wall, free)
     person = np.zeros(SIZE[::-1], dtype=bool)
     person[50:90, 40:60] = True
     picture = np.where(person[..., None], np.uint8(255) - wall, wall)
-    like, unlike = behind.compared(picture, free)
+    like, unlike = behind.classify(picture, free)
     assert like[~person].all()
     assert not unlike[~person].any()
     # no brightness of the wall, of all that are possible, comes near to these pixels
-    brightness = np.linspace(DARKEST, BRIGHTEST, 241)[:, None, None]
+    brightness = np.linspace(MIN_LIGHT_GAIN, MAX_LIGHT_GAIN, 241)[:, None, None]
     off = picture[person] - brightness * wall[person]
     nearest = (off**2).sum(axis=-1).argmin(axis=0)
     off = np.abs(off).max(axis=-1)[nearest, np.arange(person.sum())]
-    sure = np.abs(off - UNLIKE) > 1.0
-    np.testing.assert_array_equal(unlike[person][sure], off[sure] > UNLIKE)
+    sure = np.abs(off - FOREGROUND_MIN_DIFFERENCE) > 1.0
+    np.testing.assert_array_equal(unlike[person][sure], off[sure] > FOREGROUND_MIN_DIFFERENCE)
     assert 0.5 < unlike[person].mean() < 1.0
 
 
 def test_a_shadow_on_what_lay_behind_is_no_person_but_a_red_sole_in_it_is(camera):
-    behind, free = Behind(), np.ones(SIZE[::-1], dtype=bool)
+    behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     floor = np.broadcast_to(np.uint8([140, 105, 65]), (*SIZE[::-1], 3)).copy()
     for _ in range(3):
-        behind.learn(floor, free)
+        behind.update(floor, free)
     picture = floor.copy()
     picture[100:] = floor[100:] * 0.6
     picture[120:124] = 0.6 * np.array([200.0, 70.0, 60.0])
-    like, unlike = behind.compared(picture, free)
+    like, unlike = behind.classify(picture, free)
     assert like[:100].all()
     assert not like[100:].any()
     np.testing.assert_array_equal(np.flatnonzero(unlike.any(axis=1)), np.arange(120, 124))
@@ -170,70 +170,70 @@ def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_w
     wall = rng.integers(60, 200, (*SIZE[::-1], 3)).astype(float)
     person = np.zeros(SIZE[::-1], dtype=bool)
     person[50:90, 40:60] = True
-    behind, steady, pictures = Behind(), Behind(), []
-    assert behind.shown(wall.astype(np.uint8), ~person) is None
+    behind, steady, pictures = BackgroundModel(), BackgroundModel(), []
+    assert behind.predict(wall.astype(np.uint8), ~person) is None
     never = np.zeros_like(person)
     never[150:] = True
     for _ in range(12):
         pictures.append(np.clip(wall + rng.normal(0.0, 12.0, wall.shape), 0, 255).astype(np.uint8))
-        behind.learn(pictures[-1], ~never)
-        steady.learn(wall.astype(np.uint8), ~never)
+        behind.update(pictures[-1], ~never)
+        steady.update(wall.astype(np.uint8), ~never)
     shadow = np.where(person[..., None], 255.0, 0.7 * wall).astype(np.uint8)
-    shown = behind.shown(shadow, ~person)
+    shown = behind.predict(shadow, ~person)
     assert shown is not None
     assert np.isinf(shown[1][never]).all()
     expected = np.sqrt(np.var(pictures, axis=0).mean(axis=-1))
-    np.testing.assert_allclose(shown[1][~never], np.maximum(expected, GRAIN)[~never], rtol=1e-3)
+    np.testing.assert_allclose(shown[1][~never], np.maximum(expected, MIN_BACKGROUND_SPREAD)[~never], rtol=1e-3)
     rim = person & ~cv2.erode(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     np.testing.assert_allclose(shown[0][rim], 0.7 * np.mean(pictures, axis=0)[rim], rtol=0.03)
-    sure = steady.shown(shadow, ~person)
+    sure = steady.predict(shadow, ~person)
     assert sure is not None
-    assert (sure[1][~never] == GRAIN).all()
+    assert (sure[1][~never] == MIN_BACKGROUND_SPREAD).all()
 
 
 @pytest.mark.parametrize("thick_m", [0.0, 0.04])
 def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
     """Masks of a body that is thicker by so much all over; the person turns once."""
     large = camera.resized((480, 600))
-    outline, shell = Outline(shaped), Shell(shaped)
+    outline, shell = MeshSilhouette(shaped), ClothingOffset(shaped)
     for yaw in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
         pose = standing(shaped, float(yaw))
-        around = shell.around(pose, large)
+        around = shell.clothe(pose, large)
         assert around is not None
-        true = outline.filled(around.skin + thick_m * around.normals, large).astype(np.float32)
-        expected = shell.drawn(around, large)
+        true = outline.draw_vertices(around.skin + thick_m * around.normals, large).astype(np.float32)
+        expected = shell.draw(around, large)
         covered = cv2.resize(expected, large.size_px, interpolation=cv2.INTER_AREA) > 0.5
-        away = away_px(covered)
+        away = signed_distance_px(covered)
         rgb = np.where(true[..., None] > 0.0, np.uint8(200), np.uint8(20))
-        shell.vote(around, large, np.repeat(rgb, 3, axis=2), true, away, (0.1, 0.1))
-    around = shell.around(standing(shaped), large)
+        shell.update(around, large, np.repeat(rgb, 3, axis=2), true, away, (0.1, 0.1))
+    around = shell.clothe(standing(shaped), large)
     assert around is not None
-    assert around.known > 0.3
+    assert around.known_fraction > 0.3
     height = shaped.vertices[:, 1]
     trunk = (height > -0.3) & (height < 0.2) & (np.abs(shaped.vertices[:, 0]) < 0.2)
-    assert np.median(np.abs(around.thickness[trunk] - thick_m)) < 0.004
-    drawn = cv2.resize(shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA)
-    true = outline.filled(around.skin + thick_m * around.normals, large)
+    assert np.median(np.abs(around.offset_m[trunk] - thick_m)) < 0.004
+    drawn = cv2.resize(shell.draw(around, large), large.size_px, interpolation=cv2.INTER_AREA)
+    true = outline.draw_vertices(around.skin + thick_m * around.normals, large)
     assert agreement(drawn, true) > 0.96
 
 
 def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, camera, rng):
     """Every other vertex, at random, is 4 mm thicker: the outline is theirs."""
-    large, shell = camera.resized((480, 600)), Shell(shaped)
-    around = shell.around(standing(shaped), large)
+    large, shell = camera.resized((480, 600)), ClothingOffset(shaped)
+    around = shell.clothe(standing(shaped), large)
     assert around is not None
-    head = around.skin[around.rim, 1] > 1.5
+    head = around.skin[around.rim_vertices, 1] > 1.5
 
     def beyond(thickness: np.ndarray, known: float) -> np.ndarray:
-        now = around._replace(thickness=thickness, known=known)
-        fine = shell.drawn(now, large)
+        now = around._replace(thickness=thickness, known_fraction=known)
+        fine = shell.draw(now, large)
         covered = cv2.resize(fine, large.size_px, interpolation=cv2.INTER_AREA)
-        return shell._beyond(now, large, away_px(covered > 0.5))[head]
+        return shell._overshoot_m(now, large, signed_distance_px(covered > 0.5))[head]
 
     even = np.full(len(shaped.vertices), 0.01)
     thicker = rng.random(len(even)) < 0.5
     rough, smooth = beyond(even + 0.004 * thicker, 1.0), beyond(even, 1.0)
-    thick = thicker[around.rim][head]
+    thick = thicker[around.rim_vertices][head]
     # those farther inside are hidden by other parts of the head, and say nothing
     low, high = (rough[(thick == which) & (rough != 0.0)] for which in (False, True))
     assert np.median(smooth[smooth != 0.0]) < 0.001
@@ -247,35 +247,35 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
     pose = standing(shaped)
     thickness = []
     for limit in (0.02, 0.2):
-        shell = Shell(shaped)
+        shell = ClothingOffset(shaped)
         for _ in range(4):
-            around = shell.around(pose, camera)
+            around = shell.clothe(pose, camera)
             assert around is not None
-            leaked = Outline(shaped).filled(around.skin + 0.03 * around.normals, camera)
+            leaked = MeshSilhouette(shaped).draw_vertices(around.skin + 0.03 * around.normals, camera)
             covered = cv2.resize(
-                shell.drawn(around, camera), camera.size_px, interpolation=cv2.INTER_AREA
+                shell.draw(around, camera), camera.size_px, interpolation=cv2.INTER_AREA
             )
             rgb = np.repeat(leaked[..., None] * np.uint8(200), 3, axis=2)
-            away = away_px(covered > 0.5)
-            shell.vote(around, camera, rgb, leaked.astype(np.float32), away, (limit, limit))
-        thickness.append(float(np.median(shell._thickness()[0][around.rim])))
+            away = signed_distance_px(covered > 0.5)
+            shell.update(around, camera, rgb, leaked.astype(np.float32), away, (limit, limit))
+        thickness.append(float(np.median(shell._offsets_m()[0][around.rim_vertices])))
     assert thickness[0] < thickness[1] - 0.005
 
 
 def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
     """Of five masks two reach 3 cm beyond the skin, the others end at it."""
-    large, shell, pose = camera.resized((480, 600)), Shell(shaped), standing(shaped)
+    large, shell, pose = camera.resized((480, 600)), ClothingOffset(shaped), standing(shaped)
     for thick_m in (0.03, 0.0, 0.0, 0.03, 0.0) * 4:
-        around = shell.around(pose, large)
+        around = shell.clothe(pose, large)
         assert around is not None
-        mask = Outline(shaped).filled(around.skin + thick_m * around.normals, large)
+        mask = MeshSilhouette(shaped).draw_vertices(around.skin + thick_m * around.normals, large)
         covered = cv2.resize(
-            shell.drawn(around, large), large.size_px, interpolation=cv2.INTER_AREA
+            shell.draw(around, large), large.size_px, interpolation=cv2.INTER_AREA
         )
         rgb = np.repeat(mask[..., None] * np.uint8(200), 3, axis=2)
-        shell.vote(around, large, rgb, mask.astype(np.float32), away_px(covered > 0.5), (0.2, 0.2))
-    thickness, known = shell._thickness()
-    feet, legs = np.isin(shell._limb, FEET), np.isin(shell._limb, (1, 2, 4, 5))
+        shell.update(around, large, rgb, mask.astype(np.float32), signed_distance_px(covered > 0.5), (0.2, 0.2))
+    thickness, known = shell._offsets_m()
+    feet, legs = np.isin(shell._limb, FOOT_JOINTS), np.isin(shell._limb, (1, 2, 4, 5))
     assert np.median(thickness[feet & (known == 1.0)]) > 0.02
     assert np.median(thickness[legs & (known == 1.0)]) < 0.01
 
@@ -286,11 +286,11 @@ def test_a_knot_of_hair_is_wide_in_all_directions_and_a_leak_is_not():
     beyond[20:22, 30:50] = True  # a stripe 2 cm high
     expected = np.zeros_like(beyond)
     expected[3:11, 29:37] = True
-    np.testing.assert_array_equal(knots(beyond, 100.0), expected)
+    np.testing.assert_array_equal(solid_hair(beyond, 100.0), expected)
 
 
 def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
-    find = GrabCut(shaped)
+    find = GrabCutSegmenter(shaped)
     found = []
     for index, yaw in enumerate(np.linspace(0.0, 2.0 * np.pi, 16)):
         frame, pose, true = film(float(yaw), index)
@@ -301,22 +301,22 @@ def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
 
 @pytest.mark.parametrize("off_m", [0.006, 0.02])
 def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m):
-    find, shape = GrabCut(shaped), np.zeros((40, 60), dtype=bool)
+    find, shape = GrabCutSegmenter(shaped), np.zeros((40, 60), dtype=bool)
     shape[:, :30] = True
-    away = away_px(shape)
-    around = Around(
-        skin=np.zeros((0, 3)), normals=np.zeros((0, 3)), thickness=np.zeros(0),
-        rim=np.zeros(0, dtype=int), known=1.0, px_per_m=100.0,
+    away = signed_distance_px(shape)
+    around = ClothedBody(
+        skin=np.zeros((0, 3)), normals=np.zeros((0, 3)), offset_m=np.zeros(0),
+        rim_vertices=np.zeros(0, dtype=int), known_fraction=1.0, px_per_m=100.0,
     )  # fmt: skip
     covered = shape.astype(np.float32)
     find._off_m = off_m
     cut = np.zeros_like(shape)
     cut[:20, :30] = True
     cut[20:, :34] = True  # four centimetres too far
-    found_cut = _Cut(person=cut, away=away_px(cut), sure=0.0 * covered, doubt_m=(0.05, 0.05))
-    expected = _Shape(fine=covered, covered=covered, away=away, hair=np.zeros_like(shape))
-    weight = find._weight_of_shell(found_cut, expected, around)
-    hairy = find._weight_of_shell(found_cut, expected._replace(hair=~expected.hair), around)
+    found_cut = _Segmentation(foreground=cut, signed_distance_px=signed_distance_px(cut), decided_by_background=0.0 * covered, band_m=(0.05, 0.05))
+    expected = _ExpectedShape(supersampled=covered, coverage=covered, signed_distance_px=away, hair_region=np.zeros_like(shape))
+    weight = find._shape_weight(found_cut, expected, around)
+    hairy = find._shape_weight(found_cut, expected._replace(hair_region=~expected.hair_region), around)
     assert hairy[35, 31:35].max() <= weight[35, 31:35].min()  # a bun is no leak
     assert weight.min() >= 0.0
     assert weight.max() <= 1.0
@@ -330,7 +330,7 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
 
 
 def test_a_bun_of_hair_is_found_though_it_stands_off_far(shaped, camera, film):
-    find = GrabCut(shaped)
+    find = GrabCutSegmenter(shaped)
     for index, yaw in enumerate(np.linspace(0.0, 1.0, 4)):
         frame, pose, true = film(float(yaw), index)
         head = camera.project(shaped.with_pose(pose).joints()[[15]])[0].astype(int)
@@ -344,14 +344,14 @@ def test_a_bun_of_hair_is_found_though_it_stands_off_far(shaped, camera, film):
 
 def test_the_same_frames_give_the_same_masks(shaped, camera, film):
     frame, pose, _ = film(0.7)
-    masks = [GrabCut(shaped)(frame, pose, camera) for _ in range(2)]
+    masks = [GrabCutSegmenter(shaped)(frame, pose, camera) for _ in range(2)]
     np.testing.assert_array_equal(*masks)
 
 
 def test_large_pictures_are_cut_small_and_come_back_large(shaped, camera, film):
     frame, pose, true = film(0.3)
     large = replace(frame, rgb=cv2.resize(frame.rgb, (480, 600), interpolation=cv2.INTER_NEAREST))
-    mask = GrabCut(shaped)(large, pose, camera.resized((480, 600)))
+    mask = GrabCutSegmenter(shaped)(large, pose, camera.resized((480, 600)))
     assert mask.shape == (600, 480)
     assert agreement(cv2.resize(mask, SIZE, interpolation=cv2.INTER_AREA), true) > 0.93
 
@@ -359,8 +359,8 @@ def test_large_pictures_are_cut_small_and_come_back_large(shaped, camera, film):
 def test_a_person_who_is_not_there_gives_no_mask(shaped, camera, film):
     frame, pose, _ = film(0.0)
     aside = replace(pose, root_translation=pose.root_translation + np.array([9.0, 0.0, 0.0]))
-    with pytest.raises(BadInput, match="not in the picture"):
-        GrabCut(shaped)(frame, aside, camera)
+    with pytest.raises(InputError, match="not in the picture"):
+        GrabCutSegmenter(shaped)(frame, aside, camera)
 
 
 # --- the seat for others -----------------------------------------------------------------------
@@ -388,7 +388,7 @@ def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):
     monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
     assert make_segmenter("rembg", shaped)(1, None, None) == 1
     assert made == [shaped]
-    with pytest.raises(BadInput, match="installed are grabcut, rembg"):
+    with pytest.raises(InputError, match="installed are grabcut, rembg"):
         make_segmenter("sam", shaped)
 
 
@@ -397,5 +397,5 @@ def test_a_segmenter_that_cannot_be_loaded_is_named(monkeypatch, shaped):
         raise ImportError("no module named rembg")
 
     monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
-    with pytest.raises(BadInput, match=r"'rembg' could not be loaded: no module named rembg"):
+    with pytest.raises(InputError, match=r"'rembg' could not be loaded: no module named rembg"):
         make_segmenter("rembg", shaped)

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from capture.camera import same_shape
-from capture.errors import BadInput
+from capture.camera import same_aspect_ratio
+from capture.errors import InputError
 from capture.opening import open_source
 from capture.quiet import silence_opencv
-from preprocess.masks.files import masks_in_poses, open_masks
-from preprocess.masks.one_file import decoded
+from preprocess.masks.files import open_tracker_masks, open_masks
+from preprocess.masks.one_file import decode_rle
 
 SIZE = (30, 40)
 
@@ -133,7 +133,7 @@ def test_an_empty_mask_among_others_does_not_decide(write):
 def test_masks_that_do_not_tell_which_side_is_the_person_are_refused(write):
     framed = np.full((40, 30), 255, np.uint8)
     framed[2:-2, 2:-2] = 0
-    with pytest.raises(BadInput, match="--mask-invert"):
+    with pytest.raises(InputError, match="--mask-invert"):
         open_masks(write([framed]))
 
 
@@ -150,20 +150,20 @@ def test_numbers_of_objects_in_grey_are_masks_and_dark_noise_is_none(write, rng)
 def test_pictures_are_no_masks(write, rng):
     photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
     for invert in (None, False):
-        with pytest.raises(BadInput, match="pictures, not masks: 7"):
+        with pytest.raises(InputError, match="pictures, not masks: 7"):
             open_masks(write(photographs, f"photographs {invert}"), invert=invert)
     soft = cv2.GaussianBlur(person(), (5, 5), 0)
     assert open_masks(write([soft], "soft")).count == 1
 
 
 def test_masks_that_show_nothing_are_refused(write):
-    with pytest.raises(BadInput, match="empty or full"):
+    with pytest.raises(InputError, match="empty or full"):
         open_masks(write([np.zeros((40, 30), np.uint8)] * 3))
 
 
 def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
     masks = open_masks(write([person()]))
-    with pytest.raises(BadInput, match=r"30x40 px, its picture 40x30"):
+    with pytest.raises(InputError, match=r"30x40 px, its picture 40x30"):
         masks.alpha(0, (40, 30))
     half = masks.alpha(0, (15, 20))
     by_hand = (person() / np.float32(255)).reshape(20, 2, 15, 2).mean(axis=(1, 3))
@@ -175,8 +175,8 @@ def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
 def test_shapes_agree_after_any_shrinking(width, height, longer):
     scale = min(1.0, longer / max(width, height))
     small = max(1, round(width * scale)), max(1, round(height * scale))
-    assert same_shape((width, height), small)
-    assert not same_shape((width, height), (width, 2 * height))
+    assert same_aspect_ratio((width, height), small)
+    assert not same_aspect_ratio((width, height), (width, 2 * height))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_what_holds_no_masks_is_refused(tmp_path, name, content, message):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
-    with pytest.raises(BadInput, match=message):
+    with pytest.raises(InputError, match=message):
         open_masks(tmp_path / name.split("/")[0])
 
 
@@ -217,10 +217,10 @@ def text_of(mask: np.ndarray) -> bytes:
 
 def test_run_lengths_are_those_of_the_standards_own_example():
     """From the specification of COCO's maskApi: columns first, beginning with zeros."""
-    assert decoded({"size": [3, 4], "counts": [1, 2, 5, 4]}).tolist() == [
+    assert decode_rle({"size": [3, 4], "counts": [1, 2, 5, 4]}).tolist() == [
         [0, 0, 0, 1], [1, 0, 0, 1], [1, 0, 1, 1]
     ]  # fmt: skip
-    assert decoded({"size": [2, 2], "counts": "04"}).tolist() == [[1, 1], [1, 1]]
+    assert decode_rle({"size": [2, 2], "counts": "04"}).tolist() == [[1, 1], [1, 1]]
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
@@ -228,7 +228,7 @@ def test_coded_masks_of_any_shape_go_round(height, width, seed):
     rng = np.random.default_rng(seed)
     mask = np.repeat(rng.random((height, width)) < rng.random(), rng.integers(1, 9), axis=0)
     code = {"size": list(mask.shape), "counts": text_of(mask)}
-    np.testing.assert_array_equal(decoded(code), mask)
+    np.testing.assert_array_equal(decode_rle(code), mask)
 
 
 @pytest.mark.parametrize("container", ["list", "names", "coco", "npy", "several"])
@@ -245,14 +245,14 @@ def test_coded_masks_are_read_from_whatever_holds_them(tmp_path, container):
         listed = [
             {"image_id": i + 100, "segmentation": codes[i]} for i in (3, 1, 2, 0, *range(4, 12))
         ]
-        path.write_text(json.dumps({"images": images, "annotations": listed}))
+        path.write_text_atomically(json.dumps({"images": images, "annotations": listed}))
     elif container == "names":
-        path.write_text(json.dumps(dict(sorted(zip(names, codes, strict=True)))))
+        path.write_text_atomically(json.dumps(dict(sorted(zip(names, codes, strict=True)))))
     elif container == "several":
         empty = {"size": [40, 30], "counts": [1200]}
-        path.write_text(json.dumps([[empty, code] if i else [] for i, code in enumerate(codes)]))
+        path.write_text_atomically(json.dumps([[empty, code] if i else [] for i, code in enumerate(codes)]))
     else:
-        path.write_text(json.dumps(codes))
+        path.write_text_atomically(json.dumps(codes))
     masks = open_masks(path)
     assert masks.count == 12
     for row in (11, 0, 5):
@@ -285,7 +285,7 @@ def test_the_masks_of_one_of_phalps_people_are_read_from_its_tracks(tmp_path):
     second = open_masks(path, person="2").alpha(2, SIZE)
     np.testing.assert_array_equal(second, person(7) > 200)
     assert not open_masks(path, person="2").alpha(3, SIZE).any()
-    with pytest.raises(BadInput):
+    with pytest.raises(InputError):
         open_masks(path, person="9")
 
 
@@ -301,15 +301,15 @@ def test_masks_beside_poses_are_taken_only_where_they_fit_the_video(tmp_path):
             Image.new("RGB", size_px).save(folder / f"{row}.png")
         return open_source(folder)
 
-    masks = masks_in_poses(path, film())
+    masks = open_tracker_masks(path, film())
     assert masks is not None
     np.testing.assert_array_equal(masks.alpha(3, SIZE), hard[3])
-    assert masks_in_poses(path, film(frames=13)) is None
-    assert masks_in_poses(path, film(size_px=(64, 64))) is None
+    assert open_tracker_masks(path, film(frames=13)) is None
+    assert open_tracker_masks(path, film(size_px=(64, 64))) is None
     spoilt = {name: {**frame, "mask": [{"size": [40, 30], "counts": b"abc"}] * 2}
               for name, frame in content.items()}  # fmt: skip
     path.write_bytes(pickle.dumps(spoilt))
-    assert masks_in_poses(path, film()) is None
+    assert open_tracker_masks(path, film()) is None
 
 
 @pytest.mark.parametrize(
@@ -323,8 +323,8 @@ def test_masks_beside_poses_are_taken_only_where_they_fit_the_video(tmp_path):
 )
 def test_codes_that_do_not_fill_their_picture_are_refused(tmp_path, code):
     path = tmp_path / "masks.json"
-    path.write_text(json.dumps([code, code]))
-    with pytest.raises(BadInput, match="run-length code"):
+    path.write_text_atomically(json.dumps([code, code]))
+    with pytest.raises(InputError, match="run-length code"):
         open_masks(path)
 
 
@@ -348,9 +348,9 @@ def test_a_video_of_masks_is_read_in_any_order(tmp_path):
 
 def test_arrays_that_are_no_masks_are_refused(tmp_path, write):
     np.savez(tmp_path / "m.npz", masks=np.zeros((3, 40)))
-    with pytest.raises(BadInput, match="no array of masks"):
+    with pytest.raises(InputError, match="no array of masks"):
         open_masks(tmp_path / "m.npz")
-    with pytest.raises(BadInput, match="NaN"):
+    with pytest.raises(InputError, match="NaN"):
         open_masks(write([np.full((40, 30), np.nan)], suffix=".npy"))
-    with pytest.raises(BadInput, match="There are no masks"):
+    with pytest.raises(InputError, match="There are no masks"):
         open_masks(tmp_path / "nowhere")

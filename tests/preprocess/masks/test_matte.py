@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.masks.matte import EDGE_PX, softened
+from preprocess.masks.matte import EDGE_SIGMA_PX, soften_border
 
 
 def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -21,15 +21,15 @@ def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray
 def test_edges_come_nearer_to_the_true_ones_than_hard_and_than_smooth_ones(rng):
     rgb, alpha = drawn(rng)
     hard = alpha > 0.5
-    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_PX)
-    off = [((mask - alpha) ** 2).mean() for mask in (hard, smooth, softened(rgb, hard))]
+    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
+    off = [((mask - alpha) ** 2).mean() for mask in (hard, smooth, soften_border(rgb, hard))]
     assert off[2] < 0.5 * off[1] < 0.5 * off[0]
 
 
 def test_only_the_border_changes(rng):
     rgb, alpha = drawn(rng)
     hard = alpha > 0.5
-    soft = softened(rgb, hard)
+    soft = soften_border(rgb, hard)
     square = np.ones((3, 3), np.uint8)
     inside = cv2.erode(hard.astype(np.uint8), square) > 0
     outside = cv2.dilate(hard.astype(np.uint8), square) == 0
@@ -43,9 +43,9 @@ def test_where_colours_are_alike_the_mask_is_smoothed(rng):
     _, alpha = drawn(rng)
     grey = np.full((64, 64, 3), 128, np.uint8)
     hard = alpha > 0.5
-    soft = softened(grey, hard)
+    soft = soften_border(grey, hard)
     border = (soft > 0.0) & (soft < 1.0)
-    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_PX)
+    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     np.testing.assert_allclose(soft[border], smooth[border], atol=1e-6)
 
 
@@ -53,4 +53,4 @@ def test_where_colours_are_alike_the_mask_is_smoothed(rng):
 def test_masks_of_all_or_nothing_stay(whole):
     person = np.full((20, 30), whole)
     rgb = np.zeros((20, 30, 3), np.uint8)
-    np.testing.assert_array_equal(softened(rgb, person), person)
+    np.testing.assert_array_equal(soften_border(rgb, person), person)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture.opening import open_source
-from preprocess.masks.naming import rows_by_name
+from preprocess.masks.naming import associate_by_name
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def film(tmp_path_factory) -> Path:
     ],
 )
 def test_numbers_count_the_frames_of_a_film_of_five(names, rows, film):
-    assert rows_by_name(names, open_source(film)) == rows
+    assert associate_by_name(names, open_source(film)) == rows
 
 
 @pytest.mark.parametrize(
@@ -51,4 +51,4 @@ def test_numbers_count_the_frames_of_a_film_of_five(names, rows, film):
 def test_masks_of_pictures_belong_to_those_of_their_name_or_number(names, rows, tmp_path):
     for number in (12, 13, 15):
         cv2.imwrite(str(tmp_path / f"shot_{number}.png"), np.zeros((8, 8, 3), np.uint8))
-    assert rows_by_name(names, open_source(tmp_path)) == rows
+    assert associate_by_name(names, open_source(tmp_path)) == rows

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from capture.errors import BadInput
-from preprocess.body_file import load_body
+from capture.errors import InputError
+from preprocess.body_file import load_body_model
 from preprocess.pickles import content as pickles
 from preprocess.pickles.content import read_pickled_arrays
 
@@ -73,7 +73,7 @@ def test_a_python_2_file_with_chumpy_and_scipy_is_read(tmp_path, smpl_arrays, ch
     path.write_bytes(python2_pickle(content))
     names = {arg for op, arg, _ in pickletools.genops(path.read_bytes()) if op.name == "GLOBAL"}
     assert {"chumpy.ch Ch", "numpy.core.multiarray _reconstruct"} <= names
-    body = load_body(path)
+    body = load_body_model(path)
     np.testing.assert_array_equal(body.template, smpl_arrays["v_template"])
     np.testing.assert_array_equal(body.shape_directions, smpl_arrays["shapedirs"])
     np.testing.assert_array_equal(body.pose_directions, smpl_arrays["posedirs"])
@@ -129,8 +129,8 @@ def test_a_pickle_with_code_in_it_is_refused_and_nothing_runs(tmp_path, smpl_arr
     path = tmp_path / "body.pkl"
     content = {**smpl_arrays, "v_template": hostile(marker)[way]}
     path.write_bytes(pickle.dumps(content, protocol))
-    with pytest.raises(BadInput, match="nothing was run"):
-        load_body(path)
+    with pytest.raises(InputError, match="nothing was run"):
+        load_body_model(path)
     assert not marker.exists()
 
 
@@ -144,7 +144,7 @@ def test_names_are_allowed_exactly_not_by_module(tmp_path):
     path = tmp_path / "a.pkl"
     for name in (b"numpy\nload", b"numpy.core.multiarray\nfromfile", b"builtins\nsetattr"):
         path.write_bytes(b"c" + name + b"\n.")
-        with pytest.raises(BadInput, match="nothing was run"):
+        with pytest.raises(InputError, match="nothing was run"):
             read_pickled_arrays(path, ("a",))
 
 
@@ -168,7 +168,7 @@ def test_bombs_and_rubbish_are_refused_or_harmless_and_take_no_memory(tmp_path, 
     path.write_bytes(data)
     tracemalloc.start()
     try:
-        with suppress(BadInput):
+        with suppress(InputError):
             assert read_pickled_arrays(path, ("a",)) == {}
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
@@ -184,7 +184,7 @@ def test_records_inside_cannot_be_turned_against_the_reader(tmp_path, chumpy):
     path = tmp_path / "a.pkl"
     for thing in (loop, huge, far, chumpy.Ch(), {"a": 1}, "text", None, [[1], [2, 3]]):
         path.write_bytes(python2_pickle({"a": thing}))
-        with pytest.raises(BadInput, match="`a`"):
+        with pytest.raises(InputError, match="`a`"):
             read_pickled_arrays(path, ("a",))
 
 
@@ -192,7 +192,7 @@ def test_a_file_beyond_the_limit_is_not_even_read(tmp_path, monkeypatch):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"a": np.zeros(1000)}))
     monkeypatch.setattr(pickles, "MAX_BYTES", 1000)
-    with pytest.raises(BadInput, match="are not read"):
+    with pytest.raises(InputError, match="are not read"):
         read_pickled_arrays(path, ("a",))
 
 
@@ -204,5 +204,5 @@ def test_damage_anywhere_is_refused_or_read_but_never_worse(tmp_path, data):
         whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     path = tmp_path / "a.pkl"
     path.write_bytes(whole)
-    with suppress(BadInput):
+    with suppress(InputError):
         read_pickled_arrays(path, ("a",))

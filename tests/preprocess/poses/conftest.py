@@ -33,7 +33,7 @@ def truth(rng) -> Motion:
         joint_rotations=waves,
         valid=np.ones(count, dtype=bool),
         betas=0.5 * rng.normal(size=10),
-        model="smpl",
+        body_model="smpl",
         frames=np.arange(count),
     )
 

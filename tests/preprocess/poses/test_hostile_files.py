@@ -23,10 +23,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.mutations import mutated, random_opcodes
-from capture.errors import BadInput
-from preprocess.body_file import load_body
-from preprocess.content import read_content
+from benchmarks.mutations import mutate_bytes, random_opcodes
+from capture.errors import InputError
+from preprocess.body_file import load_body_model
+from preprocess.content import read_untrusted_file
 from preprocess.pickles import content as pickles
 from preprocess.poses import read_poses
 
@@ -125,7 +125,7 @@ def test_code_in_any_container_is_refused_by_name_and_not_run(tmp_path, joblib_b
     command = f"{sys.executable} -c \"open(r'{marker}', 'w')\""
     path = tmp_path / "poses.any"
     path.write_bytes(containers(Calls(os.system, command), joblib_bytes)[kind])
-    with watched(), pytest.raises(BadInput, match=r"asks to run (posix|nt)\.system"):
+    with watched(), pytest.raises(InputError, match=r"asks to run (posix|nt)\.system"):
         read_poses(path)
     assert not marker.exists()
 
@@ -139,7 +139,7 @@ def test_code_in_a_storage_of_a_tensor_is_refused(tmp_path):
     inner = pickle.dumps(Calls(os.system, "true"))
     path = tmp_path / "t.npy"
     path.write_bytes(object_npy({"t": Calls(torch.storage._load_from_bytes, inner)}))
-    with watched(), pytest.raises(BadInput):
+    with watched(), pytest.raises(InputError):
         read_poses(path)
 
 
@@ -148,7 +148,7 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
     thing = {"n": np.arange(6.0).reshape(2, 3), "t": (1, 2.5, "x", None, True), 3: {"é": [b"b"]}}
     path = tmp_path / "any"
     path.write_bytes(containers(thing, joblib_bytes)[kind])
-    found = read_content(path)
+    found = read_untrusted_file(path)
     while isinstance(found, dict) and "n" not in found:
         found = found.get("b", found.get("deep", found.get("results", found.get("a"))))
         found = found[0] if isinstance(found, list) else found
@@ -161,7 +161,7 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
 def test_arrays_without_rows_are_read_from_every_protocol(tmp_path, protocol):
     path = tmp_path / "empty.pkl"
     path.write_bytes(pickle.dumps({"a": np.zeros((0, 3)), "b": b"", "c": np.ones(2)}, protocol))
-    found = read_content(path)
+    found = read_untrusted_file(path)
     assert found["a"].shape == (0, 3)
     assert found["b"] == ""
     np.testing.assert_array_equal(found["c"], np.ones(2))
@@ -169,8 +169,8 @@ def test_arrays_without_rows_are_read_from_every_protocol(tmp_path, protocol):
 
 def test_a_file_without_a_byte_is_called_empty(tmp_path):
     (tmp_path / "poses.npz").touch()
-    with pytest.raises(BadInput, match="it is empty"):
-        read_content(tmp_path / "poses.npz")
+    with pytest.raises(InputError, match="it is empty"):
+        read_untrusted_file(tmp_path / "poses.npz")
 
 
 def test_tensors_of_every_type_and_stride_are_read(tmp_path):
@@ -181,7 +181,7 @@ def test_tensors_of_every_type_and_stride_are_read(tmp_path):
     for data in (torch_bytes(tensors), torch_bytes(tensors, new=False), object_npy(tensors)):
         path = tmp_path / "t"
         path.write_bytes(data)
-        for read, tensor in zip(read_content(path), tensors, strict=True):
+        for read, tensor in zip(read_untrusted_file(path), tensors, strict=True):
             np.testing.assert_array_equal(read, tensor.detach().numpy())
 
 
@@ -240,7 +240,7 @@ def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
     monkeypatch.setattr("preprocess.content.MAX_BYTES", 16 << 20)
     tracemalloc.start()
     try:
-        with pytest.raises(BadInput):
+        with pytest.raises(InputError):
             read_poses(path)
         assert tracemalloc.get_traced_memory()[1] < 160 << 20
     finally:
@@ -251,7 +251,7 @@ def test_many_sparse_matrices_may_not_grow_beyond_the_limit_together(tmp_path, m
     path = tmp_path / "bomb"
     path.write_bytes(sparse_bombs())
     monkeypatch.setattr(pickles, "MAX_BYTES", 300 << 20)
-    with pytest.raises(BadInput, match="grow beyond 300 MiB"):
+    with pytest.raises(InputError, match="grow beyond 300 MiB"):
         read_poses(path)
 
 
@@ -278,14 +278,14 @@ def random_files(count: int, joblib_bytes) -> Iterator[bytes]:
         if number % 8 == 7:
             yield random_opcodes(rng)
         else:
-            yield mutated(whole[number % len(whole)], whole, rng)
+            yield mutate_bytes(whole[number % len(whole)], whole, rng)
 
 
 def outcome(path: Path, read) -> str:
     """How reading one file ended: read, or refused with a message that names it."""
     try:
         read(path)
-    except BadInput as refusal:
+    except InputError as refusal:
         return "refused" if str(path) in str(refusal) else "refused without its name"
     return "read"
 
@@ -300,10 +300,10 @@ def test_random_files_are_read_or_refused_and_no_worse(tmp_path, joblib_bytes):
             tracemalloc.reset_peak()
             before, began = tracemalloc.get_traced_memory()[0], time.process_time()
             with watched():
-                ended[outcome(path, read_content)] += 1
+                ended[outcome(path, read_untrusted_file)] += 1
                 outcome(path, read_poses)
-                with suppress(BadInput):
-                    load_body(path)
+                with suppress(InputError):
+                    load_body_model(path)
             assert tracemalloc.get_traced_memory()[1] - before < MOST_BYTES, data
             assert time.process_time() - began < 10.0, data
     finally:

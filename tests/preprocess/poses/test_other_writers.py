@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from preprocess.poses import read_poses
-from preprocess.poses.place import SMPLX_PELVIS, placed
+from preprocess.poses.place import SMPLX_PELVIS, place_in_camera_world
 from tests.preprocess.poses.test_trackers import World, npz, own_camera
 
 
@@ -145,9 +145,9 @@ WRITERS = [
 @pytest.mark.parametrize("write", WRITERS, ids=lambda write: write.__name__)
 def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(world, shaped, joints_of, write):
     motion = read_poses(write(world), default_model="body24")
-    assert motion.model == ("smplx" if write in (ex_avatar, file_a_frame) else "smpl")
+    assert motion.body_model == ("smplx" if write in (ex_avatar, file_a_frame) else "smpl")
     assert motion.valid.all()
-    motion = placed(motion, shaped, own_camera(motion), cameras_given=False)
+    motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
     away = np.linalg.norm(joints_of(motion) - joints_of(world.truth), axis=-1)
     assert away.shape == (40, 24)
     assert away.max() < 1e-3
@@ -167,10 +167,10 @@ def test_the_camera_in_lhms_files_is_the_trackers(world):
     for path in sorted(ex_avatar(world).iterdir()):
         content = json.loads(path.read_text())
         content |= {"focal": [900, 901], "princpt": [320.0, 180.0], "img_size_wh": [640, 360]}
-        path.write_text(json.dumps({**content, "betas": [0.1] * 10, "pad_ratio": 0}))
+        path.write_text_atomically(json.dumps({**content, "betas": [0.1] * 10, "pad_ratio": 0}))
     motion = read_poses(world.folder / "smplx_params")
     np.testing.assert_array_equal(motion.intrinsic, [[900, 0, 320], [0, 901, 180], [0, 0, 1]])
-    assert motion.model == "smplx"
+    assert motion.body_model == "smplx"
     np.testing.assert_allclose(motion.betas, 0.1)
 
 
@@ -181,7 +181,7 @@ def test_people_whom_slahmr_lost_are_lost_and_cameras_stay_with_their_rows(world
     arrays["track_mask"][0, 10:13] = False
     path = world.write("gaps.npz", npz(**arrays))
     motion = read_poses(path, person="0")
-    assert np.flatnonzero(motion.bridged).tolist() == [10, 11, 12]
+    assert np.flatnonzero(motion.interpolated).tolist() == [10, 11, 12]
     cameras, _, _ = seen_from(world)
     np.testing.assert_allclose(motion.camera_from_world, cameras)
 
@@ -194,7 +194,7 @@ def test_a_world_that_is_not_metric_is_refused(world):
         if not told:
             assert len(read_poses(path)) == 40
             continue
-        with pytest.raises(BadInput, match=r"`scale` of 0.37.*metres were expected. Divide"):
+        with pytest.raises(InputError, match=r"`scale` of 0.37.*metres were expected. Divide"):
             read_poses(path)
 
 
@@ -205,10 +205,10 @@ def test_the_number_of_joints_tells_the_body(world, numbers, model):
     poses = np.column_stack([world.thetas[:, :66], np.zeros((40, numbers - 66))])
     path = world.write("poses.npz", npz(poses=poses, trans=world.places))
     motion = read_poses(path)
-    assert motion.model == model
+    assert motion.body_model == model
     np.testing.assert_allclose(motion.joint_rotations[:, :21], world.truth.joint_rotations[:, :21])
     rated = world.write("rated.npz", npz(poses=poses, trans=world.places, mocap_framerate=60.0))
-    assert read_poses(rated).model == (model if numbers == 165 else "smpl")
+    assert read_poses(rated).body_model == (model if numbers == 165 else "smpl")
 
 
 def test_a_gendered_shape_is_spoken_of_where_somebodys_own_body_is_used(world):
@@ -232,14 +232,14 @@ def test_a_gendered_shape_is_spoken_of_where_somebodys_own_body_is_used(world):
 def test_what_is_no_pose_of_smpl_is_called_by_its_name(tmp_path, content, words):
     path = tmp_path / "poses.pkl"
     path.write_bytes(pickle.dumps(content))
-    with pytest.raises(BadInput, match=words):
+    with pytest.raises(InputError, match=words):
         read_poses(path)
 
 
 def test_hdf5_is_told_how_to_become_an_npz(tmp_path):
     path = tmp_path / "reconstructed_poses.hdf5"
     path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
-    with pytest.raises(BadInput, match=r"HDF5.*h5py.*savez"):
+    with pytest.raises(InputError, match=r"HDF5.*h5py.*savez"):
         read_poses(path)
 
 
@@ -247,14 +247,14 @@ def test_frames_whose_poses_have_other_shapes_do_not_fit_together(world):
     rows = json.loads(list_of_frames(world).read_text())
     rows[3]["body_pose"] = rows[3]["body_pose"][:21]
     path = world.write("poses.json", json.dumps(rows).encode())
-    with pytest.raises(BadInput, match="do not fit together"):
+    with pytest.raises(InputError, match="do not fit together"):
         read_poses(path)
 
 
 def test_a_motion_with_moving_cameras_of_its_own_is_not_bridged_where_a_camera_is_missing(truth):
-    from preprocess.poses.bridge import bridged
+    from preprocess.poses.bridge import fill_gaps
 
     some = replace(
         truth, frames=np.arange(40) * 2, camera_from_world=np.tile(np.eye(4), (40, 1, 1))
     )
-    assert bridged(some) is some
+    assert fill_gaps(some) is some

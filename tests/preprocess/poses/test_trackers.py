@@ -13,13 +13,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from capture.errors import BadInput
-from preprocess.camera_file import CameraTrack, tracker_intrinsic
+from capture.errors import InputError
+from preprocess.camera_file import CameraTrack, tracker_intrinsic_matrix
 from preprocess.kinematics import rotation_matrices
 from preprocess.pose import Motion
 from preprocess.poses import read_poses
-from preprocess.poses.bridge import bridged
-from preprocess.poses.place import SMPLX_PELVIS, placed
+from preprocess.poses.bridge import fill_gaps
+from preprocess.poses.place import SMPLX_PELVIS, place_in_camera_world
 
 SIZE = (640, 360)
 
@@ -349,7 +349,7 @@ def world(tmp_path, truth, shaped, joblib_bytes) -> World:
 
 def own_camera(motion: Motion) -> CameraTrack:
     """The camera that the tracker took, at the world's origin."""
-    matrix = tracker_intrinsic(motion, SIZE)
+    matrix = tracker_intrinsic_matrix(motion, SIZE)
     matrix = np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]]) if matrix is None else matrix
     return CameraTrack(cameras=(Camera.from_intrinsic(matrix, SIZE),), source="its own")
 
@@ -359,9 +359,9 @@ def own_camera(motion: Motion) -> CameraTrack:
 def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(
     world, shaped, joints_of, write, driving
 ):
-    motion = read_poses(write(world), default_model="smpl", driving=driving)
+    motion = read_poses(write(world), default_model="smpl", prefer_world=driving)
     assert np.flatnonzero(motion.valid).tolist() == list(range(40))
-    motion = placed(motion, shaped, own_camera(motion), cameras_given=False)
+    motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
     away = np.linalg.norm(joints_of(motion)[:40] - joints_of(world.truth), axis=-1)
     assert away.max() < 1e-3
 
@@ -384,7 +384,7 @@ def test_rows_without_numbers_have_times_or_are_matched_by_order(world):
     [(wham, "smpl"), (easymocap, "smpl"), (gvhmr, "smplx"), (amass_smplx, "smplx")],
 )
 def test_the_body_model_is_the_trackers(world, write, model):
-    assert read_poses(write(world), default_model="body24").model == model
+    assert read_poses(write(world), default_model="body24").body_model == model
 
 
 @pytest.mark.parametrize("write", [phalp, wham, vibe, tram, romp, easymocap, instant_avatar])
@@ -409,7 +409,7 @@ def test_of_several_people_the_longest_is_taken_and_the_others_are_named(
     assert "--person" in motion.note
     assert len(read_poses(path, person=taken)) == 40
     assert read_poses(path, person=other).valid.sum() in (rows, 14, 40)
-    with pytest.raises(BadInput, match=rf"nobody called '99'.*{other} \("):
+    with pytest.raises(InputError, match=rf"nobody called '99'.*{other} \("):
         read_poses(path, person="99")
 
 
@@ -465,11 +465,11 @@ def test_a_short_gap_is_bridged_and_marked_and_a_long_one_stays(world, shaped, j
     motion = read_poses(lost.write("w.pkl", pickle.dumps({0: rows})))
     assert motion.frames.tolist() == [*range(15), *range(30, 40)]
     assert motion.valid.all()
-    assert motion.frames[motion.bridged].tolist() == [5, 6, 7, 8]
+    assert motion.frames[motion.interpolated].tolist() == [5, 6, 7, 8]
     assert "4 poses that WHAM had lost" in motion.note
     away = joints_of(motion) - joints_of(without(np.r_[15:30], world.truth))
     assert np.linalg.norm(away, axis=-1)[5:9].max() < 0.1  # the way between is not the truth
-    assert np.linalg.norm(away, axis=-1)[~motion.bridged].max() < 1e-6
+    assert np.linalg.norm(away, axis=-1)[~motion.interpolated].max() < 1e-6
 
 
 def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
@@ -483,13 +483,13 @@ def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
         valid=np.array([True, False, True]),
         frames=np.array([10, 11, 13]),
     )
-    whole = bridged(motion)
+    whole = fill_gaps(motion)
     assert whole.frames.tolist() == [10, 11, 12, 13]
     expected = [[0, np.deg2rad(170.0 + step), 0] for step in (0, 10, 20, 30)]
     turned = rotation_matrices(whole.root_rotations)
     np.testing.assert_allclose(turned, rotation_matrices(np.array(expected)), atol=1e-12)
     np.testing.assert_allclose(whole.root_translations[:, 2], [3, 4, 5, 6])
-    assert bridged(motion, longest=1) is motion
+    assert fill_gaps(motion, max_gap=1) is motion
 
 
 # --- refused -----------------------------------------------------------------------------------
@@ -517,10 +517,10 @@ def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
 def test_what_holds_no_poses_is_refused_and_says_what_it_holds(tmp_path, content, message):
     path = tmp_path / "poses.pkl"
     path.write_bytes(pickle.dumps(content))
-    with pytest.raises(BadInput, match=message):
+    with pytest.raises(InputError, match=message):
         read_poses(path)
 
 
 def test_a_folder_without_poses_is_refused(tmp_path):
-    with pytest.raises(BadInput, match="folder with 0 files"):
+    with pytest.raises(InputError, match="folder with 0 files"):
         read_poses(tmp_path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from preprocess.solve.model import Model
+from preprocess.solve.model import SparseModel
 
 HALF_M, HEIGHT_M = 3.0, 2.6
 PIXELS_PER_M = 160
@@ -75,7 +75,7 @@ class Room:
         """The picture, 8-bit RGB."""
         width, height = camera.size_px
         eye = camera.center_world
-        rays = camera.directions(camera.pixel_centers()).reshape(-1, 3)
+        rays = camera.ray_directions(camera.pixel_centers()).reshape(-1, 3)
         low, high = np.array([-HALF_M, 0.0, -HALF_M]), np.array([HALF_M, HEIGHT_M, HALF_M])
         with np.errstate(divide="ignore"):
             ahead = np.where(rays > 0, (high - eye) / rays, (low - eye) / rays)
@@ -111,7 +111,7 @@ def walked() -> Callable[..., list[Camera]]:
     return arc
 
 
-def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) -> Model:
+def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) -> SparseModel:
     """A model in which every camera sees every point that is in its picture, where it is."""
     rng = np.random.default_rng(2)
     seen_by, seen_point, pixels = [], [], []
@@ -123,7 +123,7 @@ def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) ->
         seen_point.append(np.flatnonzero(inside))
         pixels.append(there[inside] + noise_px * rng.normal(size=(inside.sum(), 2)))
     first = cameras[0]
-    return Model(
+    return SparseModel(
         frames=np.arange(len(cameras)),
         camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
         focal_px=first.focal_px[0],
@@ -131,8 +131,8 @@ def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) ->
         bend=0.0,
         size_px=first.size_px,
         points=points,
-        seen_by=np.concatenate(seen_by),
-        seen_point=np.concatenate(seen_point),
+        observation_camera=np.concatenate(seen_by),
+        observation_point=np.concatenate(seen_point),
         pixels=np.concatenate(pixels),
     )
 
@@ -154,11 +154,11 @@ def cameras(walked) -> list[Camera]:
 
 
 @pytest.fixture
-def model(cameras, room_points) -> Model:
+def model(cameras, room_points) -> SparseModel:
     """An exact solution, in metres."""
     return exactly(cameras, room_points)
 
 
 @pytest.fixture(scope="session")
-def exact_model() -> Callable[..., Model]:
+def exact_model() -> Callable[..., SparseModel]:
     return exactly

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from preprocess.solve.gates import agreement, doubtful, judged, similarity
+from preprocess.solve.gates import compare_models, find_outlier_cameras, evaluate_gates, fit_similarity
 
 
 def failed(gates) -> list[str]:
@@ -36,15 +36,15 @@ def turned(model, row: int, degrees: float):
 
 def test_an_exact_solution_passes_whatever_its_world(model):
     for one in (model, transformed(model)):
-        gates = judged(one, len(one.frames))
+        gates = evaluate_gates(one, len(one.frames))
         assert failed(gates) == []
         assert next(g.value for g in gates if g.name == "reprojection_px") < 1e-9
-        assert not doubtful(one).any()
+        assert not find_outlier_cameras(one).any()
 
 
 def test_noise_of_pixels_is_measured(cameras, room_points, exact_model):
     noisy = exact_model(cameras, room_points, noise_px=1.0)
-    gates = judged(noisy, len(cameras))
+    gates = evaluate_gates(noisy, len(cameras))
     assert failed(gates) == ["reprojection_px"]
     # the length of a vector of two normal numbers is sqrt(pi / 2) on average
     assert next(g.value for g in gates if g.name == "reprojection_px") == pytest.approx(
@@ -53,14 +53,14 @@ def test_noise_of_pixels_is_measured(cameras, room_points, exact_model):
 
 
 def test_key_frames_that_are_missing_are_counted(model):
-    assert failed(judged(model, round(len(model.frames) / 0.89))) == ["registered"]
+    assert failed(evaluate_gates(model, round(len(model.frames) / 0.89))) == ["registered"]
 
 
 @pytest.mark.parametrize("share", [0.3, 2.6])
 def test_a_lens_that_nobody_has_is_refused(cameras, room_points, exact_model, share):
     focal = share * 640
     lenses = [replace(camera, focal_px=(focal, focal)) for camera in cameras]
-    assert "focal" in failed(judged(exact_model(lenses, room_points), len(cameras)))
+    assert "focal" in failed(evaluate_gates(exact_model(lenses, room_points), len(cameras)))
 
 
 def test_a_camera_that_hardly_moves_is_refused(walked, room_points, exact_model):
@@ -71,30 +71,30 @@ def test_a_camera_that_hardly_moves_is_refused(walked, room_points, exact_model)
         near = camera.camera_from_world.copy()
         near[:3, 3] = eye + 0.02 * (near[:3, 3] - eye)
         close.append(replace(camera, camera_from_world=near))
-    assert "angle_deg" in failed(judged(exact_model(close, room_points), len(close)))
+    assert "angle_deg" in failed(evaluate_gates(exact_model(close, room_points), len(close)))
 
 
 @pytest.mark.parametrize("row", [1, 11, 22])
 def test_one_camera_that_looks_elsewhere_is_found(model, row):
-    found = doubtful(turned(model, row, 8.0))
+    found = find_outlier_cameras(turned(model, row, 8.0))
     assert found.nonzero()[0].tolist() == [row]
 
 
 def test_a_camera_placed_by_a_few_points_is_found(model):
-    few = model.seen_in(7)[20:]
+    few = model.observations_of_camera(7)[20:]
     kept = np.setdiff1d(np.arange(len(model.pixels)), few)
     thinned = replace(
-        model, seen_by=model.seen_by[kept], seen_point=model.seen_point[kept],
+        model, observation_camera=model.seen_by[kept], observation_point=model.seen_point[kept],
         pixels=model.pixels[kept],
     )  # fmt: skip
-    assert doubtful(thinned).nonzero()[0].tolist() == [7]
-    rest = thinned.without(doubtful(thinned))
+    assert find_outlier_cameras(thinned).nonzero()[0].tolist() == [7]
+    rest = thinned.without(find_outlier_cameras(thinned))
     assert rest.frames.tolist() == [i for i in range(24) if i != 7]
     assert rest.residuals().max() < 1e-9
 
 
 def test_two_solutions_agree_if_they_differ_by_a_similarity(model):
-    gate = agreement(model, transformed(model))
+    gate = compare_models(model, transformed(model))
     assert gate.passed
     assert gate.value < 1e-9
 
@@ -103,10 +103,10 @@ def test_two_solutions_contradict_each_other(model):
     bent = model.camera_from_world.copy()
     path = np.linalg.norm(np.diff(model.centers(), axis=0), axis=1).sum()
     bent[12:, :3, 3] += bent[12:, :3, :3] @ [0.0, 0.06 * path, 0.0]
-    assert not agreement(model, replace(model, camera_from_world=bent)).passed
-    assert not agreement(model, turned(model, 5, 1.5)).passed  # the centres stay where they were
+    assert not compare_models(model, replace(model, camera_from_world=bent)).passed
+    assert not compare_models(model, turned(model, 5, 1.5)).passed  # the centres stay where they were
     half = model.without(np.arange(24) % 2 == 0)
-    assert not agreement(model, half).passed
+    assert not compare_models(model, half).passed
 
 
 @given(
@@ -117,7 +117,7 @@ def test_two_solutions_contradict_each_other(model):
 def test_a_similarity_is_found_again(scale, turn, shift):
     points = np.random.default_rng(0).normal(size=(8, 3))
     rotation = Rotation.from_rotvec(turn).as_matrix()
-    found = similarity(points, scale * points @ rotation.T + shift)
+    found = fit_similarity(points, scale * points @ rotation.T + shift)
     assert found[0] == pytest.approx(scale)
     np.testing.assert_allclose(found[1], rotation, atol=1e-9)
     np.testing.assert_allclose(found[2], shift, atol=1e-8 * max(1.0, scale))

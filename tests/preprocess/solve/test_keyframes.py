@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
-from preprocess.solve.keyframes import choose, grown, read_keys, write_keys
+from preprocess.solve.keyframes import select_keyframes, dilate_person, read_keyframes, write_keyframes
 
 COUNT, SHARP = 36, (1, 5, 6, 11, 13, 17, 18, 22, 25, 29, 32, 35)
 
@@ -30,7 +30,7 @@ def film(tmp_path, rng):
 
 def test_the_sharpest_frame_of_each_stretch_is_chosen(film):
     told = []
-    keys = list(choose(film, nobody, told.append, 12))
+    keys = list(select_keyframes(film, nobody, told.append, 12))
     assert tuple(key.index for key in keys) == SHARP
     assert told[-1] == 1.0
     assert told == sorted(told)
@@ -38,14 +38,14 @@ def test_the_sharpest_frame_of_each_stretch_is_chosen(film):
 
 def test_only_wanted_frames_are_chosen(film):
     part = open_source(film.path, frames=slice(6, 30, 2))
-    assert {key.index for key in choose(part, nobody, lambda s: None, 60)} == set(range(6, 30, 2))
+    assert {key.index for key in select_keyframes(part, nobody, lambda s: None, 60)} == set(range(6, 30, 2))
 
 
 def test_frames_in_which_nobody_knows_the_person_are_passed_over(film):
     def sometimes(frame, size_px):
         return None if frame.index in (5, 6) else nobody(frame, size_px)
 
-    chosen = [key.index for key in choose(film, sometimes, lambda share: None, 12)]
+    chosen = [key.index for key in select_keyframes(film, sometimes, lambda share: None, 12)]
     assert not {5, 6} & set(chosen)
     assert len(chosen) == 12
 
@@ -53,7 +53,7 @@ def test_frames_in_which_nobody_knows_the_person_are_passed_over(film):
 def test_the_person_is_left_out_with_a_margin():
     person = np.zeros((200, 300), dtype=bool)
     person[50:150, 100:140] = True
-    around = grown(person)
+    around = dilate_person(person)
     rows, columns = np.nonzero(around)
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (46, 153, 96, 143)
 
@@ -64,20 +64,20 @@ def test_key_frames_are_read_as_they_were_written(film, tmp_path):
         person[:, : size_px[0] // 2] = True
         return person
 
-    chosen = choose(film, left_half, lambda share: None, 12)
-    written = write_keys(chosen, tmp_path / "images", tmp_path / "masks")
-    again = read_keys(tmp_path / "images", tmp_path / "masks")
+    chosen = select_keyframes(film, left_half, lambda share: None, 12)
+    written = write_keyframes(chosen, tmp_path / "images", tmp_path / "masks")
+    again = read_keyframes(tmp_path / "images", tmp_path / "masks")
     for one, other in zip(written, again, strict=True):
         assert one.index == other.index
-        np.testing.assert_array_equal(one.grey, other.grey)
-        np.testing.assert_array_equal(one.person, other.person)
+        np.testing.assert_array_equal(one.gray, other.gray)
+        np.testing.assert_array_equal(one.person_mask, other.person_mask)
     mask = cv2.imread(str(tmp_path / "masks" / "000001.png.png"), cv2.IMREAD_GRAYSCALE)
     assert not mask[:, :32].any()  # COLMAP looks where a mask is not 0
     assert (mask[:, 40:] == 255).all()
 
 
 def test_too_few_key_frames_are_refused(film, tmp_path):
-    with pytest.raises(BadInput, match="Only 5 frames"):
-        write_keys(
-            choose(film, nobody, lambda share: None, 5), tmp_path / "images", tmp_path / "masks"
+    with pytest.raises(InputError, match="Only 5 frames"):
+        write_keyframes(
+            select_keyframes(film, nobody, lambda share: None, 5), tmp_path / "images", tmp_path / "masks"
         )

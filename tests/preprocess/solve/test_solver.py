@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.errors import BadInput
+from capture.errors import InputError
 from capture.opening import open_source
 from preprocess.solve import mapping, solver
-from preprocess.solve.gates import similarity
-from preprocess.solve.model import Model
-from preprocess.solve.solved import INTERPOLATED, KEY, PLACED, Solved
-from preprocess.solve.solver import Settings, solve
+from preprocess.solve.gates import fit_similarity
+from preprocess.solve.model import SparseModel
+from preprocess.solve.solved import INTERPOLATED, KEY, PLACED, CameraSolution
+from preprocess.solve.solver import SolverSettings, solve_cameras
 
 SIZE = (320, 240)
 FRAMES, KEYS = 20, 10
@@ -39,8 +39,8 @@ def walk(room, walked, tmp_path_factory):
     cameras = walked(FRAMES, degrees=80, size_px=SIZE, focal_px=260.0)
     source = filmed(folder / "film", [room.seen(camera) for camera in cameras])
     told = []
-    settings = Settings(most_keys=KEYS)
-    solved = solve(source, nobody, folder / "work", settings, lambda *what: told.append(what))
+    settings = SolverSettings(max_keyframes=KEYS)
+    solved = solve_cameras(source, nobody, folder / "work", settings, lambda *what: told.append(what))
     return cameras, source, solved, folder / "work", told
 
 
@@ -51,7 +51,7 @@ def test_cameras_of_a_walk_are_solved_to_millimetres(walk):
     views = solved.camera_from_solved
     centers = -np.einsum("cba,cb->ca", views[:, :3, :3], views[:, :3, 3])
     true = np.stack([camera.center_world for camera in cameras])
-    scale, turn, shift = similarity(centers, true)
+    scale, turn, shift = fit_similarity(centers, true)
     off = np.linalg.norm(scale * centers @ turn.T + shift - true, axis=1)
     assert off.max() < 0.01
     rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
@@ -78,10 +78,10 @@ def test_every_stage_is_told_and_paid_for(walk):
 def test_what_is_finished_is_not_done_again(walk, tmp_path, monkeypatch):
     _, source, solved, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
-    for name in ("extract", "match", "map_globally", "map_incrementally"):
+    for name in ("extract", "match", "map_global", "map_incremental"):
         monkeypatch.setattr(mapping, name, None)  # calling it would be an error
-    monkeypatch.setattr(solver, "place_between", None)
-    again = solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    monkeypatch.setattr(solver, "resect_intermediate_frames", None)
+    again = solve_cameras(source, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None)
     np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
     assert again.gates == solved.gates
 
@@ -90,17 +90,17 @@ def test_a_stage_that_was_cut_off_is_done_anew(walk, tmp_path):
     _, source, solved, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
     (tmp_path / "work" / "frames between").rename(tmp_path / "work" / "part.frames between")
-    again = solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    again = solve_cameras(source, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None)
     np.testing.assert_allclose(again.camera_from_solved, solved.camera_from_solved, atol=1e-9)
 
 
 def test_a_solution_is_read_as_it_was_written(walk, tmp_path):
     *_, solved, _, _ = walk
     solved.save(tmp_path)
-    again = Solved.load(tmp_path)
+    again = CameraSolution.load(tmp_path)
     np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
-    np.testing.assert_array_equal(again.marks, solved.marks)
-    np.testing.assert_array_equal(again.model.residuals(), solved.model.residuals())
+    np.testing.assert_array_equal(again.frame_status, solved.marks)
+    np.testing.assert_array_equal(again.model.reprojection_errors_px(), solved.model.residuals())
     assert again.gates == solved.gates
     assert again.costs == solved.costs
 
@@ -113,22 +113,22 @@ def test_a_frame_that_shows_nothing_is_interpolated(walk, tmp_path):
     pictures[lost] = np.full_like(pictures[lost], 90)
     spoilt = filmed(tmp_path / "film", pictures)
     (tmp_path / "work" / "frames between").unlink()
-    again = solve(spoilt, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
-    assert again.marks[lost] == INTERPOLATED
-    assert (again.marks == INTERPOLATED).sum() == 1
+    again = solve_cameras(spoilt, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None)
+    assert again.frame_status[lost] == INTERPOLATED
+    assert (again.frame_status == INTERPOLATED).sum() == 1
 
 
 def test_pictures_that_have_nothing_in_common_are_refused(tmp_path, rng):
     noise = [rng.integers(0, 255, (12, 16, 3), dtype=np.uint8) for _ in range(8)]
     source = filmed(tmp_path / "film", [cv2.resize(picture, (160, 120)) for picture in noise])
     with pytest.raises(
-        BadInput, match="with certainty: the pictures have hardly anything in common"
+        InputError, match="with certainty: the pictures have hardly anything in common"
     ):
-        solve(source, nobody, tmp_path / "work", Settings(), lambda *what: None)
+        solve_cameras(source, nobody, tmp_path / "work", SolverSettings(), lambda *what: None)
 
 
 def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_path, monkeypatch):
-    monkeypatch.setattr(mapping, "map_globally", None)  # before anything is mapped
+    monkeypatch.setattr(mapping, "map_global", None)  # before anything is mapped
     here = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
     pictures = []
     for degrees in np.linspace(-14.0, 14.0, 8):
@@ -136,8 +136,8 @@ def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_pa
         turn[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
         view = turn @ here.camera_from_world
         pictures.append(room.seen(replace(here, camera_from_world=view)))
-    with pytest.raises(BadInput, match="turns on the spot"):
-        solve(filmed(tmp_path / "film", pictures), nobody, tmp_path / "w", Settings(), lambda *w: 0)
+    with pytest.raises(InputError, match="turns on the spot"):
+        solve_cameras(filmed(tmp_path / "film", pictures), nobody, tmp_path / "w", SolverSettings(), lambda *w: 0)
 
 
 def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch):
@@ -147,7 +147,7 @@ def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch
     costs = json.loads((tmp_path / "work" / "stages.json").read_text())
     for seed in (0, 1):
         for kind in ("global", "incremental"):
-            model = Model.load(work / f"{kind} mapping 0" / "model.npz")
+            model = SparseModel.load(work / f"{kind} mapping 0" / "model.npz")
             if kind == "incremental":
                 lift = np.linspace(0.0, 0.3, len(model.frames))[:, None] * [0.0, 1.0, 0.0]
                 turned = model.camera_from_world[:, :3, :3]
@@ -156,23 +156,23 @@ def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch
             (tmp_path / "work" / name).mkdir(exist_ok=True)
             model.save(tmp_path / "work" / name / "model.npz")
             costs[name] = costs["matches"]
-    (tmp_path / "work" / "stages.json").write_text(json.dumps(costs))
+    (tmp_path / "work" / "stages.json").write_text_atomically(json.dumps(costs))
     monkeypatch.setattr(solver, "judged", lambda model, keys: [])  # each passes by itself
-    with pytest.raises(BadInput, match="contradict each other"):
-        solve(source, nobody, tmp_path / "work", Settings(most_keys=KEYS), lambda *what: None)
+    with pytest.raises(InputError, match="contradict each other"):
+        solve_cameras(source, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None)
 
 
 def test_a_tripod_needs_no_solution(room, walked, tmp_path, monkeypatch):
     monkeypatch.setattr(mapping, "extract", None)
     camera = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
     source = filmed(tmp_path / "film", [room.seen(camera)] * 9)
-    solved = solve(source, nobody, tmp_path / "work", Settings(), lambda *what: None)
+    solved = solve_cameras(source, nobody, tmp_path / "work", SolverSettings(), lambda *what: None)
     assert solved.still
     solved.save(tmp_path / "work")
-    assert Solved.load(tmp_path / "work").still
+    assert CameraSolution.load(tmp_path / "work").still
 
 
 def test_a_missing_pycolmap_is_said(monkeypatch, tmp_path):
     monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(BadInput, match="pip install pycolmap"):
-        mapping.check_installed()
+    with pytest.raises(InputError, match="pip install pycolmap"):
+        mapping.require_pycolmap()
