@@ -23,7 +23,7 @@ def _quiet_excepthook(
     Nor is a reader that has seen enough: `ia-play --help | head`.
     """
     if issubclass(kind, KeyboardInterrupt):
-        print("stopped by Ctrl-C.", file=sys.stderr)  # noqa: T201 - no console is there yet
+        print("stopped by Ctrl-C.", file=sys.stderr)  # noqa: T201 - there is no console yet
     elif issubclass(kind, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still held back goes nowhere
     else:

@@ -9,20 +9,26 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.checking.command import check_command
-from apps.checking.examine import GOOD_EDGE_RATIO, NO_KNOWN_MISTAKE, CaptureValidation, check_capture, json_number
-from apps.checking.mended import check_new_or_empty, write_corrected_capture
-from apps.checking.sheet import write_contact_sheet
-from apps.ingest_arguments import parse_frame_range, mask_inversion
-from apps.recording.wanted import CaptureInputs
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, run_command
-from apps.terminal.places import check_disjoint_from_inputs, check_output_file
+from apps.checks.capture_validation import (
+    GOOD_EDGE_RATIO,
+    NO_KNOWN_MISTAKE,
+    CaptureValidation,
+    check_capture,
+    json_number,
+)
+from apps.checks.contact_sheet import write_contact_sheet
+from apps.checks.corrected_capture import check_new_or_empty, write_corrected_capture
+from apps.checks.preflight_check import check_command
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import BAD_INPUT, DONE, run_command
+from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file
+from apps.run.ingest_arguments import mask_inversion, parse_frame_range
 from capture.atomic_files import write_text_atomically
-from capture.camera_device import camera_address
-from capture.errors import InputError
-from preprocess.doctor.diagnosis import GOOD_IOU, USABLE_IOU
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from preprocess.alignment.correction_search import GOOD_IOU, USABLE_IOU
+from preprocess.capture_session import CaptureInputs
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """How the name of a picture that --sheet names may end."""
@@ -98,7 +104,9 @@ class CheckArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parse_frame_range(self.frames),
-            invert_masks=mask_inversion(person_dark=self.mask_invert, person_bright=self.no_mask_invert),
+            invert_masks=mask_inversion(
+                person_dark=self.mask_invert, person_bright=self.no_mask_invert
+            ),
             person=self.person,
         )
 
@@ -112,7 +120,9 @@ class CheckArguments:
         if self.json is not None:
             check_output_file(self.json, "--json", inputs, overwrite=self.overwrite)
         if self.sheet is not None and self.sheet.suffix.lower() not in IMAGE_SUFFIXES:
-            raise InputError(f"--sheet is {self.sheet}; a name in {', '.join(IMAGE_SUFFIXES)} was expected.")
+            raise InputError(
+                f"--sheet is {self.sheet}; a name in {', '.join(IMAGE_SUFFIXES)} was expected."
+            )
         check_output_file(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
         if self.fix is not None:
             check_disjoint_from_inputs(self.fix, "--fix", inputs)
@@ -178,19 +188,30 @@ def check_to_json(examined: CaptureValidation) -> dict[str, Any]:
         "format": 1,
         "verdict": examined.verdict,
         "cause": examined.causes[0] if examined.causes else None,
-        "iou": {"now": json_number(examined.stored_iou), "after_fix": json_number(examined.corrected_iou)},
+        "iou": {
+            "now": json_number(examined.stored_iou),
+            "after_fix": json_number(examined.corrected_iou),
+        },
         "tried": [
-            {"cause": guess.correction.cause, "iou": json_number(guess.mean_score), "words": guess.correction.description}
+            {
+                "cause": guess.correction.cause,
+                "iou": json_number(guess.mean_score),
+                "words": guess.correction.description,
+            }
             for guess in tried
         ],
         "film": None
         if film is None
         else {
-            "now": json_number(film.now),
-            "after_fix": json_number(film.after),
+            "now": json_number(film.score_before),
+            "after_fix": json_number(film.score_after),
             "tried": [
-                {"cause": guess.cure.cause, "score": json_number(guess.iou), "words": guess.cure.words}
-                for guess in film.tried
+                {
+                    "cause": guess.correction.cause,
+                    "score": json_number(guess.mean_score),
+                    "words": guess.correction.description,
+                }
+                for guess in film.candidates
             ],
         },
         "corrections": [{"cause": cure.cause, "words": cure.description} for cure in cures],
@@ -227,7 +248,9 @@ def _print_findings(examined: CaptureValidation, console: Console) -> None:
         )
         return
     but = ", but not with the pictures" if examined.has_film_errors else ""
-    console.info(f"{examined.verdict}: body and masks agree by {examined.stored_iou:.2f} (0 to 1){but}.")
+    console.info(
+        f"{examined.verdict}: body and masks agree by {examined.stored_iou:.2f} (0 to 1){but}."
+    )
     for cure in examined.diagnosis.corrections:
         console.info(f"It looks as if {cure.description} ({cure.cause}).")
     if examined.causes:

@@ -7,18 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.evaluating.arguments import EvaluateArguments
-from apps.learning.run_folder import RunFolder
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
-from capture.errors import InputError
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
+from apps.evaluation.evaluate_arguments import EvaluateArguments
+from apps.run.run_folder import RunFolder
+from capture.input_error import InputError
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from apps.evaluating.frames import EvaluationFrames
-    from apps.evaluating.protocol import DatasetSubject
-    from apps.evaluating.rows import AvatarEvaluation
-    from avatar.trainer import Trainer
+    from apps.evaluation.evaluation_frames import EvaluationFrames
+    from apps.evaluation.people_snapshot import DatasetSubject
+    from apps.evaluation.score_table import AvatarEvaluation
+    from avatar.training.trainer import Trainer
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,9 +36,8 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     """
     arguments.validate()
     with console.status("loading torch"):
-        from apps.evaluating.rows import evaluations_to_json
-        from apps.evaluating.table import markdown_table
-        from apps.terminal.interrupt import stop_on_interrupt
+        from apps.cli.interrupt import stop_on_interrupt
+        from apps.evaluation.score_table import evaluations_to_json, markdown_table
         from capture.atomic_files import write_text_atomically
 
     found: list[AvatarEvaluation] = []
@@ -55,7 +54,9 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     told = markdown_table(found)
     print(told, end="")  # noqa: T201 - the table goes to stdout, for scripts
     if arguments.json is not None:
-        write_text_atomically(arguments.json, evaluations_to_json(found), replace=arguments.overwrite)
+        write_text_atomically(
+            arguments.json, evaluations_to_json(found), replace=arguments.overwrite
+        )
     if arguments.markdown is not None:
         write_text_atomically(arguments.markdown, told, replace=arguments.overwrite)
     return INTERRUPTED if stop.is_set() else DONE
@@ -63,8 +64,8 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
 
 def _evaluate_all(
     arguments: EvaluateArguments, console: Console, stop: threading.Event
-) -> "Iterator[Evaluation]":
-    from apps.evaluating.protocol import find_subjects
+) -> "Iterator[AvatarEvaluation]":
+    from apps.evaluation.people_snapshot import find_subjects
 
     for path in arguments.targets:
         if stop.is_set():
@@ -76,7 +77,9 @@ def _evaluate_all(
             yield _evaluate_run(run, arguments, console, stop)
         elif subjects := find_subjects(path):
             if arguments.on is not None:
-                raise InputError(f"{path} is a dataset with test frames of its own; leave --on out.")
+                raise InputError(
+                    f"{path} is a dataset with test frames of its own; leave --on out."
+                )
             for subject, place in subjects:
                 run = _run_folder_of(subject, path, arguments)
                 if not stop.is_set() and _train_subject(subject, place, run, arguments, console):
@@ -94,8 +97,8 @@ def _evaluate_package(
     path: Path, arguments: EvaluateArguments, console: Console, stop: threading.Event
 ) -> "AvatarEvaluation":
     """The player alone, beside frames that have to be named."""
-    from apps.evaluating.frames import capture_frames
-    from apps.evaluating.judge import evaluate_avatar
+    from apps.evaluation.avatar_scorer import evaluate_avatar
+    from apps.evaluation.evaluation_frames import capture_frames
 
     if arguments.on is None:
         raise InputError(
@@ -111,18 +114,28 @@ def _evaluate_package(
 def _evaluate_run(
     run: RunFolder, arguments: EvaluateArguments, console: Console, stop: threading.Event
 ) -> "AvatarEvaluation":
-    """RenderFunction and player beside the run's own held-out frames, or another capture's."""
-    from apps.evaluating.frames import capture_frames, held_out_frames, trained_longer_side_px
+    """Renderer and player beside the run's own held-out frames, or another capture's."""
+    from apps.evaluation.evaluation_frames import (
+        capture_frames,
+        held_out_frames,
+        trained_longer_side_px,
+    )
 
     if arguments.on is None:
         frames = held_out_frames(run, arguments.size)
     else:
         person = run.body_file if run.body_file.is_file() else None
-        frames = capture_frames(arguments.capture_inputs(arguments.on), person, arguments.size or trained_longer_side_px(run))
+        frames = capture_frames(
+            arguments.capture_inputs(arguments.on),
+            person,
+            arguments.size or trained_longer_side_px(run),
+        )
     return _evaluate_renderer_and_player(str(run.path), run, frames, arguments, console, stop)
 
 
-def _run_folder_of(subject: "DatasetSubject", dataset: Path, arguments: EvaluateArguments) -> RunFolder:
+def _run_folder_of(
+    subject: "DatasetSubject", dataset: Path, arguments: EvaluateArguments
+) -> RunFolder:
     """Where a subject is learnt."""
     above = arguments.out or Path("runs") / dataset.resolve().name
     return RunFolder(path=above / subject.name)
@@ -137,29 +150,38 @@ def _evaluate_subject(
     stop: threading.Event,
 ) -> "AvatarEvaluation":
     """A subject of the dataset that was learnt, in the paper's frames."""
-    from apps.evaluating.frames import capture_frames
-    from apps.evaluating.protocol import LONGER_SIDE_PX, TEST_POSES, subject_poses
-    from apps.ingest_arguments import parse_frame_range
+    from apps.evaluation.evaluation_frames import capture_frames
+    from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TEST_POSES, subject_poses
+    from apps.run.ingest_arguments import parse_frame_range
 
     wanted = replace(
-        arguments.capture_inputs(folder), poses=subject_poses(folder, TEST_POSES), frames=parse_frame_range(subject.test)
+        arguments.capture_inputs(folder),
+        poses=subject_poses(folder, TEST_POSES),
+        frames=parse_frame_range(subject.test),
     )
     frames = capture_frames(wanted, run.body_file, arguments.size or LONGER_SIDE_PX)
-    return replace(_evaluate_renderer_and_player(subject.name, run, frames, arguments, console, stop), paper=subject.paper)
+    return replace(
+        _evaluate_renderer_and_player(subject.name, run, frames, arguments, console, stop),
+        paper=subject.paper,
+    )
 
 
 def _train_subject(
-    subject: "DatasetSubject", folder: Path, run: RunFolder, arguments: EvaluateArguments, console: Console
+    subject: "DatasetSubject",
+    folder: Path,
+    run: RunFolder,
+    arguments: EvaluateArguments,
+    console: Console,
 ) -> bool:
     """Makes the subject's run as ia-ingest does, from all of the paper's training frames.
 
     Returns:
         Whether it is whole; Ctrl-C leaves a part, with which the next evaluation goes on.
     """
-    from apps.evaluating.frames import is_trained
-    from apps.evaluating.protocol import LONGER_SIDE_PX, TRAIN_POSES, subject_poses
+    from apps.evaluation.evaluation_frames import is_trained
+    from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TRAIN_POSES, subject_poses
     from apps.ingest import ingest
-    from apps.ingest_arguments import IngestArguments
+    from apps.run.ingest_arguments import IngestArguments
 
     if is_trained(run, seconds=arguments.seconds, steps=arguments.steps):
         console.info(f"{subject.name} was learnt before, in {run.path}.")
@@ -195,17 +217,19 @@ def _evaluate_renderer_and_player(
     console: Console,
     stop: threading.Event,
 ) -> "AvatarEvaluation":
-    from apps.evaluating.judge import evaluate_avatar
+    from apps.evaluation.avatar_scorer import evaluate_avatar
 
     package = run.package if arguments.player and run.package.is_file() else None
     trainer = _load_trainer(run, arguments, console)
-    return evaluate_avatar(name, frames, trainer, package, console, stop, fit_poses=arguments.fitted)
+    return evaluate_avatar(
+        name, frames, trainer, package, console, stop, fit_poses=arguments.fitted
+    )
 
 
 def _load_trainer(run: RunFolder, arguments: EvaluateArguments, console: Console) -> "Trainer":
     with console.status(f"loading {run.checkpoint}"):
-        from apps.terminal.device import resolve_device
-        from avatar import checkpoint
+        from apps.cli.device import resolve_device
+        from avatar.training import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, resolve_device(arguments.device))
     return trainer

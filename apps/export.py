@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.learning.run_folder import RunFolder
-from apps.playing.novel import demo_motion
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, NO_AVATAR, CommandExit, run_command
-from apps.terminal.places import check_output_file
+from apps.animation.driving_motion import demo_motion
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, NO_AVATAR, CommandExit, run_command
+from apps.cli.output_paths import check_output_file
+from apps.run.run_folder import RunFolder
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
-from capture.errors import InputError
-from preprocess.pose import BodyPose
+from capture.input_error import InputError
+from preprocess.body.body_pose import BodyPose
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from avatar.rig import Rig
+    from avatar.deformation.rig import Rig
 
 CHECK_VIEWS = 4
 VIEW_PX = 256
@@ -84,13 +84,21 @@ def export(arguments: ExportArguments, console: Console) -> int:
         Stop: If there is nothing to draw.
     """
     if arguments.out.suffix.lower() != f".{arguments.to}":
-        raise InputError(f"--out is {arguments.out}; a name that ends in .{arguments.to} was expected.")
+        raise InputError(
+            f"--out is {arguments.out}; a name that ends in .{arguments.to} was expected."
+        )
     if not arguments.out.resolve().parent.is_dir():
-        raise InputError(f"--out: there is no folder {arguments.out.resolve().parent}. Make it first.")
-    inputs = [path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()]
+        raise InputError(
+            f"--out: there is no folder {arguments.out.resolve().parent}. Make it first."
+        )
+    inputs = [
+        path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()
+    ]
     check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
     if arguments.poses is not None and arguments.to != "glb":
-        raise InputError(f"--poses go into a .glb; a .{arguments.to} holds no motion. Leave them out.")
+        raise InputError(
+            f"--poses go into a .glb; a .{arguments.to} holds no motion. Leave them out."
+        )
     if arguments.run.is_file() and arguments.to != "iavatar":
         _export_mesh(arguments, arguments.run, console)
     else:
@@ -107,7 +115,7 @@ def export(arguments: ExportArguments, console: Console) -> int:
 
 
 def _export_mesh(arguments: ExportArguments, package: Path, console: Console) -> None:
-    from apps.playing.mesh_file import write_mesh
+    from apps.animation.mesh_writer import write_mesh
 
     write_mesh(
         package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem, person=arguments.person,
@@ -131,13 +139,15 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
     with console.status("loading the checkpoint"):
         import torch
 
-        from apps.learning.snapshot import write_package_snapshot
-        from avatar import checkpoint
+        from apps.run.package_snapshot import write_package_snapshot
+        from avatar.training import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
     with console.progress("writing the package", 1.0) as bar:
         shots = synthetic_views(trainer.avatar.rig)
-        taken = write_package_snapshot(trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share)
+        taken = write_package_snapshot(
+            trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
+        )
     if taken.export_report is None:
         raise CommandExit(taken.refusal or "nothing was written.", NO_AVATAR)
     for warning in taken.export_report.warnings:

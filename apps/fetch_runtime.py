@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, run_command
-from capture.errors import InputError
-from export.web import runtime
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, run_command
+from capture.input_error import InputError
+from export.web import onnxruntime_web
 
 PROGRAM = "python -m apps.fetch_runtime"
 
@@ -41,11 +41,11 @@ def fetch_runtime(console: Console) -> int:
         InputError: If npm is missing, cannot fetch it, or fetches something else.
     """
     try:
-        runtime.runtime_files()
+        onnxruntime_web.runtime_files()
     except InputError:
-        with console.status(f"fetching onnxruntime-web {runtime.ORT_WEB_VERSION}"):
-            runtime.install_runtime(_fetch_tarball())
-    console.print_artifact("onnxruntime-web", runtime.FOLDER)
+        with console.status(f"fetching onnxruntime-web {onnxruntime_web.ORT_WEB_VERSION}"):
+            onnxruntime_web.install_runtime(_fetch_tarball())
+    console.print_artifact("onnxruntime-web", onnxruntime_web.FOLDER)
     return DONE
 
 
@@ -54,7 +54,7 @@ def _fetch_tarball() -> bytes:
     if npm is None:
         raise InputError("npm was not found. Install Node.js, which brings it, and try again.")
     with tempfile.TemporaryDirectory() as folder:
-        package = f"onnxruntime-web@{runtime.ORT_WEB_VERSION}"
+        package = f"onnxruntime-web@{onnxruntime_web.ORT_WEB_VERSION}"
         command = [npm, "pack", package, "--ignore-scripts", "--pack-destination", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
         found = list(Path(folder).glob("*.tgz"))

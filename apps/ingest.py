@@ -8,30 +8,29 @@ from contextlib import nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from apps.checking.first_look import preflight_check, correction_hint
-from apps.ingest_arguments import VIEW_PORT, IngestArguments
-from apps.learning.run_folder import RunFolder
-from apps.recording.recording import Capture
-from apps.solving.attempt import CameraSolving, start_camera_solving
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
-from apps.terminal.interrupt import stop_on_interrupt, exit_on_interrupt
-from apps.terminal.port import fill_optional_port
+from apps.checks.preflight_check import correction_hint, preflight_check
+from apps.cli.command_line import fill_optional_port, parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
+from apps.cli.interrupt import exit_on_interrupt, stop_on_interrupt
+from apps.run.camera_solving import CameraSolving, start_camera_solving
+from apps.run.ingest_arguments import VIEW_PORT, IngestArguments
+from apps.run.run_folder import RunFolder
 from capture.atomic_files import write_text_atomically
-from capture.camera_device import camera_address
-from capture.errors import InputError
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from preprocess.capture_session import Capture
 
 PROGRAM = "ia-ingest"
 JOINT_TOLERANCE_M = 1e-3
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from apps.learning.deliver import RunOutcome
-    from apps.learning.learn import TrainingSession
-    from apps.learning.learnt import TrainingResult
-    from apps.learning.snapshot import PackageSnapshot
-    from apps.view.viewer import LiveViewer
-    from avatar.trainer import Trainer
+    from apps.run.package_snapshot import PackageSnapshot
+    from apps.run.report_writer import RunOutcome
+    from apps.run.training_result import TrainingResult
+    from apps.run.training_session import TrainingSession
+    from apps.view.live_viewer import LiveViewer
+    from avatar.training.trainer import Trainer
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +51,11 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
     started = time.perf_counter()
     arguments.validate()
     run = arguments.run_folder()
-    run.check_usable(arguments.capture_inputs().input_paths(), resume=arguments.resume, overwrite=arguments.overwrite)
+    run.check_usable(
+        arguments.capture_inputs().input_paths(),
+        resume=arguments.resume,
+        overwrite=arguments.overwrite,
+    )
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
         with console.status("opening video and poses"):
             recording = _open_capture(arguments)
@@ -76,11 +79,10 @@ def _train_and_report(
     """All that comes once the input was found good."""
     with exit_on_interrupt(console, PROGRAM, run.release):
         with console.status("loading torch"):
-            from apps.learning.deliver import RunInfo, write_report
-            from apps.learning.learn import TrainingSession
-            from apps.terminal.device import CUDA_SLOW_WARNING, resolve_device
-            from apps.terminal.threads import set_threads
-            from avatar.kernels.choice import backend_for
+            from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
+            from apps.run.report_writer import RunInfo, write_report
+            from apps.run.training_session import TrainingSession
+            from avatar.backends import backend_for
 
             threads = set_threads(arguments.threads)
         with console.status("compiling kernels (slow on the first run only)"):
@@ -106,15 +108,17 @@ def _train_and_report(
             learnt, taken = _train_and_bake(lesson, recall, recording, run, console)
             if attempt is not None:
                 recording = attempt.wait_after_training(recording, run, console, stop)
-            startup = (learnt.meter.first_at or started) - started
+            startup = (learnt.meter.first_frame_at or started) - started
             note = RunInfo(command=arguments.as_json(), startup_seconds=startup, threads=threads)
             delivered = write_report(learnt, taken, recording, run, note, console)
             if arguments.json is not None:
-                write_text_atomically(arguments.json, delivered.report.to_json(), replace=arguments.may_replace_json)
+                write_text_atomically(
+                    arguments.json, delivered.report.to_json(), replace=arguments.may_replace_json
+                )
             code = _print_results(delivered, run, console, interrupted=stop.is_set())
         if viewer is not None and code == DONE:
             console.info(f"The page stays at {viewer.page.address}. Ctrl-C ends it.")
-            viewer.stay(lesson)
+            viewer.serve_until_interrupt(lesson)
         if code == DONE and attempt is not None and attempt.refused is not None:
             raise CommandExit(f"{attempt.refused} The avatar was learnt without.", BAD_INPUT)
         return code
@@ -150,10 +154,10 @@ def _new_or_resumed_trainer(
     arguments: IngestArguments, recording: Capture, run: RunFolder, console: Console
 ) -> "tuple[Trainer, int, dict[str, Any]]":
     """The trainer, how many frames it has seen of this video, and what checkpoints keep."""
-    from apps.learning.extension import EarlierVideos
-    from apps.learning.learn import new_trainer
-    from apps.terminal.device import resolve_device
-    from avatar import checkpoint
+    from apps.cli.device import resolve_device
+    from apps.run.continual_learning import EarlierVideos
+    from apps.run.training_session import new_trainer
+    from avatar.training import checkpoint
 
     device, video = resolve_device(arguments.device), _video_identity(recording)
     seconds = arguments.training_seconds(recording)
@@ -218,21 +222,21 @@ def _video_identity(recording: Capture) -> str:
 
 
 def _warm_up(trainer: "Trainer", console: Console) -> None:
-    from avatar.warm import warm_up
-    from export import compiled
+    from avatar.training.warmup import warm_up
+    from export.bake import bake_kernels
 
     with console.status("warming up"):
         warm_up(trainer)
-        compiled.warm_up()
+        bake_kernels.warm_up()
 
 
 def _announce_duration(
     arguments: IngestArguments, recording: Capture, trainer: "Trainer", console: Console
 ) -> None:
     """Says how long it will take: learning, and what comes after it."""
-    from apps.learning.remaining import post_training_seconds, expected_held_out
-    from apps.terminal.console import format_duration
-    from avatar.hold import MAX_HELD_OUT
+    from apps.cli.console import format_duration
+    from apps.run.time_estimate import expected_held_out, post_training_seconds
+    from avatar.evaluation.held_out import MAX_HELD_OUT
 
     source, config, longest = recording.source, trainer.config, max(recording.source.size_px)
     held = expected_held_out(source.frame_count, arguments.hold_out, MAX_HELD_OUT)
@@ -251,41 +255,49 @@ def _announce_duration(
 
 def _open_viewer(
     arguments: IngestArguments, recording: Capture, run: RunFolder, console: Console
-) -> "Viewer | None":
+) -> "LiveViewer | None":
     if arguments.view is None:
         return None
-    from apps.view.viewer import LiveViewer
+    from apps.view.live_viewer import LiveViewer
 
     return LiveViewer(recording, run, console, arguments.view)
 
 
 def _train_and_bake(
-    session: "TrainingSession", restore_count: int, recording: Capture, run: RunFolder, console: Console
-) -> "tuple[Learnt, Snapshot]":
+    session: "TrainingSession",
+    restore_count: int,
+    recording: Capture,
+    run: RunFolder,
+    console: Console,
+) -> "tuple[TrainingResult, PackageSnapshot]":
     """Learns and writes the package: where a video was waited for, at once, and later a finer one.
 
     Scores come after the first package, which need not wait for them.
     """
-    from apps.learning.snapshot import prefer_final, write_package_snapshot, validation_views
+    from apps.run.package_snapshot import prefer_final, validation_views, write_package_snapshot
 
     learnt, hasty = session.train(restore_count=restore_count), recording.source.paced
     _check_trained(learnt, recording)
     views, trainer = validation_views(learnt.held_out, recording), learnt.trainer
     with console.progress("writing the package", 1.0) as bar, session.checkpointing():
         mark = learnt.curve[-1] if learnt.curve else None
-        taken = write_package_snapshot(trainer, run.package, views, curve_point=mark, quick=hasty, progress=bar.set_share)
+        taken = write_package_snapshot(
+            trainer, run.package, views, curve_point=mark, quick=hasty, progress=bar.set_share
+        )
     learnt = session.with_scores(learnt)
     if hasty:
         with console.progress("writing the final package, with finer detail", 1.0) as bar:
             mark = learnt.curve[-1] if learnt.curve else None
-            last = write_package_snapshot(trainer, run.package, views, curve_point=mark, progress=bar.set_share)
+            last = write_package_snapshot(
+                trainer, run.package, views, curve_point=mark, progress=bar.set_share
+            )
             taken = prefer_final(taken, last)
     return learnt, taken
 
 
-def _check_trained(result: "Learnt", recording: Capture) -> None:
+def _check_trained(result: "TrainingResult", recording: Capture) -> None:
     """Raises if there is nothing to write."""
-    if result.trained:
+    if result.is_trained:
         return
     if result.interrupted:
         raise CommandExit("stopped before anything was learnt; no avatar was written.", INTERRUPTED)
@@ -306,7 +318,7 @@ def _print_results(
     Raises:
         Stop: If there is no package, or it holds no usable avatar.
     """
-    from apps.reporting.report import format_psnr
+    from apps.report.report_schema import format_psnr
 
     held, score = outcome.report.held_out, "no frame was held out to score it"
     if held.psnr is not None:

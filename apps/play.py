@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apps.playing.arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import BAD_INPUT, DONE, INTERRUPTED, run_command
-from apps.terminal.port import fill_optional_port, fill_optional_number
-from capture.errors import InputError
+from apps.animation.play_arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
+from apps.cli.command_line import fill_optional_number, fill_optional_port, parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, run_command
+from capture.input_error import InputError
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
     from export.player import Player
@@ -38,25 +37,39 @@ def play(arguments: PlayArguments, console: Console) -> int:
         return _run_verification(arguments, console)
     if arguments.web is not None:
         return _run_web(arguments, arguments.web, console)
-    return _run_benchmark(arguments, console) if arguments.bench else _render_clip(arguments, console)
+    return (
+        _run_benchmark(arguments, console) if arguments.bench else _render_clip(arguments, console)
+    )
 
 
 def _render_clip(arguments: PlayArguments, console: Console) -> int:
-    from apps.playing.background import TRANSPARENT, background_compositor
-    from apps.playing.clip import MAX_GIF_FPS, check_clip_path, choose_encoder, write_clip
-    from apps.playing.shots import plan_render
-    from apps.terminal.interrupt import stop_on_interrupt
+    from apps.animation.clip_writer import (
+        MAX_GIF_FPS,
+        TRANSPARENT,
+        background_compositor,
+        check_clip_path,
+        choose_encoder,
+        write_clip,
+    )
+    from apps.animation.render_sequence import plan_render
+    from apps.cli.interrupt import stop_on_interrupt
     from export.player import Player
 
     out = arguments.output_path
     suffix = out.suffix.lower()
     check_clip_path(out, arguments.inputs, overwrite=arguments.overwrite)
-    clear = suffix in ("", ".png") if arguments.background is None else arguments.background == TRANSPARENT
+    clear = (
+        suffix in ("", ".png")
+        if arguments.background is None
+        else arguments.background == TRANSPARENT
+    )
     blend = None if clear else background_compositor(arguments.background or "white")
     encoder = choose_encoder(out, blend)
     player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     _print_package_warnings(player, console)
-    shots = plan_render(arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf)
+    shots = plan_render(
+        arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf
+    )
     if arguments.fps is not None and shots.fps < arguments.fps:
         console.info(f"note: a GIF shows {MAX_GIF_FPS:g} pictures a second at most.")
     total = len(shots)
@@ -66,7 +79,9 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     ):
 
         def pictures() -> Iterator[np.ndarray]:
-            drawn = player.render_all(shots, workers=arguments.worker_count, samples=arguments.samples)
+            drawn = player.render_all(
+                shots, workers=arguments.worker_count, samples=arguments.samples
+            )
             for done, picture in enumerate(drawn):
                 bar.update(float(done), f"{done}/{total} pictures")
                 yield picture
@@ -75,27 +90,32 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
                     return
 
         count = write_clip(
-            out, pictures(), fps=shots.fps, blend=blend, encoder=encoder, replace=arguments.overwrite
+            out,
+            pictures(),
+            fps=shots.fps,
+            blend=blend,
+            encoder=encoder,
+            replace=arguments.overwrite,
         )
     width, height = shots.cameras[0].size_px
     pace = f" at {shots.fps:.4g} a second" if count > 1 else ""
     what = "a picture" if count == 1 else f"{count} pictures"
     cut = f" of {total}" if count < total else ""
     console.info(f"Drew {what}{cut} of {width}x{height} px{pace}; {encoder.description}:")
-    print(out)  # noqa: T201 - what was made goes to stdout, for scripts
+    print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
 
 
 def _print_package_warnings(player: "Player", console: Console) -> None:
-    from apps.playing.verdict import package_warnings
+    from apps.animation.package_verification import package_warnings
 
     for note in package_warnings(player.manifest):
         console.warning(note)
 
 
 def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
-    from apps.playing.bench import benchmark_player
-    from apps.playing.shots import plan_render
+    from apps.animation.player_timing import benchmark_player
+    from apps.animation.render_sequence import plan_render
     from capture.atomic_files import write_text_atomically
     from export.player import Player
 
@@ -127,14 +147,12 @@ def _format_workers(workers: int) -> str:
 
 
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
-    from apps.playing.driving import load_driving_motion
-    from apps.playing.novel import demo_motion
-    from apps.playing.rate import pose_rate
-    from apps.playing.web import web_clip, serve_site, write_site
-    from apps.terminal.places import check_output_folder
+    from apps.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+    from apps.animation.web_server import serve_site, web_clip, write_site
+    from apps.cli.output_paths import check_output_folder
     from export.player import Player
-    from export.web.runtime import runtime_files
-    from export.web.site import build_page
+    from export.web.onnxruntime_web import runtime_files
+    from export.web.player_page import build_page
 
     if not 0 < port < 1 << 16:
         raise InputError(f"--web {port} is no port; 1 to 65535 were expected.")
@@ -149,22 +167,26 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
     clip = web_clip(player, motion, rows, arguments.fps or arguments.speed * pose_rate(motion))
     name = (
-        arguments.avatar.resolve().parent.name if arguments.avatar.stem == "avatar" else arguments.avatar.stem
+        arguments.avatar.resolve().parent.name
+        if arguments.avatar.stem == "avatar"
+        else arguments.avatar.stem
     )
     with console.status("unpacking the avatar for the page"):
-        files = build_page(arguments.avatar, clip, name=name, compression_level=1 if arguments.out is None else 6)
+        files = build_page(
+            arguments.avatar, clip, name=name, compression_level=1 if arguments.out is None else 6
+        )
     if arguments.out is None:
         serve_site(files, port, console)
         return DONE
     write_site(files, arguments.out)
     megabytes = sum(map(len, files.values())) / 1e6
     console.info(f"Wrote {len(files)} files, {megabytes:.1f} MB; any static host serves them:")
-    print(arguments.out)  # noqa: T201 - what was made goes to stdout, for scripts
+    print(arguments.out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE
 
 
 def _run_verification(arguments: PlayArguments, console: Console) -> int:
-    from apps.playing.verdict import verify_package
+    from apps.animation.package_verification import verify_package
     from capture.atomic_files import write_text_atomically
 
     verdict = verify_package(arguments.avatar, provider=arguments.provider)

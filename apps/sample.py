@@ -9,10 +9,10 @@ from typing import Annotated
 
 import tyro
 
-from apps.studio.shoot_config import ShootConfig
-from apps.terminal.command_line import parse_arguments
-from apps.terminal.console import Console
-from apps.terminal.exit_codes import DONE, run_command
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, run_command
+from studio.shoot_config import ShootConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def _film(config: SampleArguments, console: Console) -> int:
 
 
 def _film_with_progress(config: SampleArguments, console: Console) -> None:
-    from apps.studio.writer import film_capture
+    from studio.shoot import film_capture
 
     with console.progress("filming", 1.0) as bar:
 

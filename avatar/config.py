@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 COARSEST_M = 0.13
-"""SolvedCorrespondences of the coarsest hash level: 16 along a two-metre box."""
+"""Cells of the coarsest hash level: 16 along a two-metre box."""
 FULL_DETAIL_FRAMES = 24
 """So many frames, all round, determine the detail that their pixels show."""
 FEW_FRAMES = 12
@@ -25,7 +25,7 @@ SkippingScheme = Literal["canonical", "union", "frame", "none"]
 """What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
 for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
 RootScheme = Literal["cells", "broyden"]
-"""How samples are warped: by our warp cells, or each by BroydenLookup's method (Fast-SNARF)."""
+"""How samples are warped: by our warp cells, or each by Broyden's method (Fast-SNARF)."""
 EmptySpaceScheme = Literal["occupancy", "global"]
 """Where density is penalised: in empty cells (InstantAvatar, §3.4), or in the whole box."""
 HELD_OUT_STRIDE = 10
@@ -48,13 +48,13 @@ class TrainConfig:
     opaque_margin_m: float = 0.06
     """How far a ray is followed once its cached optical depth says it is opaque, metres."""
     max_samples: int = 128
-    """RaySamples a ray may have."""
+    """Samples a ray may have."""
     levels: int = 8
     """Levels of the hash grid."""
     table_size: int = 1 << 17
     """Entries of a hashed level."""
     finest_m: float = 0.008
-    """SolvedCorrespondences of the finest level, metres."""
+    """Cells of the finest level, metres."""
     learning_rate: float = 2.5e-2
     """Of the table; the network's is 0.3 of it."""
     alpha_weight: float = 0.1
@@ -82,7 +82,7 @@ class TrainConfig:
     smoothness_pairs: int = 256
     """Pairs of close points at which both are measured in each step."""
     min_occupied_density: float = 0.0
-    """SolvedCorrespondences less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
+    """Cells less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
     inner_leg_weight: float = 0.0
     """Of log density off the skin between the legs, where no ray may tell; 0 turns it off."""
     inner_leg_points: int = 128
@@ -96,7 +96,7 @@ class TrainConfig:
     refine_poses: bool = True
     """Whether the frames' poses are corrected while they are learnt from."""
     replay_capacity: int = 200
-    """EvaluationFrames that stay for replay."""
+    """Frames that stay for replay."""
     held_out_stride: int = HELD_OUT_STRIDE
     """Every so manieth frame is held out; 0 for none."""
     seed: int = 0
@@ -177,7 +177,7 @@ class TrainConfig:
         return cls(
             seconds=seconds,
             steps=steps,
-            step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
+            sample_step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
             finest_m=finest_m,
             table_size=size,
             density_tv_weight=cls.density_tv_weight * few * scant**3,
@@ -189,5 +189,5 @@ class TrainConfig:
             min_occupied_density=FEW_FRAMES_MIN_DENSITY * (1.0 - 1.0 / scant),
             inner_leg_weight=FEW_FRAMES_INNER_LEG_WEIGHT * (1.0 - 1.0 / scant),
             seed=seed,
-            hold_every=held_out_stride,
+            held_out_stride=held_out_stride,
         )

@@ -31,7 +31,7 @@ class Stepped:
         wall_seconds: Training time so far.
         loss: Mean of its rays.
         samples_per_ray: Mean of its rays.
-        frames_seen: EvaluationFrames trained on so far.
+        frames_seen: Frames trained on so far.
     """
 
     step: int
@@ -50,7 +50,7 @@ class HeldOutScore:
         psnr: Of the whole frame, dB.
         psnr_mask: Where alpha > 0.5, dB.
         ssim: In [-1, 1].
-        blur: Equivalent blur, as a share of the person's height (`avatar.sharpness`); NaN if it
+        blur: Equivalent blur, as a share of the person's height (`avatar.evaluation.sharpness`); NaN if it
             was not measured.
         overlap: Of the rendered alpha with the mask, in [0, 1]; NaN if it was not measured.
     """
@@ -69,7 +69,7 @@ class Evaluated:
 
     Attributes:
         wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: EvaluationFrames trained on so far.
+        frames_seen: Frames trained on so far.
         scores: One a frame.
     """
 

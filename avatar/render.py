@@ -14,21 +14,26 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from avatar.cells import CorrespondenceGrid
-from avatar.field import RadianceField
-from avatar.kernels.backend import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch, RaySamples
-from avatar.kernels.reference import MAX_LOG_DENSITY
-from avatar.model import Avatar
-from avatar.prepare import BodyFrameRays
-from avatar.skip import cull_cells, screen_bounds
-from avatar.strays import CorrespondenceCheck
+from avatar.deformation.correspondence_check import CorrespondenceCheck
+from avatar.deformation.correspondence_grid import CorrespondenceGrid, cull_cells, screen_bounds
+from avatar.field.avatar_model import Avatar
+from avatar.field.radiance_field import RadianceField
+from avatar.kernels.backend_protocol import (
+    CorrespondenceTables,
+    DensityGrid,
+    MarchSettings,
+    RayBatch,
+    RaySamples,
+)
+from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.training.training_frame import BodyFrameRays
 from capture.camera import Camera
-from preprocess.pose import BodyPose
+from preprocess.body.body_pose import BodyPose
 
 RAYS_PER_CHUNK = 1 << 15
 SAMPLES_PER_CHUNK = 1 << 15
 MIN_SAMPLES_PER_PASS, MAX_SAMPLES_PER_PASS = 4, 8
-"""RaySamples of a ray that are asked for together: more of them, the fewer rays are left."""
+"""Samples of a ray that are asked for together: more of them, the fewer rays are left."""
 MIN_TRANSMITTANCE = 5e-6
 """Share of the light that may be left where a ray ends: no colour is farther off than this."""
 EMPTY_LOG_DENSITY = -30.0
@@ -46,7 +51,7 @@ def render(
     """Premultiplied RGBA in [0, 1] of the avatar in one pose, seen by one camera.
 
     It is within `MIN_TRANSMITTANCE`, and what single precision rounds off, of the sum over all lattice samples
-    in `avatar.rendering_grid()` that are on their rays (`avatar.strays`).
+    in `avatar.rendering_grid()` that are on their rays (`avatar.deformation.correspondence_check`).
 
     Args:
         avatar: Who.
@@ -54,7 +59,7 @@ def render(
         camera: Also says how large the picture is.
         cells: The pose's warp, if it has been solved already.
         samples_along: Where samples lie, if not in the avatar's own occupancy
-            (`avatar.paper.rendering`).
+            (`baselines.instant_avatar.rendering`).
     """
     device = avatar.field.table.device
     cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
@@ -65,10 +70,14 @@ def render(
         cells = cull_cells(cells, grid)
         rows, columns = screen_bounds(cells, camera, world_from_body)
         strays = CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device)
-        colors_of = partial(trace_rays, avatar.field, grid=grid, check=strays, sample_step_m=avatar.sample_step_m)
+        colors_of = partial(
+            trace_rays, avatar.field, grid=grid, check=strays, sample_step_m=avatar.sample_step_m
+        )
     else:
         rows, columns = slice(0, height), slice(0, width)
-        colors_of = partial(_render_given_samples, avatar.field, sample_rays, sample_step_m=avatar.sample_step_m)
+        colors_of = partial(
+            _render_given_samples, avatar.field, sample_rays, sample_step_m=avatar.sample_step_m
+        )
     tables = correspondence_tables(cells, avatar.field.table.device)
     picture = np.zeros((height, width, 4), dtype=np.float32)
     for part, pixels in _pixel_chunks(picture[rows, columns], rows.start, columns.start):
@@ -147,7 +156,11 @@ def _render_given_samples(
     raw[:, 3] = EMPTY_LOG_DENSITY
     optical = points.new_zeros(len(count))
     for start in range(0, int(count.max()) if len(count) else 0, MAX_SAMPLES_PER_PASS):
-        lit = (rank >= start) & (rank < start + MAX_SAMPLES_PER_PASS) & (optical[ray] < -math.log(MIN_TRANSMITTANCE))
+        lit = (
+            (rank >= start)
+            & (rank < start + MAX_SAMPLES_PER_PASS)
+            & (optical[ray] < -math.log(MIN_TRANSMITTANCE))
+        )
         seen = lit.nonzero()[:, 0]
         values = field.raw_outputs_at(points[seen])
         raw[seen] = values

@@ -19,35 +19,48 @@ from typing import NamedTuple
 import torch
 import tyro
 
-from apps.recording.recording import Capture
-from avatar.hold import HeldOutFrame
-from avatar.model import Avatar
-from avatar.prepare import TrainingFrame
-from avatar.rig import Rig
+from avatar.deformation.rig import Rig
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.field.avatar_model import Avatar
+from avatar.training.training_frame import TrainingFrame
 from benchmarks.ablation_page import AblationPage, written
 from benchmarks.hardware import Hardware
-from benchmarks.in_turns import TrainingBudget, VariantOutcome, VariantRun, Variant, score_variant, train_variants
-from benchmarks.quality import NOISE, novel_pose_frames, with_true_poses
-from benchmarks.schemes import SchemeTiming, time_scheme
-from benchmarks.stage import load_trainer, film_sample, open_sample, training_config
+from benchmarks.paired_training import (
+    TrainingBudget,
+    Variant,
+    VariantOutcome,
+    VariantRun,
+    score_variant,
+    train_variants,
+)
+from benchmarks.sample_training import film_sample, load_trainer, open_sample, training_config
+from benchmarks.scheme_timing import SchemeTiming, time_scheme
 from benchmarks.stopwatch import limit_threads
+from benchmarks.training_quality import NOISE, novel_pose_frames, with_true_poses
+from preprocess.capture_session import Capture
 
 TIMED_POSES = 3
-"""NovelPoseScores poses that every scheme draws."""
+"""Novel poses that every scheme draws."""
 PAPER = "union grid, Broyden (the paper)"
 POSES_AS_GIVEN = {"refine_poses": False}
 LOSS_VARIANTS = [
     Variant(name="full", changes=POSES_AS_GIVEN),
     Variant(name="w/o alpha loss", changes={**POSES_AS_GIVEN, "alpha_weight": 0.0}),
     Variant(name="w/o hard surface", changes={**POSES_AS_GIVEN, "hard_weight": 0.0}),
-    Variant(name="w/o occupancy-based regulariser", changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0}),
+    Variant(
+        name="w/o occupancy-based regulariser",
+        changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0},
+    ),
     Variant(name="w/o total variation", changes={**POSES_AS_GIVEN, "density_tv_weight": 0.0}),
     Variant(name="global sparsity instead", changes={**POSES_AS_GIVEN, "empty_term": "global"}),
 ]
 CORRESPONDENCE_VARIANTS = [
     Variant(name="union grid, cells", changes={**POSES_AS_GIVEN, "skipping": "union"}),
     Variant(name="per-frame grids, cells", changes={**POSES_AS_GIVEN, "skipping": "frame"}),
-    Variant(name="no skipping, cells", changes={**POSES_AS_GIVEN, "skipping": "none", "empty_space_weight": 0.0}),
+    Variant(
+        name="no skipping, cells",
+        changes={**POSES_AS_GIVEN, "skipping": "none", "empty_space_weight": 0.0},
+    ),
 ]
 BROYDEN_VARIANTS = [
     Variant(name="canonical occupancy, Broyden", changes={**POSES_AS_GIVEN, "roots": "broyden"}),
@@ -57,7 +70,12 @@ BROYDEN_VARIANTS = [
     ),
     Variant(
         name="no skipping, Broyden",
-        changes={**POSES_AS_GIVEN, "roots": "broyden", "skipping": "none", "empty_space_weight": 0.0},
+        changes={
+            **POSES_AS_GIVEN,
+            "roots": "broyden",
+            "skipping": "none",
+            "empty_space_weight": 0.0,
+        },
     ),
 ]
 REFINEMENT_VARIANTS = [
@@ -108,21 +126,28 @@ def main() -> None:
         page = run_ablation(job, hardware, job.keep or Path(temporary))
     print("\n".join(page.lines()))
     if job.json is not None:
-        job.json.write_text_atomically(json.dumps(asdict(page), indent=1) + "\n")
+        job.json.write_text(json.dumps(asdict(page), indent=1) + "\n")
     if job.write is not None:
-        job.write.write_text_atomically(written(page, job.write))
+        job.write.write_text(written(page, job.write))
 
 
 def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:
     """Everything, table after table; each row is told on standard error as it comes."""
     began, device = time.process_time(), torch.device(job.device)
     scene = load_data(film_sample(folder / f"sample{job.size}", job.size), device)
-    runs = train_variants(scene, [*LOSS_VARIANTS, *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], TrainingBudget(seconds=job.seconds), device)
+    runs = train_on_scene(
+        scene,
+        [*LOSS_VARIANTS, *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS],
+        TrainingBudget(seconds=job.seconds),
+        device,
+    )
     by_time = outcomes_of(runs, scene)
     occupancy_ms, ours = occupancy_update_ms(runs[0]), runs[0].trainer.avatar
     del runs
     counted = TrainingBudget(steps=job.steps)
-    runs = train_variants(scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted, device)
+    runs = train_on_scene(
+        scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted, device
+    )
     by_steps = outcomes_of(runs, scene)
     schemes = time_schemes(ours, _run_named(runs, PAPER).trainer.avatar, scene)
     del runs
@@ -141,8 +166,8 @@ def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPag
         by_time=[by_time[0], *by_time[len(LOSS_VARIANTS) :]],
         by_steps=by_steps,
         scheme_timings=schemes,
-        exact=outcomes_of(train_variants(scene, REFINEMENT_VARIANTS, budget, device), scene),
-        noisy=outcomes_of(train_variants(noisy, REFINEMENT_VARIANTS, budget, device), noisy),
+        exact=outcomes_of(train_on_scene(scene, REFINEMENT_VARIANTS, budget, device), scene),
+        noisy=outcomes_of(train_on_scene(noisy, REFINEMENT_VARIANTS, budget, device), noisy),
         core_minutes=(time.process_time() - began) / 60.0,
     )
 
@@ -156,7 +181,7 @@ def load_data(capture: Path, device: torch.device) -> AblationData:
     return AblationData(recording, rig, seen.frames, seen.held_out, novel_pose_frames(capture, rig))
 
 
-def train_variants(
+def train_on_scene(
     scene: AblationData, variants: list[Variant], budget: TrainingBudget, device: torch.device
 ) -> list[VariantRun]:
     """Every variant after its budget."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.in_turns import VariantOutcome
-from benchmarks.marks import format_value as number
-from benchmarks.schemes import SchemeTiming
+from benchmarks.measurements import format_value as number
+from benchmarks.paired_training import VariantOutcome
+from benchmarks.scheme_timing import SchemeTiming
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 COMMAND = "python -m benchmarks.ablation --write docs/ablation.md"
@@ -21,7 +21,7 @@ class AblationPage:
         hardware: Where and when.
         size: Of the pictures, pixels.
         seconds, steps: What each variant was given.
-        pictures: EvaluationFrames learnt, held out; novel poses scored, and drawn by each scheme.
+        pictures: Frames learnt, held out; novel poses scored, and drawn by each scheme.
         occupancy_ms: What keeping the canonical occupancy costs a step.
         losses: One by one.
         by_time, by_steps: Skipping and root finding, for both budgets.

@@ -21,17 +21,17 @@ import tyro
 from jaxtyping import Float
 from tyro.conf import Positional
 
-from apps.playing.follow import FollowingCamera
-from apps.playing.novel import demo_motion
-from apps.playing.web import web_clip, make_server
-from apps.terminal.exit_codes import run_command
+from apps.animation.driving_motion import demo_motion
+from apps.animation.following_camera import FollowingCamera
+from apps.animation.web_server import make_server, web_clip
+from apps.cli.exit_codes import run_command
 from benchmarks.hardware import Hardware
-from benchmarks.marks import Measurement, markdown_rows
+from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads
+from export.package.render_settings import QUALITY_TIERS
 from export.player import Player
-from export.tiers import QUALITY_TIERS
-from export.web.site import build_page
-from preprocess.pose import Motion
+from export.web.player_page import build_page
+from preprocess.body.body_pose import Motion
 from tests.apps.browser import Browser, until
 
 SIZE_PX = 540
@@ -58,7 +58,9 @@ def compare(package: Path, rounds: int) -> int:
     found: dict[str, list[tuple[float, float, float]]] = {tier: [] for tier in QUALITY_TIERS}
     with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
         address = f"http://127.0.0.1:{server.server_port}/"
-        opened = np.array([time_page_load(browser, f"{address}?{again}") for again in range(1 + rounds)])
+        opened = np.array(
+            [time_page_load(browser, f"{address}?{again}") for again in range(1 + rounds)]
+        )
         browser.run("document.querySelector('#play.playing')?.click()")
         for tier in QUALITY_TIERS:
             browser_ms(browser, tier)  # the browser compiles again what it finds hot

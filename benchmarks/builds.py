@@ -10,13 +10,13 @@ from pathlib import Path
 
 import torch
 
-from avatar.cells import CorrespondenceGrid
-from avatar.rig import Rig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.deformation.rig import Rig
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Measurement
-from benchmarks.stage import open_sample
+from benchmarks.measurements import Measurement
+from benchmarks.sample_training import open_sample
 from benchmarks.stopwatch import time_interleaved
-from preprocess.pose_file import read_motion
+from preprocess.poses.pose_file import read_motion
 
 BANDS_M = (0.08, 0.15)
 ROUNDS = 15
@@ -36,7 +36,9 @@ def built(capture: Path) -> dict[str, float]:
         "novel": novel[len(novel) // 2].joint_rotations,
     }
     work = {
-        f"{name} {band_m}": lambda pose=pose, band_m=band_m: CorrespondenceGrid.solve(rig, pose, band_m=band_m)
+        f"{name} {band_m}": lambda pose=pose, band_m=band_m: CorrespondenceGrid.solve(
+            rig, pose, band_m=band_m
+        )
         for name, pose in poses.items()
         for band_m in BANDS_M
     }

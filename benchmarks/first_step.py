@@ -12,21 +12,21 @@ from pathlib import Path
 
 
 def main() -> None:
-    from apps.recording.opening import open_capture
-    from apps.recording.wanted import CaptureInputs
+    from preprocess.capture_session import CaptureInputs
+    from preprocess.open_capture import open_capture
 
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
     recording = open_capture(CaptureInputs(video=capture))
 
     import torch
 
-    from apps.terminal.threads import set_threads
+    from apps.cli.device import set_threads
     from avatar.config import TrainConfig
+    from avatar.deformation.rig import Rig
+    from avatar.evaluation.held_out import HeldOutFrame, prepare_stream
     from avatar.events import Stepped
-    from avatar.hold import HeldOutFrame, prepare_stream
-    from avatar.rig import Rig
-    from avatar.train import Trainer, train
-    from avatar.warm import warm_up
+    from avatar.training.train import Trainer, train
+    from avatar.training.warmup import warm_up
     from capture.inbox import Inbox
 
     set_threads(None)
@@ -36,7 +36,9 @@ def main() -> None:
     warm_up(trainer)
     total, held = recording.source.frame_count, list[HeldOutFrame]()
     begun = time.time()
-    inbox = Inbox(prepare_stream(recording.observations(), rig, stride=config.held_out_stride, total=total))
+    inbox = Inbox(
+        prepare_stream(recording.observations(), rig, stride=config.held_out_stride, total=total)
+    )
     for event in train(trainer, inbox, held):
         if isinstance(event, Stepped):
             now = time.time()

@@ -22,15 +22,19 @@ from pathlib import Path
 import torch
 import tyro
 
-from apps.terminal.exit_codes import run_command
-from avatar import checkpoint
-from avatar.trainer import Trainer
-from benchmarks.baked import time_bake, package_marks
+from apps.cli.exit_codes import run_command
+from avatar.training import checkpoint
+from avatar.training.trainer import Trainer
 from benchmarks.hardware import ROOT, Hardware
-from benchmarks.likeness import ComparedView, fidelity_marks, views_of_sample, views_of_person
-from benchmarks.marks import Measurement, markdown_rows
-from benchmarks.pace import load_time_marks, frame_time_marks
-from benchmarks.stage import film_sample
+from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.player_cost import frame_time_marks, load_time_marks, package_marks, time_bake
+from benchmarks.player_fidelity import (
+    ComparedView,
+    fidelity_marks,
+    views_of_person,
+    views_of_sample,
+)
+from benchmarks.sample_training import film_sample
 from benchmarks.stopwatch import limit_threads
 
 SIZE_PX = 540
@@ -68,7 +72,7 @@ def measure(job: PlayerBenchmark) -> int:
     print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
+        job.json.write_text(json.dumps(content, indent=1) + "\n")
     return 0
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.hardware import ROOT
-from benchmarks.marks import Measurement
+from benchmarks.measurements import Measurement
 
 STARTS = 3
 MEMORY_SECONDS = 30.0

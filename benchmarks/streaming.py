@@ -17,12 +17,12 @@ from pathlib import Path
 import tyro
 
 from benchmarks.hardware import Hardware
-from benchmarks.kills import measure_kills
-from benchmarks.looped import measure_memory_growth
-from benchmarks.marks import Measurement, markdown_rows
-from benchmarks.onlooker import measure_streaming_quality
-from benchmarks.played import measure_realtime
-from benchmarks.stage import film_sample
+from benchmarks.kill_and_resume import measure_kills
+from benchmarks.long_video import measure_memory_growth
+from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.realtime_run import measure_realtime
+from benchmarks.sample_training import film_sample
+from benchmarks.streaming_quality import measure_streaming_quality
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class StreamingOptions:
     size: int = 270
     """Width and height of the pictures."""
     frames: int = 600
-    """EvaluationFrames of the video, at 30 a second."""
+    """Frames of the video, at 30 a second."""
     kills: int = 20
     """How often a run is killed."""
     quick: bool = False
@@ -52,7 +52,7 @@ def main() -> None:
     print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
+        job.json.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def measure_all(job: StreamingOptions, folder: Path, scratch: Path) -> Iterator[Measurement]:

@@ -18,20 +18,30 @@ from typing import Literal
 import torch
 import tyro
 
-from apps.terminal.device import resolve_device
-from apps.terminal.exit_codes import run_command
-from avatar.rig import Rig
+from apps.cli.device import resolve_device
+from apps.cli.exit_codes import run_command
+from avatar.deformation.rig import Rig
 from benchmarks.builds import build_marks
+from benchmarks.correspondence_lookup import warp_marks
+from benchmarks.empty_space_skipping import skipping_marks
 from benchmarks.hardware import Hardware
-from benchmarks.marks import Measurement, markdown_rows
-from benchmarks.quality import measure_by_core_seconds, measure_pose_refinement, measure_by_wall_time
-from benchmarks.skipping import skipping_marks
-from benchmarks.stage import load_trainer, film_sample, open_sample, training_config, train_for_core_seconds
+from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.sample_training import (
+    film_sample,
+    load_trainer,
+    open_sample,
+    train_for_core_seconds,
+    training_config,
+)
 from benchmarks.startup import measure_peak_memory, measure_startup
-from benchmarks.steps import encode_marks, step_marks
+from benchmarks.step_timing import encode_marks, step_marks
 from benchmarks.stopwatch import limit_threads
-from benchmarks.warps import warp_marks
-from preprocess.pose_file import read_motion
+from benchmarks.training_quality import (
+    measure_by_core_seconds,
+    measure_by_wall_time,
+    measure_pose_refinement,
+)
+from preprocess.poses.pose_file import read_motion
 
 SIZE_PX = 256
 TEN_MINUTES = 600.0
@@ -68,7 +78,7 @@ def run_benchmark(job: Training) -> int:
     print("\n".join([*hardware.lines(), f"device {job.device}", "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text_atomically(json.dumps(content, indent=1) + "\n")
+        job.json.write_text(json.dumps(content, indent=1) + "\n")
     return 0
 
 
@@ -80,7 +90,9 @@ def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     if not job.quick:
         groups += [
             measure_by_core_seconds(folder, device),
-            measure_by_wall_time(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device),
+            measure_by_wall_time(
+                small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device
+            ),
             measure_pose_refinement(folder, device),
             large_marks(folder, device),
         ]
@@ -93,7 +105,9 @@ def operation_marks(capture: Path, device: torch.device) -> Iterator[Measurement
     """Single operations, on an avatar that has been learnt for a while."""
     recording = open_sample(capture)
     rig = Rig.from_shaped_body(recording.shaped)
-    seen = load_trainer(recording, rig, training_config(recording, 60.0, refine_poses=False), device)
+    seen = load_trainer(
+        recording, rig, training_config(recording, 60.0, refine_poses=False), device
+    )
     limit_threads(1)
     train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
     yield from step_marks(seen, device)

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import final
 
-from capture.errors import InputError
-from capture.file_list import OutputFileList
+from capture.input_error import InputError
+from capture.output_file_list import OutputFileList
 
 
 @final
@@ -46,7 +46,10 @@ class AtomicFile:
         self._check_replaceable()
         real = Path(os.path.realpath(path))
         real.parent.mkdir(parents=True, exist_ok=True)
-        self._real, self.part = real, real.with_name(_temporary_name(path.stem, "part") + path.suffix)
+        self._real, self.part = (
+            real,
+            real.with_name(_temporary_name(path.stem, "part") + path.suffix),
+        )
         if self._list.exists() and real.parent == Path(os.path.realpath(path.parent)):
             self._list.add_temporary(self.part.name)
         os.close(os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -114,10 +117,10 @@ def atomic_file(path: Path, *, replace: bool | None = None) -> Iterator[Path]:
 def write_text_atomically(path: Path, text: str, *, replace: bool | None = None) -> None:
     """A text file, whole or not at all; a device such as /dev/stdout just gets the text."""
     if is_stream(path):
-        path.write_text_atomically(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         return
     with atomic_file(path, replace=replace) as part:
-        part.write_text_atomically(text, encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
 
 
 @contextmanager

@@ -119,7 +119,9 @@ class Camera:
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         return np.stack([x, y], axis=-1)
 
-    def ray_directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
+    def ray_directions(
+        self, pixels: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions in the world of the rays through `pixels` (x, y).
 
         All rays start at `center_world`.

@@ -67,7 +67,9 @@ class Inbox(Generic[Item]):
         """
         taken: list[Item] = []
         try:
-            taken.append(self._queue.get(timeout=timeout_s) if timeout_s else self._queue.get_nowait())
+            taken.append(
+                self._queue.get(timeout=timeout_s) if timeout_s else self._queue.get_nowait()
+            )
             while max_items is None or len(taken) < max_items:
                 taken.append(self._queue.get_nowait())
         except queue.Empty:

@@ -1,11 +1,69 @@
-"""What every source of frames is, recorded or live."""
+"""What every source of frames is, recorded or live.
+
+Which frames of a source are wanted: START:STOP:STEP, counted from 0.
+
+A recording whose width and height are exchanged in name only.
+"""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, final, runtime_checkable
 
 from capture.frame import Frame
-from capture.selection import FrameSelection
+from capture.input_error import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSelection:
+    """Every `step`-th frame from `start` up to, not including, `stop` (None: to the end)."""
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+    @classmethod
+    def of(cls, frames: slice | None) -> "FrameSelection":
+        """From a slice; all frames if it is None.
+
+        Raises:
+            InputError: If it counts from the end, goes backwards or leaves nothing.
+        """
+        if frames is None:
+            return cls()
+        start = 0 if frames.start is None else frames.start
+        step = 1 if frames.step is None else frames.step
+        if start < 0 or step < 1 or (frames.stop is not None and frames.stop <= start):
+            raise InputError(
+                f"Frames {start}:{'' if frames.stop is None else frames.stop}:{step} name nothing; "
+                "expected START:STOP:STEP with 0 <= START < STOP and STEP >= 1."
+            )
+        return cls(start=start, stop=frames.stop, step=step)
+
+    def contains(self, index: int) -> bool:
+        """Whether the frame with this number belongs to it."""
+        return (
+            index >= self.start
+            and not self.is_past_end(index)
+            and not (index - self.start) % self.step
+        )
+
+    def is_past_end(self, index: int) -> bool:
+        """Whether no frame from this number on belongs to it."""
+        return self.stop is not None and index >= self.stop
+
+    def count(self, total: int) -> int:
+        """How many of `total` frames belong to it."""
+        return len(range(self.start, min(total, self.stop or total), self.step))
+
+    def position(self, index: int) -> int:
+        """The place of a wanted frame among the wanted ones, counted from 0."""
+        return (index - self.start) // self.step
+
+    def span(self, total: int) -> int:
+        """How many of `total` frames lie from the first wanted one to the last, both counted."""
+        count = self.count(total)
+        return (count - 1) * self.step + 1 if count else 0
 
 
 @runtime_checkable
@@ -66,3 +124,47 @@ class FrameSource(Protocol):
     def close(self) -> None:
         """Ends `frames()`, also one that waits on another thread, and lets a device go."""
         ...
+
+
+@final
+class TransposedSource:
+    """A source that is said to be as high as it is wide, and as wide as it is high.
+
+    With it masks and cameras of the upright pictures can be opened for a film that was rotated by
+    a quarter turn afterwards. The frames themselves stay as they are.
+    """
+
+    live = False
+    paced = False
+    waited_s = 0.0
+
+    def __init__(self, source: FrameSource) -> None:
+        """Nothing is read yet.
+
+        Args:
+            source: A recording.
+        """
+        self._source = source
+        self.path = source.path
+        self.size_px = (source.size_px[1], source.size_px[0])
+        self.selection = source.selection
+        self.frames_in_file = source.frames_in_file
+        self.frame_count = source.frame_count
+        self.duration_s = source.duration_s
+        self.has_alpha = source.has_alpha
+        self.quarter_turns = source.quarter_turns
+        self.started_at = source.started_at
+        self.dropped = source.dropped
+        self.warnings = source.warnings
+
+    def frames(self) -> Iterator[Frame]:
+        """The recording's frames, of its own size."""
+        return self._source.frames()
+
+    def count_frames(self) -> int:
+        """How many frames there really are in all, found by decoding."""
+        return self._source.count_frames()
+
+    def close(self) -> None:
+        """Closes the recording."""
+        self._source.close()

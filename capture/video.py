@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.decoder import open_decoder
-from capture.errors import InputError
 from capture.frame import Frame
-from capture.hdr import read_hdr_transfer
-from capture.selection import FrameSelection
-from capture.shot import DecoderFrame
+from capture.hdr_video import read_hdr_transfer
+from capture.input_error import InputError
+from capture.source import FrameSelection
+from capture.video_decoder import DecoderFrame, open_decoder
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}

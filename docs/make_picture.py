@@ -8,13 +8,13 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.playing.background import background_compositor
-from apps.playing.follow import FollowingCamera
+from apps.animation.clip_writer import background_compositor
+from apps.animation.following_camera import FollowingCamera
 from capture.atomic_files import atomic_file
-from capture.opening import open_source
+from capture.source_opening import open_source
 from export.player import Player
-from preprocess.camera_file import read_cameras
-from preprocess.pose_file import read_motion
+from preprocess.cameras.camera_file import read_cameras
+from preprocess.poses.pose_file import read_motion
 
 FRAMES, STEP, FPS = 40, 3, 10
 
@@ -49,7 +49,9 @@ def main() -> None:
         pose = dance[len(rows) * STEP % len(dance)]
         video = np.asarray(Image.fromarray(frame.rgb).resize((size, size)))
         same = blend(player.render(poses[frame.index], camera))
-        rows.append(np.hstack([video, same, blend(player.render(pose, following.camera_for(pose)))]))
+        rows.append(
+            np.hstack([video, same, blend(player.render(pose, following.camera_for(pose)))])
+        )
     first, *others = [Image.fromarray(row) for row in rows]
     with atomic_file(given.out) as part:
         first.save(

@@ -14,17 +14,17 @@ try:
 
     import torch
 
-    from apps.recording.opening import open_capture
-    from apps.recording.wanted import CaptureInputs
-    from apps.studio.writer import ShootConfig, film_capture
+    from preprocess.open_capture import open_capture
+    from preprocess.capture_session import CaptureInputs
+    from studio.shoot import ShootConfig, film_capture
     from avatar.config import TrainConfig
     from avatar.events import Evaluated, Finished, Warned
-    from avatar.hold import prepare_stream
-    from avatar.rig import Rig
-    from avatar.train import train
-    from avatar.trainer import Trainer
-    from avatar.warm import warm_up
-    from capture.errors import InputError
+    from avatar.evaluation.held_out import prepare_stream
+    from avatar.deformation.rig import Rig
+    from avatar.training.train import train
+    from avatar.training.trainer import Trainer
+    from avatar.training.warmup import warm_up
+    from capture.input_error import InputError
     from capture.inbox import Inbox
     from export.build import export_avatar
 except ModuleNotFoundError as missing:
@@ -47,7 +47,9 @@ def main(folder: Path) -> None:
     warm_up(trainer)  # compiles kernels
 
     # One thread makes frames ready, this one learns from them as they come.
-    frames = prepare_stream(recording.observations(), rig, stride=10, total=recording.source.frame_count)
+    frames = prepare_stream(
+        recording.observations(), rig, stride=10, total=recording.source.frame_count
+    )
     held_out = []
     for event in train(trainer, Inbox(frames), held_out):
         match event:

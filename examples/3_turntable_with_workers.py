@@ -15,9 +15,9 @@ try:
     from PIL import Image
 
     from capture.camera import Camera
-    from capture.errors import InputError
+    from capture.input_error import InputError
     from export.player import Player
-    from preprocess.pose import BodyPose
+    from preprocess.body.body_pose import BodyPose
 except ModuleNotFoundError as missing:
     sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
 

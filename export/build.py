@@ -14,32 +14,31 @@ import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from avatar.model import Avatar
+from avatar.deformation.rig import Rig
+from avatar.field.avatar_model import Avatar
 from avatar.render import render
-from avatar.rig import Rig
 from capture.camera import Camera
-from capture.errors import InputError
-from export.bake import BakeConfig, sample_field, bake_tables
-from export.checks import (
+from capture.input_error import InputError
+from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
+from export.bake.field_grid import FieldFunction
+from export.bake.fine_tuning import ExportProgress, FineTuningResult, fine_tune, is_below_target
+from export.bake.render_targets import PosedView, RenderFunction, RgbaPicture
+from export.graph.player_graph import build_graph
+from export.package.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
+from export.package.package_file import AvatarPackage, PackageWriter
+from export.package.player_tables import PlayerTables
+from export.package.render_settings import QUALITY_TIERS, RenderSettings
+from export.package.table_codec import TableLayout
+from export.package_checks import (
     CHECK_PX,
     check_graph,
-    mean_psnr_to_renderer,
     fit_camera,
+    mean_psnr_to_renderer,
     picture_on_white,
     quality_warnings,
 )
-from export.codec import TableLayout
-from export.graph import build_graph
-from export.lattice import FieldFunction
-from export.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
-from export.package import AvatarPackage, PackageWriter
 from export.player import Player
-from export.rules import RenderSettings
-from export.seen import RgbaPicture, RenderFunction, PosedView
-from export.tables import PlayerTables
-from export.tiers import QUALITY_TIERS
-from export.tuning import ExportProgress, FineTuningResult, is_below_target, fine_tune
-from preprocess.pose import BodyPose
+from preprocess.body.body_pose import BodyPose
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
@@ -62,7 +61,7 @@ class ExportReport:
         bytes: Its size.
         seconds: Wall time of baking, checking and writing.
         psnr_to_renderer: Of each tier, dB, mean over the views.
-        largest_difference: ResectionResult graph and twin, in 1/255.
+        largest_difference: Between graph and twin, in 1/255.
         tuning: PSNR to the volume renderer's before and after fine-tuning, dB, of pictures that
             it has not seen; None if it was left out.
         warnings: What the user should know.
@@ -160,7 +159,9 @@ def export_field(
 
         def finer() -> PlayerTables:
             better = config.with_finer_voxels()
-            return bake_tables(sample_field(field_at, rig, occupied=occupied, config=better), rig, better)
+            return bake_tables(
+                sample_field(field_at, rig, occupied=occupied, config=better), rig, better
+            )
 
         better = _fine_tune(
             baked.result(), finer, rig, renderer, views, config, beside,
@@ -168,11 +169,16 @@ def export_field(
         )  # fmt: skip
         tables = better.tables
         compressed = beside.submit(draft.add_tables, tables)
-        rules = {tier: better.settings if tier == "hq" else QUALITY_TIERS[tier] for tier in config.tiers}
+        rules = {
+            tier: better.settings if tier == "hq" else QUALITY_TIERS[tier] for tier in config.tiers
+        }
         package = _unchecked_package(tables, rules, rig, views, metrics)
         others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
         hq = Player(package)
-        notes, warnings = {}, [INTERRUPTED_WARNING] if config.fine_tuning_pictures and better.psnr is None else []
+        notes, warnings = (
+            {},
+            [INTERRUPTED_WARNING] if config.fine_tuning_pictures and better.psnr is None else [],
+        )
         for tier in config.tiers:
             player = hq if tier == "hq" else others[tier].result()
             looks = slice(None) if tier == "hq" else slice(1)
@@ -240,7 +246,10 @@ def _unchecked_package(
     """The package as it stands before the checks: no scores, no pictures."""
     notes = {
         tier: TierInfo(
-            layout=TableLayout.of(tables), settings=rule, psnr_to_renderer=0.0, largest_difference=0.0
+            layout=TableLayout.of(tables),
+            settings=rule,
+            psnr_to_renderer=0.0,
+            largest_difference=0.0,
         )
         for tier, rule in rules.items()
     }

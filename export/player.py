@@ -11,15 +11,20 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
-from capture.errors import InputError
-from export.close_up import ResolutionLimit, downscale_camera, upscale_picture
-from export.drawable import check_render_inputs, resize_camera
-from export.initialisers import graph_initializers
-from export.manifest import Manifest
-from export.package import AvatarPackage, read_package
-from export.session import find_provider, create_session, shorten_error
-from preprocess.kinematics import body_from_rest, world_from_body
-from preprocess.pose import BodyPose
+from capture.input_error import InputError
+from export.onnx_session import create_session, find_provider, shorten_error
+from export.package.graph_tables import graph_initializers
+from export.package.manifest import Manifest
+from export.package.package_file import AvatarPackage, read_package
+from export.player_limits import (
+    ResolutionLimit,
+    check_render_inputs,
+    downscale_camera,
+    resize_camera,
+    upscale_picture,
+)
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import body_from_rest, world_from_body
 
 MAX_CLOSE_DIFFERENCE = 2
 """Two pictures are alike where no channel (premultiplied) differs by more, in 1/255 …"""
@@ -114,7 +119,9 @@ class Player:
         times = self._close_ups.downscale_factor(bones, camera)
         if times == 1.0:
             return self._run_graph(bones, camera, samples)
-        return upscale_picture(self._run_graph(bones, downscale_camera(camera, times), samples), camera.size_px, times)
+        return upscale_picture(
+            self._run_graph(bones, downscale_camera(camera, times), samples), camera.size_px, times
+        )
 
     def _run_graph(
         self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
@@ -132,7 +139,9 @@ class Player:
         try:
             packed = np.asarray(self._session.run(["rgba"], inputs)[0])
         except Exception as error:  # onnxruntime has no common class for what a graph can do
-            raise InputError(f"The package's graph cannot draw this: {shorten_error(error)}") from error
+            raise InputError(
+                f"The package's graph cannot draw this: {shorten_error(error)}"
+            ) from error
         if packed.size != height * width or packed.dtype != np.int32:
             raise InputError(
                 f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
@@ -208,7 +217,10 @@ class PictureDifference:
     ) -> "PictureDifference":
         """Of two premultiplied pictures in [0, 1]."""
         difference = np.abs(a - b).max(axis=-1) * 255.0
-        return cls(largest=float(difference.max()), close=float((difference <= MAX_CLOSE_DIFFERENCE).mean()))
+        return cls(
+            largest_difference=float(difference.max()),
+            close_fraction=float((difference <= MAX_CLOSE_DIFFERENCE).mean()),
+        )
 
     @property
     def matches(self) -> bool:
@@ -241,6 +253,8 @@ def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDi
     package = read_package(Path(path), tier=None)  # every entry is looked at
     player = Player(package, provider=provider)
     return [
-        PictureDifference.of(premultiply(player.render(frame.pose, frame.camera)), premultiply(stored))
+        PictureDifference.of(
+            premultiply(player.render(frame.pose, frame.camera)), premultiply(stored)
+        )
         for frame, stored in zip(package.manifest.golden, package.golden, strict=True)
     ]

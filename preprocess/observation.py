@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from capture.camera import Camera
 from capture.frame import Frame
-from preprocess.pose import BodyPose
+from preprocess.body.body_pose import BodyPose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

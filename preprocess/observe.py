@@ -8,18 +8,16 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera, same_aspect_ratio
-from capture.errors import InputError
 from capture.frame import Frame
-from capture.images import has_cutout_alpha
+from capture.image_folder import has_cutout_alpha
+from capture.input_error import InputError
 from capture.source import FrameSource
-from preprocess.camera_file import CameraTrack
-from preprocess.masks.files import Masks
-from preprocess.masks.naming import associate_by_name
-from preprocess.masks.segmenter import Segmenter
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.cameras.camera_file import CameraTrack
+from preprocess.frame_association import associate_by_name, associate_by_order, associate_by_time
+from preprocess.masks.mask_files import Masks
+from preprocess.masks.mask_origin import Segmenter
 from preprocess.observation import Observation
-from preprocess.pairing import associate_by_order
-from preprocess.pairing_by_time import associate_by_time
-from preprocess.pose import BodyPose, Motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +225,9 @@ def shrink_to_longer_side(size_px: tuple[int, int], longer_px: int | None) -> tu
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
-def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+def alpha_channel_mask(
+    frame: Frame, size_px: tuple[int, int]
+) -> Float32[np.ndarray, "height width"]:
     """The picture's own alpha channel, scaled.
 
     Raises:

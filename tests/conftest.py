@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from preprocess.body import ShapedBody
-from preprocess.body_file import load_body_model
+from preprocess.body.body_file import load_body_model
+from preprocess.body.parametric_body import ShapedBody
 
 settings.register_profile("busy", deadline=None)  # a machine may be busy with something else
 settings.load_profile("busy")

@@ -1,1 +1,1 @@
-"""A page on this machine alone, on which somebody watches the avatar learn (`ia-ingest --view`)."""
+"""The live viewer."""

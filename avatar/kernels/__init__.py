@@ -1,1 +1,1 @@
-"""The operations of a training step: a plain torch meaning, and twins that are fast."""
+"""Kernels: the protocol of a backend, and the torch reference."""

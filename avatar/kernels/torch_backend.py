@@ -7,26 +7,27 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from avatar.kernels import lattice, pose, reference, roots
-from avatar.kernels.backend import (
+from avatar.deformation.rig import Rig
+from avatar.kernels import torch_reference, torch_skinning
+from avatar.kernels.backend_protocol import (
     BlendedTransforms,
-    SolvedCorrespondences,
     CorrespondenceTables,
-    Features,
     DensityGrid,
+    Features,
+    HashTable,
     MarchSettings,
-    PremultipliedPixels,
     Points,
     PosedOccupancy,
+    PremultipliedPixels,
     RawOutputs,
     RayBatch,
     RaySamples,
     SkinningVolume,
-    HashTable,
+    SolvedCorrespondences,
 )
-from avatar.kernels.cells import solve_correspondences
-from avatar.levels import HashLevels
-from avatar.rig import Rig
+from avatar.kernels.hash_levels import HashLevels
+from avatar.kernels.torch_correspondence import solve_correspondences
+from baselines.instant_avatar import broyden_kernels, occupied_samples
 
 
 @final
@@ -40,14 +41,14 @@ class TorchBackend:
 
     def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
         with torch.no_grad():
-            return reference.encode(points, table, levels)
+            return torch_reference.encode(points, table, levels)
 
     def encode_backward(
         self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
     ) -> None:
         table = torch.zeros_like(grad_table, requires_grad=True)
         with torch.enable_grad():
-            features = reference.encode(points, table, levels)
+            features = torch_reference.encode(points, table, levels)
             (grad,) = torch.autograd.grad((features * grad_features).sum(), table)
         grad_table += grad
 
@@ -72,13 +73,15 @@ class TorchBackend:
         )  # fmt: skip
         return SolvedCorrespondences(*(part.cpu().numpy() for part in built))
 
-    def march(self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings) -> RaySamples:
+    def march(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> RaySamples:
         return self.march_resumable(rays, cells, grid, how)[0]
 
     def march_resumable(
         self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
     ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
-        points, rows, count, reached = reference.march(
+        points, rows, count, reached = torch_reference.march(
             *rays, how.sample_step_m, *cells, *grid, how.opaque_margin_steps, how.max_samples
         )
         samples = RaySamples(points, torch.cumsum(count, 0) - count, count, rows)
@@ -86,7 +89,7 @@ class TorchBackend:
 
     def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
         with torch.no_grad():
-            return reference.composite(raw, samples.offsets, samples.counts, step_m)
+            return torch_reference.composite(raw, samples.offsets, samples.counts, step_m)
 
     def composite_loss(
         self,
@@ -100,22 +103,26 @@ class TorchBackend:
     ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
         leaf = raw.detach().requires_grad_()
         with torch.enable_grad():
-            rendered = reference.composite(leaf, samples.offsets, samples.counts, step_m)
-            loss = reference.loss_per_ray(rendered, target, background, alpha_weight, hard_weight)
+            rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
+            loss = torch_reference.loss_per_ray(
+                rendered, target, background, alpha_weight, hard_weight
+            )
             (grad,) = torch.autograd.grad(loss.mean(), leaf)
         return rendered.detach(), loss.detach(), grad
 
     def scatter_max_density(
         self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
     ) -> None:
-        reference.scatter_max_density(points, log_density, grid.low, grid.cells_per_m, grid.density)
+        torch_reference.scatter_max_density(
+            points, log_density, grid.low, grid.cells_per_m, grid.density
+        )
 
     def encode_points_backward(
         self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
     ) -> Points:
         leaf = points.detach().requires_grad_()
         with torch.enable_grad():
-            features = reference.encode(leaf, table.detach(), levels)
+            features = torch_reference.encode(leaf, table.detach(), levels)
             (grad,) = torch.autograd.grad((features * grad_features).sum(), leaf)
         return grad
 
@@ -130,21 +137,29 @@ class TorchBackend:
     ) -> Float32[Tensor, "rays 24 6"]:
         ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.counts)
         slot = slots[ray].long()
-        roots = cells.roots[slot, samples.root_rows.long()]
-        wrench = pose.bone_wrenches(samples.points, grad_points, roots, bones[slot], *skin)
+        broyden_kernels = cells.roots[slot, samples.root_rows.long()]
+        wrench = torch_skinning.bone_wrenches(
+            samples.points, grad_points, broyden_kernels, bones[slot], *skin
+        )
         return wrench.new_zeros(len(slots), 24, 6).index_add_(0, ray, wrench)
 
     def update_roots(
-        self, cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
+        self,
+        cells: CorrespondenceTables,
+        slot: int,
+        skin: SkinningVolume,
+        bones: Float32[Tensor, "24 12"],
     ) -> None:
         nx, ny, nz = cells.shape[slot].tolist()
         index = cells.packed_cells[slot, : nx * ny * nz].view(nx, ny, nz)
-        pose.update_roots(index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones)
+        torch_skinning.update_roots(
+            index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones
+        )
 
     def sample_occupied_cells(
         self, rays: RayBatch, grid: PosedOccupancy, step_m: float
     ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        return lattice.sample_occupied_cells(*rays, step_m, *grid)
+        return occupied_samples.sample_occupied_cells(*rays, step_m, *grid)
 
     def find_all_roots(
         self,
@@ -152,4 +167,4 @@ class TorchBackend:
         slots: Int32[Tensor, "points"],
         poses: BlendedTransforms,
     ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-        return roots.find_all_roots(points, slots, *poses)
+        return broyden_kernels.find_all_roots(points, slots, *poses)

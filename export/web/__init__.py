@@ -1,1 +1,1 @@
-"""An avatar in a browser: a folder of plain files, with the page that plays it, for any host."""
+"""The web page that plays a package in a browser."""

@@ -1,1 +1,1 @@
-"""Cameras as other programs write them: COLMAP, nerfstudio and instant-ngp, Record3D, Polycam."""
+"""Cameras: one reader per format."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import InputError
-from capture.images import natural_sort_key
-from preprocess.cameras.named import NamedCamera, image_name
+from capture.image_folder import natural_sort_key
+from capture.input_error import InputError
+from preprocess.cameras.named_camera import NamedCamera, image_name
 
 MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.errors import InputError
-from capture.images import natural_sort_key
-from preprocess.cameras.named import (
+from capture.image_folder import natural_sort_key
+from capture.input_error import InputError
+from preprocess.cameras.named_camera import (
     NamedCamera,
     camera_from_opengl,
-    parse_rigid_transform,
     image_name,
-    parse_pinhole_camera,
     invert_rigid,
+    parse_pinhole_camera,
+    parse_rigid_transform,
 )
 
 SUPPORTED_CAMERA_MODELS = (

@@ -19,8 +19,7 @@ from jaxtyping import Float, Int
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1]))
 
-from preprocess.kinematics import joint_transforms, rotation_matrices  # noqa: E402 - a script
-from preprocess.skeleton import JOINT_NAMES, PARENTS  # noqa: E402 - a script
+from preprocess.body.kinematics import JOINT_NAMES, PARENTS, joint_transforms, rotation_matrices  # noqa: E402 - a script
 
 BONES = (
     "pelvis", "thigh_l", "thigh_r", "spine_01", "calf_l", "calf_r", "spine_02", "foot_l",

@@ -1,1 +1,1 @@
-"""Masks: out of files of every kind, while they are written, or made from body and picture."""
+"""Masks: read, checked or estimated."""

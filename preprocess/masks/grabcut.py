@@ -7,6 +7,8 @@ is in doubt. If the camera stands still, pixels that were background in earlier 
 lies behind the person (`BackgroundModel`). The mask is the mean of cut and shape, weighted by how far they
 were found to be off; where they are far apart though the poses are good, the cut has leaked. Last,
 where it is known what lies behind, border pixels are split by colours (`refine_border`).
+
+How large the picture is in which a mask is found.
 """
 
 from typing import NamedTuple, final
@@ -16,18 +18,62 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from capture.camera import Camera
-from capture.errors import InputError
 from capture.frame import Frame
-from preprocess.body import ShapedBody
-from preprocess.masks.behind import BackgroundModel
-from preprocess.masks.colours import AppearanceModel, VertexVisibility
-from preprocess.masks.hair import HAIR_BAND_M, HEAD_JOINT, solid_hair, head_region
-from preprocess.masks.matte import soften_border
-from preprocess.masks.mixture import border_distance_px, refine_border
-from preprocess.masks.outline import signed_distance_px
-from preprocess.masks.scale import WorkingResolution
-from preprocess.masks.shell import OVERSHOOT_KNOWN_FRACTION, ClothedBody, ClothingOffset
-from preprocess.pose import BodyPose
+from capture.input_error import InputError
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.silhouette import signed_distance_px
+from preprocess.masks.clothing_offset import (
+    HAIR_BAND_M,
+    HEAD_JOINT,
+    OVERSHOOT_KNOWN_FRACTION,
+    ClothedBody,
+    ClothingOffset,
+    head_region,
+    solid_hair,
+)
+from preprocess.masks.color_models import AppearanceModel, BackgroundModel, VertexVisibility
+from preprocess.masks.matting import border_distance_px, refine_border, soften_border
+
+WORKING_PERSON_PX = 220
+"""Masks are found in pictures in which the person is about so large, or smaller."""
+
+UPSAMPLE_BELOW_PX = 150
+"""Pictures of smaller persons are enlarged twice: masks then know parts of a pixel."""
+
+DOWNSAMPLE_ABOVE = 1.1
+"""A person who is little larger is not worth a smaller picture."""
+
+JOINT_HEIGHT_FRACTION = 0.87
+"""Of a standing person's height, how much lies between head joint and toes."""
+
+RESCALE_RATIO = 1.4
+"""The scale is chosen anew when the person has become so many times larger or smaller."""
+
+
+@final
+class WorkingResolution:
+    """The scale for one person; it seldom changes."""
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Nobody was seen yet."""
+        self._shaped = shaped
+        self._tall_px: float | None = None
+
+    def scale_for(self, pose: BodyPose, camera: Camera) -> float:
+        """How many times larger than the frame the picture is in which its mask is found."""
+        joints = self._shaped.with_pose(pose).joints()
+        depth = joints @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        if depth.min() > 0.0:
+            tall = float(np.ptp(camera.project(joints), axis=0).max()) / JOINT_HEIGHT_FRACTION
+            before = self._tall_px
+            if before is None or not 1.0 / RESCALE_RATIO < tall / before < RESCALE_RATIO:
+                self._tall_px = tall
+        tall = max(self._tall_px or 0.0, 1.0)
+        if tall < UPSAMPLE_BELOW_PX:
+            return 2.0
+        return 1.0 if tall < DOWNSAMPLE_ABOVE * WORKING_PERSON_PX else WORKING_PERSON_PX / tall
+
 
 UNKNOWN_BAND_M, KNOWN_BAND_M, MIN_OUTER_BAND_M = 0.02, 0.008, 0.012
 """How far inside and outside the shell pixels are in doubt, where nothing is known of it and where
@@ -128,13 +174,17 @@ class GrabCutSegmenter:
             way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
             rgb = cv2.resize(rgb, size_px, interpolation=way)
         around, shape = self._expected_shape(pose, small)
-        self._behind.reset_if_moved(small, rgb, shape.signed_distance_px > 2.0 * UNKNOWN_BAND_M * around.px_per_m)
+        self._behind.reset_if_moved(
+            small, rgb, shape.signed_distance_px > 2.0 * UNKNOWN_BAND_M * around.px_per_m
+        )
         cut = self._segment(rgb, around, shape)
         expected = shape.signed_distance_px < 0.0
         both, either = (cut.foreground & expected).sum(), (cut.foreground | expected).sum()
         agreement = float(both / max(either, 1))
         if agreement < MIN_SHAPE_IOU:
-            raise InputError(f"the estimated mask agrees by {agreement:.0%} only with the posed body")
+            raise InputError(
+                f"the estimated mask agrees by {agreement:.0%} only with the posed body"
+            )
         alpha = soften_border(rgb, cut.foreground)
         self._update_models(rgb, cut, alpha, small, around, shape)
         weight = self._shape_weight(cut, shape, around)
@@ -171,14 +221,25 @@ class GrabCutSegmenter:
         fine = self._shell.draw(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
         hair = head_region(around.skin[self._head], camera, around.px_per_m)
-        shape = _ExpectedShape(supersampled=fine, coverage=covered, signed_distance_px=signed_distance_px(covered > 0.5), hair_region=hair)
+        shape = _ExpectedShape(
+            supersampled=fine,
+            coverage=covered,
+            signed_distance_px=signed_distance_px(covered > 0.5),
+            hair_region=hair,
+        )
         if (shape.signed_distance_px < 0.0).sum() < 16:
             raise InputError("the posed body is not in the picture")
         return around, shape
 
-    def _segment(self, rgb: UInt8[np.ndarray, "height width 3"], clothed: ClothedBody, shape: _ExpectedShape) -> _Segmentation:
+    def _segment(
+        self, rgb: UInt8[np.ndarray, "height width 3"], clothed: ClothedBody, shape: _ExpectedShape
+    ) -> _Segmentation:
         """Who is person, among the pixels that the shell leaves in doubt."""
-        inwards = clothed.known_fraction * KNOWN_BAND_M + (1.0 - clothed.known_fraction) * UNKNOWN_BAND_M + self._wider_m
+        inwards = (
+            clothed.known_fraction * KNOWN_BAND_M
+            + (1.0 - clothed.known_fraction) * UNKNOWN_BAND_M
+            + self._wider_m
+        )
         outwards = max(inwards, MIN_OUTER_BAND_M) + (OUTER_GROWTH_RATIO - 1.0) * self._wider_m
         away = shape.signed_distance_px / clothed.px_per_m
         near = away < np.where(shape.hair_region, max(outwards, HAIR_BAND_M), outwards)
@@ -228,12 +289,16 @@ class GrabCutSegmenter:
         too_deep = deep.sum() > MAX_INNER_LIMIT_FRACTION * max(rim.sum(), 1)
         wider = self._wider_m + (BAND_GROWTH_M if too_deep else -BAND_SHRINK_M)
         self._wider_m = float(np.clip(wider, 0.0, MAX_BAND_GROWTH_M))
-        near = (np.abs(from_cut) < 0.8) & (np.abs(shape.signed_distance_px) < (segmentation.band_m[0] + 0.005) * per_m)
+        near = (np.abs(from_cut) < 0.8) & (
+            np.abs(shape.signed_distance_px) < (segmentation.band_m[0] + 0.005) * per_m
+        )
         if near.any():
             # the standard deviation of a normal error is 1.25 times its mean
             off = 1.25 * float(np.abs(shape.signed_distance_px[near]).mean()) / per_m
             self._off_m += 0.2 * (off - self._off_m)
-        self._shell.update(clothed, camera, rgb, alpha, shape.signed_distance_px, segmentation.band_m)
+        self._shell.update(
+            clothed, camera, rgb, alpha, shape.signed_distance_px, segmentation.band_m
+        )
         margin = max(BACKGROUND_GAP_PX, BACKGROUND_GAP_M * per_m)
         self._behind.update(rgb, (from_cut > margin) & (shape.signed_distance_px > margin))
 
@@ -250,13 +315,19 @@ class GrabCutSegmenter:
         shell = max(self._off_m**2 - CUT_ERROR_M**2, MIN_SHAPE_ERROR_M**2)
         shell += (UNKNOWN_SHAPE_ERROR_M * (1.0 - clothed.known_fraction)) ** 2
         trusted = clothed.known_fraction * CUT_ERROR_M**2 / (CUT_ERROR_M**2 + shell)
-        apart = (segmentation.signed_distance_px - shape.signed_distance_px) / np.float32(clothed.px_per_m)
+        apart = (segmentation.signed_distance_px - shape.signed_distance_px) / np.float32(
+            clothed.px_per_m
+        )
         leaked = np.maximum(apart**2 - np.float32(self._off_m**2), np.float32(0.0))
         leaked[shape.hair_region & (apart < 0.0)] = 0.0
         beyond = segmentation.foreground & shape.hair_region & (shape.signed_distance_px > 0.0)
         shell = shell + (solid_hair(beyond, clothed.px_per_m) * np.float32(HAIR_BAND_M)) ** 2
         cut_off = np.float32(CUT_ERROR_M**2) + np.float32(trusted) * leaked
-        return cut_off / (cut_off + np.float32(shell)) * (np.float32(1.0) - segmentation.decided_by_background)
+        return (
+            cut_off
+            / (cut_off + np.float32(shell))
+            * (np.float32(1.0) - segmentation.decided_by_background)
+        )
 
 
 def _blend(

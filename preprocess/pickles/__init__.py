@@ -1,1 +1,1 @@
-"""Pickles of strangers: what they hold, read without running any of it."""
+"""Pickles read without executing them."""

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from apps import ingest, play
-from apps.learning import deliver, learn, snapshot
-from apps.recording.opening import open_capture
-from apps.recording.wanted import CaptureInputs
-from apps.studio.writer import ShootConfig, film_capture
-from avatar import fit, warm
-from avatar.rig import Rig
+from apps.run import package_snapshot, report_writer, training_session
+from avatar.deformation.rig import Rig
+from avatar.training import held_out_pose_fitting, warmup
 from capture.atomic_files import write_text_atomically
-from export import bake, tuning
+from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
+from studio.shoot import ShootConfig, film_capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +51,15 @@ FEW_STEPS = 10
 
 @pytest.fixture(scope="session", autouse=True)
 def briefly_tuned():
-    """BrickTable are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
+    """Bricks are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
 
     What these are worth is seen in tests of `export` and of `avatar`.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bake, "FINE_TUNING_PICTURES", 4)
-        patch.setattr(tuning, "TRAINING_PX", 128)
-        patch.setattr(tuning, "VALIDATION_PX", 128)
-        patch.setattr(fit, "CORRECTIONS_PER_FRAME", 4)
+        patch.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
+        patch.setattr(fine_tuning, "TRAINING_PX", 128)
+        patch.setattr(fine_tuning, "VALIDATION_PX", 128)
+        patch.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
         yield
 
 
@@ -96,8 +96,8 @@ def capture(film, tmp_path) -> Path:
 @pytest.fixture
 def call_ingest(capsys, monkeypatch, rig) -> Command:
     """Runs ia-ingest, for a few steps unless the test says otherwise."""
-    monkeypatch.setattr(learn.Rig, "of", lambda shaped: rig)
-    monkeypatch.setattr(warm, "warm_up", lambda trainer: 0.0)
+    monkeypatch.setattr(training_session.Rig, "of", lambda shaped: rig)
+    monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
         words = [str(argument) for argument in arguments]
@@ -134,10 +134,10 @@ def without_baking(monkeypatch) -> None:
             largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
         )  # fmt: skip
 
-    monkeypatch.setattr(snapshot, "export_avatar", export_nothing)
-    monkeypatch.setattr(deliver, "diagnose_failure", lambda report: None)
-    monkeypatch.setattr(deliver, "novel", lambda player: "data:,")
-    monkeypatch.setattr(deliver.Player, "load", lambda path: None)
+    monkeypatch.setattr(package_snapshot, "export_avatar", export_nothing)
+    monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
+    monkeypatch.setattr(report_writer, "novel", lambda player: "data:,")
+    monkeypatch.setattr(report_writer.Player, "load", lambda path: None)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from apps import ingest
-from apps.recording.opening import open_capture
-from apps.recording.wanted import CaptureInputs
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
 
 MASK = (64, 64)
 

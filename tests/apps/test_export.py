@@ -6,7 +6,7 @@ import trimesh
 
 from apps import export
 from export.player import Player, verify_package
-from preprocess.pose_file import read_motion
+from preprocess.poses.pose_file import read_motion
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from apps.learning import deliver, learn
-from apps.learning.run_folder import RunFolder
-from apps.reporting.failure import diagnose_failure
-from avatar import checkpoint
-from avatar.advice import SEEN_COMPLETELY
+from apps.run import report_writer, training_session
+from apps.run.report_writer import diagnose_failure
+from apps.run.run_folder import RunFolder
+from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
+from avatar.training import checkpoint
 from capture.atomic_files import write_text_atomically
-from capture.file_list import LIST_NAME as LIST
+from capture.output_file_list import LIST_NAME as LIST
 from export.player import Player
 
 KEYS = {
@@ -90,13 +90,13 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
     """The package and the report are there; the exit code is not 0."""
-    monkeypatch.setattr(deliver, "diagnose_failure", diagnose_failure)
-    score = learn.score_frame
+    monkeypatch.setattr(report_writer, "diagnose_failure", diagnose_failure)
+    score = training_session.score_frame
 
     def as_of_a_room(avatar, held):
         return replace(score(avatar, held), psnr=6.88, blur=math.inf, overlap=0.2)
 
-    monkeypatch.setattr(learn, "score", as_of_a_room)
+    monkeypatch.setattr(training_session, "score", as_of_a_room)
     out = tmp_path / "run"
     outcome = call_ingest(capture, *FEW, "--out", out, "--no-refine-poses")
     assert outcome.code == 1
@@ -212,7 +212,7 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
 def test_a_full_disk_keeps_the_checkpoint_before(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(learn, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(training_session, "CHECKPOINT_INTERVAL_S", 0.0)
     save, written = torch.save, []
 
     def full_after_one(state, file):
@@ -251,7 +251,7 @@ def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr("apps.learning.snapshot.export_avatar", full)
+    monkeypatch.setattr("apps.run.package_snapshot.export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "Nothing was written" in outcome.complaint()

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from apps.terminal.packages import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
+from apps.cli.exit_codes import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -112,7 +112,9 @@ def test_commands_that_need_it_say_what_to_install(place, run, film):
 
 
 def test_a_module_of_our_own_that_is_missing_is_no_advice():
-    assert install_advice(ModuleNotFoundError("No module named 'apps.gone'", name="apps.gone")) is None
+    assert (
+        install_advice(ModuleNotFoundError("No module named 'apps.gone'", name="apps.gone")) is None
+    )
     assert "pip install pycolmap" in str(install_advice(ModuleNotFoundError(name="pycolmap._core")))
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.recording.opening import open_capture
-from apps.recording.wanted import CaptureInputs
-from capture.decoder import OpenCvDecoder
-from capture.opening import open_source
-from preprocess.live import LATE_ALPHA_WARNING
+from capture.source_opening import open_source
+from capture.video_decoder import OpenCvDecoder
+from preprocess.capture_session import CaptureInputs
+from preprocess.live.live_inputs import LATE_ALPHA_WARNING
 from preprocess.observation import Observation
+from preprocess.open_capture import open_capture
 
 FRAMES = 4
 ESTIMATED, ALPHA = "estimated by GrabCut", "alpha channel"
@@ -148,7 +148,7 @@ def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folde
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_videos_alpha_channel_is_told_where_masks_are_estimated(capture, monkeypatch, masked):
-    monkeypatch.setattr("capture.decoder.has_alpha_plane", lambda tag: True)
+    monkeypatch.setattr("capture.video_decoder.has_alpha_plane", lambda tag: True)
     monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
     if not masked:
         shutil.rmtree(capture / "masks")

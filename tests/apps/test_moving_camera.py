@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from apps import check, play
-from apps.checking.examine import passes_quick_check
-from apps.recording.opening import open_capture
-from apps.recording.wanted import CaptureInputs
+from apps.checks.capture_validation import passes_quick_check
+from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
-from preprocess.pose_file import read_motion, write_motion
-from preprocess.poses.place import transform_motion
+from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.root_placement import transform_motion
 
 
 @pytest.fixture
@@ -30,7 +30,9 @@ def walk(capture):
     worlds[:, :3, :3] = Rotation.from_rotvec(np.outer(angles, [0.0, 1.0, 0.0])).as_matrix()
     worlds[:, :3, 3] = np.column_stack([angles, 0.2 * angles, -angles])
     (capture / "poses.npz").unlink()
-    write_motion(capture / "poses.npz", transform_motion(still.motion, worlds, still.shaped.joints[0]))
+    write_motion(
+        capture / "poses.npz", transform_motion(still.motion, worlds, still.shaped.joints[0])
+    )
     (capture / "cameras.npz").unlink()
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = [world @ np.linalg.inv(camera.camera_from_world) @ flip for world in worlds]
@@ -43,7 +45,7 @@ def walk(capture):
             for number, pose in enumerate(poses[:-2])
         ],
     }  # fmt: skip
-    (capture / "transforms.json").write_text_atomically(json.dumps(content))
+    (capture / "transforms.json").write_text(json.dumps(content))
     return capture, still
 
 

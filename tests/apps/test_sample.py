@@ -4,7 +4,7 @@ import shlex
 import pytest
 
 from apps import sample
-from apps.studio import writer
+from studio import shoot
 
 
 def run(*arguments):
@@ -59,5 +59,5 @@ def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(writer, "shoot", fail)
+    monkeypatch.setattr(shoot, "shoot", fail)
     assert run(tmp_path / "c") == code

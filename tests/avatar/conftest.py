@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from apps.studio import motions
-from apps.studio.actor import Actor
-from apps.studio.framing import static_camera
-from avatar.cells import CorrespondenceGrid
 from avatar.config import TrainConfig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.deformation.rig import Rig
+from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
 from avatar.events import HeldOutScore
-from avatar.hold import HeldOutFrame, prepare_stream, score_frame
-from avatar.levels import HashLevels
-from avatar.rig import Rig
-from avatar.step import cosine_decay
-from avatar.trainer import Trainer
+from avatar.kernels.hash_levels import HashLevels
+from avatar.training.trainer import Trainer
+from avatar.training.training_step import cosine_decay
 from capture.camera import Camera
 from capture.frame import Frame
+from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
-from preprocess.pose import BodyPose
+from studio import actor_motions
+from studio.actor import Actor
+from studio.studio_cameras import static_camera
 
 
 @pytest.fixture(scope="session")
@@ -113,8 +113,8 @@ def clip() -> Clip:
             frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera
         )
 
-    filmed = motions.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
-    novel = motions.novel_poses(actor)
+    filmed = actor_motions.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
+    novel = actor_motions.novel_poses(actor)
     return Clip(
         observations=[observed(i, filmed[i]) for i in range(len(filmed))],
         novel=observed(100, novel[0]),
@@ -131,7 +131,7 @@ class Learnt:
 
     Attributes:
         trainer: After its last step.
-        held: EvaluationFrames that it has never seen.
+        held: Frames that it has never seen.
         novel: A pose that was never filmed.
         marks: Scores of the held-out frames and the novel pose, every so many steps.
     """
@@ -146,7 +146,12 @@ class Learnt:
 def learnt(rig, clip) -> Learnt:
     """Trained once for all tests, with a rate that falls after half of the steps."""
     config = TrainConfig(
-        rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
+        rays=512,
+        sample_step_m=0.015,
+        finest_m=0.03,
+        levels=6,
+        table_size=1 << 14,
+        refine_poses=False,
     )
     trainer = Trainer(rig, config, torch.device("cpu"))
     held = []
@@ -160,7 +165,9 @@ def learnt(rig, clip) -> Learnt:
     marks = []
     for step in range(LEARNT_STEPS):
         falling = (step - FRAMES_ARRIVE_FOR) / (LEARNT_STEPS - FRAMES_ARRIVE_FOR)
-        trainer.step(rate=cosine_decay(falling), hard_surface_share=min(1.0, 4.0 * step / LEARNT_STEPS))
+        trainer.step(
+            rate=cosine_decay(falling), hard_surface_share=min(1.0, 4.0 * step / LEARNT_STEPS)
+        )
         if trainer.steps % MARK_EVERY == 0:
             marks.append([score_frame(trainer.avatar, frame) for frame in [*held, novel]])
     return Learnt(trainer=trainer, held=held, novel=novel, marks=marks)

@@ -79,7 +79,11 @@ def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
     assert dozen.density_slope_weight == dozen.color_tv_weight == dozen.min_occupied_density == 0.0
     assert dozen.initial_density_tv_factor == 1.0
     assert usual.double_well_weight == usual.interior_weight == 0.0
-    assert usual.density_tv_weight_at(0.0) == usual.density_tv_weight_at(1.0) == usual.density_tv_weight
+    assert (
+        usual.density_tv_weight_at(0.0)
+        == usual.density_tv_weight_at(1.0)
+        == usual.density_tv_weight
+    )
 
 
 def test_surfaces_are_smoothest_at_first():
@@ -91,4 +95,8 @@ def test_surfaces_are_smoothest_at_first():
 
 def test_edges_may_be_as_steep_as_the_finest_cells_are_fine():
     coarse, fine = TrainConfig(finest_m=0.008), TrainConfig(finest_m=0.004)
-    assert fine.max_log_density_slope_per_m == 2.0 * coarse.max_log_density_slope_per_m == pytest.approx(1000.0)
+    assert (
+        fine.max_log_density_slope_per_m
+        == 2.0 * coarse.max_log_density_slope_per_m
+        == pytest.approx(1000.0)
+    )

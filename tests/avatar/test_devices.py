@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from avatar import checkpoint, fit, pose_step
 from avatar.config import TrainConfig
+from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
 from avatar.events import Evaluated, Finished
-from avatar.hold import HeldOutFrame, prepare_stream, score_frame
-from avatar.refine import FIRST_CORRECTION_STEPS
-from avatar.train import train
-from avatar.trainer import Trainer
+from avatar.pose import gauss_newton
+from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
+from avatar.training import checkpoint, held_out_pose_fitting
+from avatar.training.train import train
+from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -53,8 +54,10 @@ def trainer(device, rig, clip):
         trainer.add_frame(item)
     trainer.steps = FIRST_CORRECTION_STEPS - 3
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_step, "MIN_EVIDENCE", -1.0)  # these poses are exact, and would not move
-        patch.setattr(pose_step, "CERTAIN", 0.0)
+        patch.setattr(
+            gauss_newton, "MIN_EVIDENCE", -1.0
+        )  # these poses are exact, and would not move
+        patch.setattr(gauss_newton, "CERTAIN", 0.0)
         for _ in range(12):
             trainer.step(rate=1.0, hard_surface_share=1.0)
     return trainer
@@ -70,8 +73,8 @@ def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig,
     assert trainer.corrections  # poses were refined, too
     held = held_out(clip, rig)
     assert np.isfinite(score_frame(trainer.avatar, held[0]).psnr)
-    monkeypatch.setattr(fit, "CORRECTIONS_PER_FRAME", 4)
-    assert np.isfinite(fit.score_with_fitted_poses(trainer, held)[0].psnr)
+    monkeypatch.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
+    assert np.isfinite(held_out_pose_fitting.score_with_fitted_poses(trainer, held)[0].psnr)
 
 
 @pytest.mark.parametrize(

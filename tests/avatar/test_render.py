@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from avatar import render as render_module
 from avatar.config import TrainConfig
-from avatar.kernels.backend import MarchSettings, RayBatch
-from avatar.prepare import BodyFrameRays
+from avatar.deformation.correspondence_check import CorrespondenceCheck
+from avatar.kernels.backend_protocol import MarchSettings, RayBatch
 from avatar.render import MIN_TRANSMITTANCE, correspondence_tables, render
-from avatar.strays import CorrespondenceCheck
-from avatar.trainer import Trainer
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import BodyFrameRays
 from capture.camera import Camera
-from preprocess.pose import BodyPose
+from preprocess.body.body_pose import BodyPose
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,9 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
     tables = correspondence_tables(cells, torch.device("cpu"))
     samples = avatar.field.backend.march(batch, tables, avatar.rendering_grid(), how)
     strays = CorrespondenceCheck.for_pose(rig, pose.joint_rotations, cells, torch.device("cpu"))
-    rays_of_strays = torch.searchsorted(samples.offsets, strays.find_spurious(samples, batch), right=True) - 1
+    rays_of_strays = (
+        torch.searchsorted(samples.offsets, strays.find_spurious(samples, batch), right=True) - 1
+    )
     count = samples.counts.numpy() - np.bincount(rays_of_strays, minlength=len(pixels))
     alpha = 1.0 - np.exp(-np.exp(1.5) * config.sample_step_m * count.reshape(camera.size_px[::-1]))
     color = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 2.0])))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.quiet import silence_opencv
+from capture.image_folder import silence_opencv
 
 SIZE = (64, 48)
 

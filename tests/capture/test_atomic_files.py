@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from capture.atomic_files import atomic_file, atomic_folder, write_text_atomically
-from capture.errors import InputError
-from capture.file_list import HEADER, LIST_NAME, OutputFileList
+from capture.input_error import InputError
+from capture.output_file_list import HEADER, LIST_NAME, OutputFileList
 
 
 def names(folder):
@@ -23,7 +23,7 @@ def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "deep" / "report.json"
     write_text_atomically(path, "old")
     with atomic_file(path) as part:
-        part.write_text_atomically("new")
+        part.write_text("new")
         assert path.read_text() == "old"
         assert part.suffix == path.suffix
     assert path.read_text() == "new"
@@ -36,7 +36,7 @@ def test_a_file_that_fails_leaves_the_older_one(tmp_path):
 
     def fails():
         with atomic_file(path) as part:
-            part.write_text_atomically("half")
+            part.write_text("half")
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -65,9 +65,9 @@ def test_a_link_stays_and_what_it_points_to_is_replaced(tmp_path):
     (tmp_path / "far").mkdir()
     (tmp_path / "frames").symlink_to(tmp_path / "far")
     with atomic_folder(tmp_path / "frames") as part:
-        (part / "old.png").write_text_atomically("old")
+        (part / "old.png").write_text("old")
     with atomic_folder(tmp_path / "frames") as part:
-        (part / "new.png").write_text_atomically("new")
+        (part / "new.png").write_text("new")
     assert (tmp_path / "frames").is_symlink()
     assert names(tmp_path / "far") == ["new.png"]
     (tmp_path / "a.json").symlink_to(tmp_path / "b.json")
@@ -106,7 +106,7 @@ def test_a_listed_file_is_ours_until_somebody_changes_it(tmp_path, listing):
     assert listing.holds("report.json")
     write_text_atomically(path, "two")
     assert path.read_text() == "two"
-    path.write_text_atomically("mine now")
+    path.write_text("mine now")
     assert not listing.holds("report.json")
     with pytest.raises(InputError, match=r"report\.json is there already"):
         write_text_atomically(path, "three")
@@ -124,7 +124,7 @@ def test_a_copied_folder_still_knows_its_files(tmp_path, listing):
 
 def test_without_a_list_the_caller_says_what_may_go(tmp_path):
     path = tmp_path / "a.json"
-    path.write_text_atomically("mine")
+    path.write_text("mine")
     with pytest.raises(InputError, match="left alone"):
         write_text_atomically(path, "ours", replace=False)
     assert path.read_text() == "mine"
@@ -191,7 +191,7 @@ def test_what_comes_into_a_folder_that_is_being_replaced_is_not_lost(tmp_path):
 
 
 def test_somebody_elses_list_is_not_written_to(tmp_path):
-    (tmp_path / LIST_NAME).write_text_atomically("milk, eggs")
+    (tmp_path / LIST_NAME).write_text("milk, eggs")
     with pytest.raises(InputError, match="not a list"):
         OutputFileList(tmp_path).create()
     write_text_atomically(tmp_path / "a.json", "{}")
@@ -223,7 +223,7 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path, listing):
 
 
 def test_a_list_alone_goes_and_with_it_nothing_else(tmp_path, listing):
-    (tmp_path / "mine.txt").write_text_atomically("mine")
+    (tmp_path / "mine.txt").write_text("mine")
     listing.tidy()
     assert listing.exists()
     (tmp_path / "mine.txt").unlink()

@@ -62,7 +62,9 @@ def test_a_resized_camera_sees_the_same_directions():
     camera = camera_at(5)
     half = camera.resize((100, 75))
     pixels = np.array([[0.0, 0.0], [13.0, 99.0], [200.0, 150.0]])
-    np.testing.assert_allclose(half.ray_directions(pixels / 2), camera.ray_directions(pixels), atol=1e-12)
+    np.testing.assert_allclose(
+        half.ray_directions(pixels / 2), camera.ray_directions(pixels), atol=1e-12
+    )
     np.testing.assert_allclose(half.resize((200, 150)).intrinsic, camera.intrinsic)
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from capture.decoder import OpenCvDecoder, has_alpha_plane
-from capture.decoder_av import PyAvDecoder
-from capture.errors import InputError
-from capture.opening import open_source
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from capture.video_decoder import OpenCvDecoder, PyAvDecoder, has_alpha_plane
 
 
 def greys(frames) -> list[int]:

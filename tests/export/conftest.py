@@ -8,14 +8,14 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from avatar.rig import Rig
+from avatar.deformation.rig import Rig
 from capture.camera import Camera
-from export.bake import BakeConfig, bake_field
+from export.bake.bake_tables import BakeConfig, bake_field
 from export.build import ExportReport, export_field
-from export.tables import PlayerTables
-from preprocess.body_file import load_body_model
-from preprocess.kinematics import body_from_rest
-from preprocess.pose import BodyPose
+from export.package.player_tables import PlayerTables
+from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import body_from_rest
 
 RADII_CM = [12, 8, 8, 12, 6, 6, 13, 5, 5, 13, 5, 5, 7, 7, 7, 10, 6, 6, 5, 5, 4, 4, 4, 4]
 STEP_M = 0.005
@@ -63,7 +63,7 @@ class StandIn:
         return picture.reshape(height, width, 4).astype(np.float32)
 
     def _posed_field(self, points, bones, tree):
-        """SrgbColor and density of the densest of up to three canonical points."""
+        """Color and density of the densest of up to three canonical points."""
         best_rgb, best = np.zeros((len(points), 3)), np.zeros(len(points))
         if len(points) == 0:
             return best_rgb, best

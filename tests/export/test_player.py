@@ -8,15 +8,20 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from avatar.metrics import psnr
-from capture.errors import InputError
-from export.graph import build_graph
-from export.package import read_package
+from avatar.evaluation.image_metrics import psnr
+from capture.input_error import InputError
+from export.graph.player_graph import build_graph
+from export.package.graph_tables import subdivided_skinning_nodes
+from export.package.package_file import read_package
 from export.player import PictureDifference, Player, premultiply, verify_package
-from export.skin import subdivided_skinning_nodes
-from export.twin import PlayerInputs, draw_reference
-from export.twin_march import PosedNodes, skin_trilinear, skin_tetrahedral, sample_bricks
-from preprocess.pose import BodyPose
+from export.reference.reference_march import (
+    PosedNodes,
+    sample_bricks,
+    skin_tetrahedral,
+    skin_trilinear,
+)
+from export.reference.reference_player import PlayerInputs, draw_reference
+from preprocess.body.body_pose import BodyPose
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +319,7 @@ def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player
     assert set(exported.psnr_to_renderer) == {"hq", "lite"}
 
 
-@pytest.mark.parametrize("module", ["export.onnx_session", "apps.playing.bench"])
+@pytest.mark.parametrize("module", ["export.onnx_session", "apps.animation.player_timing"])
 def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     code = f"import {module}, onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     plain = {key: held for key, held in os.environ.items() if not key.startswith(("ORT_", "XDG_"))}

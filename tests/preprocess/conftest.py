@@ -1,10 +1,21 @@
-"""A small body of random vertices on the real tree, and a motion."""
+"""A small body of random vertices on the real tree, and a motion.
+
+Files of other people's trackers, written byte by byte as those programs write them.
+"""
+
+import io
+import pickle
+import sys
+import types
+import zlib
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from preprocess.pose import Motion
-from preprocess.skeleton import PARENTS
+from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import PARENTS
+from preprocess.body.parametric_body import ShapedBody
 
 
 @pytest.fixture
@@ -34,3 +45,85 @@ def motion(rng) -> Motion:
         betas=rng.normal(size=10),
         body_model="body24",
     )
+
+
+@pytest.fixture
+def truth(rng) -> Motion:
+    """Forty poses of somebody who turns round and waves, 3 m before a camera, y down."""
+    count = 40
+    phase = np.linspace(0.0, 2.0 * np.pi, count)
+    yaw = phase[:, None] * np.array([0.0, 1.0, 0.0])
+    upright = np.array([np.pi, 0.0, 0.0])
+    from scipy.spatial.transform import Rotation
+
+    roots = (Rotation.from_rotvec(upright) * Rotation.from_rotvec(yaw)).as_rotvec()
+    waves = 0.4 * np.sin(phase[:, None, None] + rng.uniform(0.0, 6.0, (1, 23, 3)))
+    waves[:, 21:] = 0.0  # SMPL's hands: no tracker knows more of them
+    places = np.column_stack([0.3 * np.sin(phase), 0.2 + 0.0 * phase, 3.0 + 0.4 * np.cos(phase)])
+    return Motion(
+        root_rotations=roots,
+        root_translations=places,
+        joint_rotations=waves,
+        valid=np.ones(count, dtype=bool),
+        betas=0.5 * rng.normal(size=10),
+        body_model="smpl",
+        frames=np.arange(count),
+    )
+
+
+@pytest.fixture
+def joints_of(shaped) -> Callable[..., np.ndarray]:
+    """Posed joints of every row of a motion, metres."""
+
+    def joints_of(motion: Motion, body: ShapedBody = shaped) -> np.ndarray:
+        rows = range(len(motion))
+        return np.stack([body.with_pose(motion[row]).joints() for row in rows])
+
+    return joints_of
+
+
+@pytest.fixture
+def joblib_bytes(monkeypatch) -> Callable[..., bytes]:
+    """What joblib 1.x writes: arrays lie between the opcodes, aligned to 16 bytes."""
+    module = types.ModuleType("joblib.numpy_pickle")
+
+    class NumpyArrayWrapper:
+        def __init__(self, array):
+            self.subclass = np.ndarray
+            self.shape = array.shape
+            self.order = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
+            self.dtype = array.dtype
+            self.allow_mmap = not array.dtype.hasobject
+            self.numpy_array_alignment_bytes = 16
+
+    NumpyArrayWrapper.__module__ = "joblib.numpy_pickle"
+    NumpyArrayWrapper.__qualname__ = "NumpyArrayWrapper"
+    module.NumpyArrayWrapper = NumpyArrayWrapper
+    monkeypatch.setitem(sys.modules, "joblib", types.ModuleType("joblib"))
+    monkeypatch.setitem(sys.modules, "joblib.numpy_pickle", module)
+
+    class JoblibPickler(pickle._Pickler):
+        def __init__(self, stream, protocol):
+            super().__init__(stream, protocol)
+            self.stream = stream
+
+        def save(self, obj, save_persistent_id=True):
+            if type(obj) is not np.ndarray:
+                return super().save(obj, save_persistent_id)
+            super().save(NumpyArrayWrapper(obj))
+            if self.proto >= 4:
+                self.framer.commit_frame(force=True)
+            if obj.dtype.hasobject:
+                pickle.dump(obj, self.stream, protocol=2)
+            else:
+                padding = 16 - (self.stream.tell() + 1) % 16
+                self.stream.write(bytes([padding]) + b"\xff" * padding)
+                self.stream.write(obj.tobytes("A"))
+            return None
+
+    def dump(thing, *, compressed: bool = False, protocol: int = 4) -> bytes:
+        stream = io.BytesIO()
+        JoblibPickler(stream, protocol).dump(thing)
+        return zlib.compress(stream.getvalue(), 3) if compressed else stream.getvalue()
+
+    return dump

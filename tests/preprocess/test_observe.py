@@ -1,4 +1,4 @@
-"""EvaluationFrames, poses, masks and cameras joined, or refused for a reason."""
+"""Frames, poses, masks and cameras joined, or refused for a reason."""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import InputError
-from capture.opening import open_source
-from capture.quiet import silence_opencv
-from preprocess.camera_file import CameraTrack, assume_static_camera
-from preprocess.masks.files import open_masks
+from capture.image_folder import silence_opencv
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from preprocess.body.body_pose import Motion
+from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
+from preprocess.masks.mask_files import open_masks
 from preprocess.observation import Observation
 from preprocess.observe import DroppedFrame, associate_poses, observe, shrink_to_longer_side
-from preprocess.pose import Motion
 
 SIZE = (48, 64)
 COUNT = 8
@@ -213,7 +213,9 @@ def test_masks_that_are_turned_among_others_are_left_out_and_obeyed_where_told(p
     assert [r.index for r in results if isinstance(r, DroppedFrame)] == [4]
     assert "wrong way round" in results[4].reason
     told = open_masks(images / "masks", invert=False)
-    assert not any(isinstance(r, DroppedFrame) for r in observe(source, moving(COUNT), told, cameras))
+    assert not any(
+        isinstance(r, DroppedFrame) for r in observe(source, moving(COUNT), told, cameras)
+    )
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1000.0, 0.0), (1.0, 1.7e9), (1e-3, 0.0)])

@@ -33,7 +33,7 @@ export class Player {
     return this.engine.open(tier);
   }
 
-  /** The camera, with fewer pixels where surfels could not cover what is near (export/close_up.py). */
+  /** The camera, with fewer pixels where surfels could not cover what is near (export/player_limits.py). */
   drawable({ tier }, pose, camera) {
     const { rules, layout } = this.avatar.tiers[tier];
     const seen = this.skeleton.posed(pose).joints.map((joint) => moved(camera.cameraFromWorld, joint));

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from capture.errors import InputError
-from capture.opening import open_source
+from capture.input_error import InputError
 from capture.source import FrameSource
-from preprocess.camera_file import read_cameras
-from preprocess.cameras.door import read_named_cameras
+from capture.source_opening import open_source
+from preprocess.cameras.camera_file import read_cameras
+from preprocess.cameras.camera_registry import read_named_cameras
 
 SIZE = (640, 480)
 COUNT = 5
@@ -90,7 +90,7 @@ def colmap(tmp_path, cameras):
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp_path):
     folder, model = colmap()
-    model.write_binary(folder) if kind == "binary" else model.write_text_atomically(folder)
+    model.write_binary(folder) if kind == "binary" else model.write_text(folder)
     if version == "3.x":
         for part in ("rigs", "frames"):
             (folder / f"{part}.{'bin' if kind == 'binary' else 'txt'}").unlink()
@@ -139,7 +139,7 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
             for n, camera in reversed(list(enumerate(cameras, 1)))
         ],
     }  # fmt: skip
-    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     for path in (tmp_path, tmp_path / "transforms.json"):
         found = read_named_cameras(path)
         names = [f"images/frame_{n:05d}" for n in range(1, COUNT + 1)]
@@ -152,12 +152,12 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
 def test_a_frame_may_have_a_lens_of_its_own_or_an_angle_of_view(cameras, tmp_path):
     frame = {"file_path": "a_1.png", "transform_matrix": opengl_pose(cameras[0]).tolist()}
     content = {"w": 640, "h": 480, "camera_angle_x": 2 * np.arctan(0.5), "frames": [frame]}
-    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read_named_cameras(tmp_path)[0].camera
     assert camera.focal_px == pytest.approx((640.0, 640.0))
     assert camera.center_px == (320.0, 240.0)
     frame |= {"fl_x": 300.0, "fl_y": 301.0, "cx": 1.0, "cy": 2.0}
-    (tmp_path / "transforms.json").write_text_atomically(json.dumps(content))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     assert read_named_cameras(tmp_path)[0].camera.focal_px == (300.0, 301.0)
 
 
@@ -168,7 +168,7 @@ def test_record3d_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
     ]
     columns = [500.0, 0, 0, 0, 505.0, 0, 318.5, 243.0, 1.0]
     content = {"poses": poses, "K": columns, "w": 640, "h": 480, "fps": 60, "dw": 192, "dh": 256}
-    (tmp_path / "metadata").write_text_atomically(json.dumps(content))
+    (tmp_path / "metadata").write_text(json.dumps(content))
     with zipfile.ZipFile(tmp_path / "walk.r3d", "w") as archive:
         archive.writestr("metadata", json.dumps(content))
     for path in (tmp_path, tmp_path / "metadata", tmp_path / "walk.r3d"):
@@ -185,7 +185,7 @@ def test_polycam_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
         numbers = {f"t_{r}{c}": matrix[r, c] for r in range(3) for c in range(4)}
         numbers |= {"fx": 500.0, "fy": 505.0, "cx": 318.5, "cy": 243.0}
         numbers |= {"width": 640, "height": 480, "blur_score": 100.0}
-        (folder / f"{98000 + number}.json").write_text_atomically(json.dumps(numbers))
+        (folder / f"{98000 + number}.json").write_text(json.dumps(numbers))
     found = read_named_cameras(tmp_path)
     assert [each.name for each in found] == [str(98000 + n) for n in range(COUNT)]
     for each, camera in zip(found, cameras, strict=True):
@@ -200,7 +200,7 @@ def transforms(path: Path, cameras: list[Camera], names: list[str]) -> Path:
         for name, camera in zip(names, cameras, strict=True)
     ]
     content = {"w": 640, "h": 480, "fl_x": 500.0, "cx": 318.5, "cy": 243.0, "frames": frames}
-    path.write_text_atomically(json.dumps(content))
+    path.write_text(json.dumps(content))
     return path
 
 
@@ -293,7 +293,7 @@ def test_cameras_of_larger_pictures_are_scaled_and_of_other_shapes_refused(camer
     ],
 )
 def test_strange_json_is_refused_with_what_is_wrong(content, words, tmp_path):
-    (tmp_path / "transforms.json").write_text_atomically(content)
+    (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(InputError, match=words):
         read_named_cameras(tmp_path)
 
@@ -312,7 +312,7 @@ def test_strange_json_is_refused_with_what_is_wrong(content, words, tmp_path):
 )  # fmt: skip
 def test_any_json_is_read_or_refused(tmp_path_factory, content):
     path = tmp_path_factory.mktemp("json") / "transforms.json"
-    path.write_text_atomically(json.dumps(content))
+    path.write_text(json.dumps(content))
     try:
         found = read_named_cameras(path)
     except InputError:

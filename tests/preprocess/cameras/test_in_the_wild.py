@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.errors import InputError
-from capture.opening import open_source
-from preprocess.camera_file import read_cameras
-from preprocess.cameras.door import read_named_cameras
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from preprocess.cameras.camera_file import read_cameras
+from preprocess.cameras.camera_registry import read_named_cameras
 
 POSES = [np.diag([1.0, 1, 1, 1]) + np.outer([0, 0, 1, 0], [0, 0, 0, n]) for n in range(3)]
 
@@ -20,7 +20,7 @@ def written(path: Path, content: dict, names: str = "./train/r_{}") -> Path:
         {"file_path": names.format(n), "transform_matrix": pose.tolist()}
         for n, pose in enumerate(POSES)
     ]
-    path.write_text_atomically(json.dumps({**content, "frames": frames}))
+    path.write_text(json.dumps({**content, "frames": frames}))
     return path
 
 
@@ -60,7 +60,7 @@ def test_pictures_of_one_name_in_several_folders_are_told_apart(tmp_path):
         for n, pose in enumerate(np.array(POSES) * np.array([1, 1, 1, sign]))
     ]
     path = tmp_path / "transforms.json"
-    path.write_text_atomically(json.dumps({**content, "frames": both}))
+    path.write_text(json.dumps({**content, "frames": both}))
     for side in ("left", "right", "third"):
         folder = tmp_path / side
         folder.mkdir()
@@ -80,9 +80,9 @@ def test_record3d_has_a_focal_length_for_each_frame(tmp_path):
         "h": 60, "perFrameIntrinsicCoeffs": [[50 + n, 50 + n, 40, 31] for n in range(3)],
     }  # fmt: skip
     path = tmp_path / "metadata"
-    path.write_text_atomically(json.dumps(content))
+    path.write_text(json.dumps(content))
     assert [each.camera.focal_px[0] for each in read_named_cameras(path)] == [50.0, 51.0, 52.0]
     assert read_named_cameras(path)[0].camera.center_px == (40.0, 31.0)
     for broken in ([[1, 2]] * 3, "x", [[0, 0, 0, 0]] * 3, None):
-        path.write_text_atomically(json.dumps({**content, "perFrameIntrinsicCoeffs": broken}))
+        path.write_text(json.dumps({**content, "perFrameIntrinsicCoeffs": broken}))
         assert {each.camera.focal_px for each in read_named_cameras(path)} == {(50.0, 50.0)}

@@ -7,17 +7,22 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from capture.errors import InputError
 from capture.frame import Frame
-from preprocess.kinematics import rotation_matrices
-from preprocess.masks import segmenter
-from preprocess.masks.behind import MAX_LIGHT_GAIN, MIN_LIGHT_GAIN, MIN_BACKGROUND_SPREAD, FOREGROUND_MIN_DIFFERENCE, BackgroundModel
-from preprocess.masks.grabcut import GrabCutSegmenter, _Segmentation, _ExpectedShape
-from preprocess.masks.hair import solid_hair
-from preprocess.masks.outline import MeshSilhouette, signed_distance_px
-from preprocess.masks.segmenter import make_segmenter, segmenter_name
-from preprocess.masks.shell import FOOT_JOINTS, ClothedBody, ClothingOffset
-from preprocess.pose import BodyPose
+from capture.input_error import InputError
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.silhouette import MeshSilhouette, signed_distance_px
+from preprocess.masks import mask_origin
+from preprocess.masks.clothing_offset import FOOT_JOINTS, ClothedBody, ClothingOffset, solid_hair
+from preprocess.masks.color_models import (
+    FOREGROUND_MIN_DIFFERENCE,
+    MAX_LIGHT_GAIN,
+    MIN_BACKGROUND_SPREAD,
+    MIN_LIGHT_GAIN,
+    BackgroundModel,
+)
+from preprocess.masks.grabcut import GrabCutSegmenter, _ExpectedShape, _Segmentation
+from preprocess.masks.mask_origin import make_segmenter, segmenter_name
 
 SIZE = (160, 200)
 
@@ -82,7 +87,9 @@ def test_nothing_is_drawn_of_a_body_behind_the_camera(shaped, camera):
     away = np.eye(4)
     away[2, 3] = -5.0
     assert (
-        not MeshSilhouette(shaped).draw_pose(standing(shaped), replace(camera, camera_from_world=away)).any()
+        not MeshSilhouette(shaped)
+        .draw_pose(standing(shaped), replace(camera, camera_from_world=away))
+        .any()
     )
 
 
@@ -183,7 +190,9 @@ def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_w
     assert shown is not None
     assert np.isinf(shown[1][never]).all()
     expected = np.sqrt(np.var(pictures, axis=0).mean(axis=-1))
-    np.testing.assert_allclose(shown[1][~never], np.maximum(expected, MIN_BACKGROUND_SPREAD)[~never], rtol=1e-3)
+    np.testing.assert_allclose(
+        shown[1][~never], np.maximum(expected, MIN_BACKGROUND_SPREAD)[~never], rtol=1e-3
+    )
     rim = person & ~cv2.erode(person.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     np.testing.assert_allclose(shown[0][rim], 0.7 * np.mean(pictures, axis=0)[rim], rtol=0.03)
     sure = steady.predict(shadow, ~person)
@@ -200,7 +209,9 @@ def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
         pose = standing(shaped, float(yaw))
         around = shell.clothe(pose, large)
         assert around is not None
-        true = outline.draw_vertices(around.skin + thick_m * around.normals, large).astype(np.float32)
+        true = outline.draw_vertices(around.skin + thick_m * around.normals, large).astype(
+            np.float32
+        )
         expected = shell.draw(around, large)
         covered = cv2.resize(expected, large.size_px, interpolation=cv2.INTER_AREA) > 0.5
         away = signed_distance_px(covered)
@@ -251,7 +262,9 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
         for _ in range(4):
             around = shell.clothe(pose, camera)
             assert around is not None
-            leaked = MeshSilhouette(shaped).draw_vertices(around.skin + 0.03 * around.normals, camera)
+            leaked = MeshSilhouette(shaped).draw_vertices(
+                around.skin + 0.03 * around.normals, camera
+            )
             covered = cv2.resize(
                 shell.draw(around, camera), camera.size_px, interpolation=cv2.INTER_AREA
             )
@@ -269,11 +282,16 @@ def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
         around = shell.clothe(pose, large)
         assert around is not None
         mask = MeshSilhouette(shaped).draw_vertices(around.skin + thick_m * around.normals, large)
-        covered = cv2.resize(
-            shell.draw(around, large), large.size_px, interpolation=cv2.INTER_AREA
-        )
+        covered = cv2.resize(shell.draw(around, large), large.size_px, interpolation=cv2.INTER_AREA)
         rgb = np.repeat(mask[..., None] * np.uint8(200), 3, axis=2)
-        shell.update(around, large, rgb, mask.astype(np.float32), signed_distance_px(covered > 0.5), (0.2, 0.2))
+        shell.update(
+            around,
+            large,
+            rgb,
+            mask.astype(np.float32),
+            signed_distance_px(covered > 0.5),
+            (0.2, 0.2),
+        )
     thickness, known = shell._offsets_m()
     feet, legs = np.isin(shell._limb, FOOT_JOINTS), np.isin(shell._limb, (1, 2, 4, 5))
     assert np.median(thickness[feet & (known == 1.0)]) > 0.02
@@ -313,10 +331,22 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
     cut = np.zeros_like(shape)
     cut[:20, :30] = True
     cut[20:, :34] = True  # four centimetres too far
-    found_cut = _Segmentation(foreground=cut, signed_distance_px=signed_distance_px(cut), decided_by_background=0.0 * covered, band_m=(0.05, 0.05))
-    expected = _ExpectedShape(supersampled=covered, coverage=covered, signed_distance_px=away, hair_region=np.zeros_like(shape))
+    found_cut = _Segmentation(
+        foreground=cut,
+        signed_distance_px=signed_distance_px(cut),
+        decided_by_background=0.0 * covered,
+        band_m=(0.05, 0.05),
+    )
+    expected = _ExpectedShape(
+        supersampled=covered,
+        coverage=covered,
+        signed_distance_px=away,
+        hair_region=np.zeros_like(shape),
+    )
     weight = find._shape_weight(found_cut, expected, around)
-    hairy = find._shape_weight(found_cut, expected._replace(hair_region=~expected.hair_region), around)
+    hairy = find._shape_weight(
+        found_cut, expected._replace(hair_region=~expected.hair_region), around
+    )
     assert hairy[35, 31:35].max() <= weight[35, 31:35].min()  # a bun is no leak
     assert weight.min() >= 0.0
     assert weight.max() <= 1.0
@@ -385,7 +415,7 @@ def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):
     def load():
         return lambda body: made.append(body) or (lambda frame, pose, camera: frame)
 
-    monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
+    monkeypatch.setattr(mask_origin, "entry_points", lambda group: [Point("rembg", load)])
     assert make_segmenter("rembg", shaped)(1, None, None) == 1
     assert made == [shaped]
     with pytest.raises(InputError, match="installed are grabcut, rembg"):
@@ -396,6 +426,6 @@ def test_a_segmenter_that_cannot_be_loaded_is_named(monkeypatch, shaped):
     def load():
         raise ImportError("no module named rembg")
 
-    monkeypatch.setattr(segmenter, "entry_points", lambda group: [Point("rembg", load)])
+    monkeypatch.setattr(mask_origin, "entry_points", lambda group: [Point("rembg", load)])
     with pytest.raises(InputError, match=r"'rembg' could not be loaded: no module named rembg"):
         make_segmenter("rembg", shaped)

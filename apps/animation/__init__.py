@@ -1,0 +1,1 @@
+"""ia-play: clips, images and web pages of a package."""

@@ -1,0 +1,88 @@
+"""An avatar's package as a mesh file: .glb with skeleton and motion, or a still .ply or .obj."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apps.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+from apps.cli.console import Console
+from capture.atomic_files import atomic_file
+from export.mesh.gltf import SkeletonAnimation, encode_glb
+from export.mesh.skinned_mesh import SkinnedMesh, extract_mesh
+from export.package.manifest import Manifest
+from export.package.package_file import read_package
+from preprocess.body.body_pose import Motion
+
+
+def write_mesh(
+    package: Path,
+    out: Path,
+    console: Console,
+    *,
+    poses: Path | None,
+    name: str,
+    person: str | None = None,
+    replace: bool | None = None,
+) -> None:
+    """Writes the mesh by the suffix of its name, whole or not at all.
+
+    Args:
+        package: The avatar.
+        out: A .glb, a .ply or an .obj, in letters of either case.
+        console: Where it says how far it is.
+        poses: What the .glb does; without it, a turn.
+        name: Of the avatar.
+        person: Whose poses, where the file holds several people's.
+        replace: Whether a file that is there already may go, as of `atomic_file`.
+
+    Raises:
+        InputError: If the package is not sound, or no pose is valid.
+        OSError: If the disk is full.
+    """
+    held = read_package(package)
+    motion = demo_motion()
+    if poses is not None:
+        motion = load_driving_motion(poses, held.manifest.rest_joints, console, person=person)
+    suffix = out.suffix.lower()
+    write = (
+        _glb_encoder(held.manifest, motion, name)
+        if suffix == ".glb"
+        else _static_mesh_encoder(suffix)
+    )
+    with console.status("taking the surface"):
+        mesh = extract_mesh(held.tables["hq"])
+        content = write(mesh)
+    with atomic_file(out, replace=replace) as part:
+        part.write_bytes(content)
+    console.info(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
+
+
+def _glb_encoder(manifest: Manifest, motion: Motion, name: str) -> Callable[[SkinnedMesh], bytes]:
+    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
+    animation = SkeletonAnimation.of(motion, rows, pose_rate(motion), manifest.rest_joints[0])
+    return lambda mesh: encode_glb(mesh, manifest, animation, name=name)
+
+
+def _static_mesh_encoder(suffix: str) -> Callable[[SkinnedMesh], bytes]:
+    """Return what encodes the canonical pose; colors are sRGB, as programs take a PLY's to be."""
+    import trimesh  # an installation of the player alone has none, and is told what to install
+
+    options: dict[str, Any] = {
+        ".ply": {"vertex_normal": True},
+        ".obj": {"include_normals": True},
+    }[suffix]
+
+    def encoded(mesh: SkinnedMesh) -> bytes:
+        solid = trimesh.Trimesh(
+            vertices=mesh.positions,
+            faces=mesh.faces,
+            vertex_normals=mesh.normals,
+            vertex_colors=mesh.colors,
+            process=False,
+        )
+        content = solid.export(file_type=suffix[1:], **options)
+        return content if isinstance(content, bytes) else str(content).encode()
+
+    return encoded

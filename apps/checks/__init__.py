@@ -1,0 +1,1 @@
+"""ia-check: validate a capture before training."""

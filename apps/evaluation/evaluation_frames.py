@@ -1,0 +1,163 @@
+"""The frames that an avatar is compared with: its own held-out ones, or another capture's."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from apps.run.ingest_arguments import IngestArguments, trainable_longer_side_px
+from apps.run.run_folder import RunFolder
+from capture.input_error import InputError
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.observation import Observation
+from preprocess.open_capture import open_capture
+
+PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EvaluationFrames:
+    """Frames of a recording.
+
+    Attributes:
+        recording: Where they come from.
+        numbers: Which of them count; None for all.
+    """
+
+    recording: Capture
+    frame_indices: frozenset[int] | None = None
+
+    @property
+    def count(self) -> int | None:
+        """How many there are, if that is known."""
+        return (
+            self.recording.source.frame_count
+            if self.frame_indices is None
+            else len(self.frame_indices)
+        )
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Those in which the person was found, in order; what is no longer needed is not read."""
+        recording, wanted = self.recording, self.frame_indices
+        observe, last = recording.observation_builder(), max(wanted, default=-1) if wanted else None
+        for frame in recording.source.frames():
+            counts = wanted is None or frame.index in wanted
+            if counts or recording.segment is not None:  # masks are estimated frame after frame
+                seen = observe(frame)
+                if counts and isinstance(seen, Observation):
+                    yield seen
+            if frame.index == last:
+                return
+
+
+def capture_frames(
+    inputs: CaptureInputs, body_file: Path | None, size_px: int | None
+) -> EvaluationFrames:
+    """All frames of a capture.
+
+    Args:
+        wanted: What the user named.
+        person: The body of the avatar, as a file, to which the poses are brought.
+        size_px: Longer side; None for their own.
+
+    Raises:
+        InputError: If a part is missing or does not fit.
+    """
+    return EvaluationFrames(recording=open_capture(inputs, size_px=size_px, avatar_body=body_file))
+
+
+def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
+    """The frames that a run has kept for scores, read again from where it read them.
+
+    Raises:
+        InputError: If its report, or what it read, is not there any more.
+    """
+    report = read_report(run)
+    given = _run_arguments(report, run)
+    if given.live or str(given.video).startswith("camera:"):
+        raise InputError(
+            f"{run.path} was learnt from a live source, which nobody kept. Name another capture of "
+            "the same person with --on."
+        )
+    wanted = given.capture_inputs()
+    if given.cameras == "solve" and run.cameras.is_file():
+        wanted = replace(wanted, cameras=str(run.cameras), poses=run.poses)
+    person = run.body_file if run.body_file.is_file() else None
+    recording = open_capture(wanted, avatar_body=person)
+    own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
+    numbers = report["held_out"]["frames"]
+    if not numbers:
+        raise InputError(
+            f"{run.path} has held out no frame, so there is nothing to score it on. Name another "
+            "capture of the same person with --on."
+        )
+    return EvaluationFrames(
+        recording=replace(recording, size_px=size_px or own_px), frame_indices=frozenset(numbers)
+    )
+
+
+def trained_longer_side_px(run: RunFolder) -> int | None:
+    """Longer side of the pictures that a run has learnt from; None if nobody knows."""
+    size = read_report(run)["held_out"].get("size") if run.report_json.is_file() else None
+    return max(size) if size else None
+
+
+def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
+    """Whether a run's report says that it was trained for the steps, or else the seconds."""
+    if not (run.has_checkpoint() and run.report_json.is_file()):
+        return False
+    training = read_report(run)["training"]
+    return training["wall_seconds"] >= seconds if steps is None else training["steps"] >= steps
+
+
+def read_report(run: RunFolder) -> dict[str, Any]:
+    """A run's report.json.
+
+    Raises:
+        InputError: If there is none, or it is damaged.
+    """
+    try:
+        report = json.loads(run.report_json.read_text(encoding="utf-8"))
+        if isinstance(report["command"], dict) and isinstance(report["held_out"]["frames"], list):
+            return report
+        raise KeyError("command")
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{run.path} holds no {run.report_json.name}, which says what it was learnt from: finish "
+            "the run (ia-ingest … --resume), or name a capture with --on."
+        ) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{run.report_json} is no report that ia-ingest wrote ({type(error).__name__}: {error}). "
+            "Let the run write it again (ia-ingest … --resume), or give both --on and --size."
+        ) from error
+
+
+def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
+    """The arguments of the run; paths that were relative are looked for near it, too."""
+    known = {item.name for item in fields(IngestArguments)}
+    words = {key: value for key, value in report["command"].items() if key in known}
+    try:
+        words |= {key: Path(words[key]) for key in PATH_ARGUMENTS if words.get(key) is not None}
+        given = IngestArguments(**words)
+    except TypeError as error:
+        raise InputError(
+            f"{run.report_json} does not say what was learnt from; name a capture with --on."
+        ) from error
+    base = _original_working_folder(given, run)
+    near = {key: base / words[key] for key in PATH_ARGUMENTS if words.get(key) is not None}
+    if given.cameras is not None and (base / given.cameras).exists():
+        near["cameras"] = str(base / given.cameras)
+    return replace(given, **near, realtime=False)
+
+
+def _original_working_folder(arguments: IngestArguments, run: RunFolder) -> Path:
+    """Where the command was run: here, or where its --out was this folder."""
+    if arguments.video.exists() or arguments.out is None or arguments.out.is_absolute():
+        return Path()
+    above = Path(os.path.abspath(run.path))
+    for _ in arguments.out.parts:
+        above = above.parent
+    return above if (above / arguments.video).exists() else Path()

@@ -1,1 +1,0 @@
-"""An avatar in motion: which poses, seen from where, drawn how fast, and what is made of it."""

@@ -1,1 +1,0 @@
-"""All that is known about a video before its first frame is read."""

@@ -1,0 +1,154 @@
+"""The learning curve: scores of held-out frames over training time.
+
+The learning curve as an SVG that takes its colours from the page.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurvePoint:
+    """How well held-out frames were rendered at some second of training.
+
+    Attributes:
+        wall_seconds, cpu_seconds: Training time so far.
+        frames_seen: Frames trained on so far.
+        psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
+        verdict: What the scores mean, in a word (`avatar.evaluation.sharpness`).
+        frames: Which those were, by their numbers in the video, each with its own PSNR of the whole
+            picture: they need not be the same at every mark, so that only a frame's own scores tell
+            whether it fell.
+        video: Whose frames they are: 1 for the video that was learnt first.
+    """
+
+    wall_seconds: float
+    cpu_seconds: float
+    frames_seen: int
+    psnr: float | None
+    psnr_mask: float | None
+    verdict: str | None = None
+    frames: tuple[tuple[int, float], ...] = ()
+    video: int = 1
+
+    @classmethod
+    def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":
+        """From what a checkpoint kept."""
+        frames = content.get("frames", [])
+        return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
+
+
+def largest_drops(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
+    """How far each held-out frame fell below its own best by a later mark, dB; 0 if it did not.
+
+    By video and number, of the frames that were scored more than once.
+    """
+    best: dict[tuple[int, int], float] = {}
+    falls: dict[tuple[int, int], float] = {}
+    for point in curve:
+        for number, value in point.frames:
+            frame = point.video, number
+            if frame in best:
+                falls[frame] = max(falls.get(frame, 0.0), best[frame] - value)
+            best[frame] = max(best.get(frame, value), value)
+    return falls
+
+
+def largest_drop(curve: Sequence[CurvePoint]) -> float | None:
+    """The largest of `largest_drops`, dB; None if no frame was scored twice."""
+    return max(largest_drops(curve).values(), default=None)
+
+
+SVG_WIDTH, SVG_HEIGHT = 720, 320
+LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
+"""Room around the plot for its labels."""
+
+AxisScale = Callable[[float], float]
+ScoredPoints = list[tuple[CurvePoint, float]]
+
+
+def curve_svg(curve: Sequence[CurvePoint]) -> str:
+    """PSNR of held-out frames over seconds of training: whole picture, and inside the mask.
+
+    Each video has a line of its own: what was held out of one cannot be compared with another's.
+
+    An empty string if nothing was measured.
+    """
+    whole = [(p, p.psnr) for p in curve if p.psnr is not None]
+    masked = [(p, p.psnr_mask) for p in curve if p.psnr_mask is not None]
+    if not whole:
+        return ""
+    values = [value for _, value in whole + masked]
+    low, high = 5.0 * (min(values) // 5.0), 5.0 * (max(values) // 5.0 + 1.0)
+    end = max(point.wall_seconds for point, _ in whole)
+
+    def x(seconds: float) -> float:
+        return LEFT + (SVG_WIDTH - LEFT - RIGHT) * seconds / max(end, 1e-6)
+
+    def y(decibels: float) -> float:
+        return TOP + (SVG_HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low)
+
+    parts = [
+        f'<svg class="curve" viewBox="0 0 {SVG_WIDTH} {SVG_HEIGHT}" role="img" '
+        'aria-label="PSNR of held-out frames over seconds of training">',
+        *_axes(x, y, low, high, end),
+        *_video_labels(whole, x),
+        *_polylines(masked, x, y, "masked", "inside the mask"),
+        *_polylines(whole, x, y, "whole", "whole picture"),
+        "</svg>",
+    ]
+    return "\n".join(parts)
+
+
+def _axes(x: AxisScale, y: AxisScale, low: float, high: float, end: float) -> list[str]:
+    parts = [
+        f'<line class="grid" x1="{LEFT}" x2="{SVG_WIDTH - RIGHT}" y1="{y(decibels):.1f}" '
+        f'y2="{y(decibels):.1f}"/>'
+        f'<text class="tick" x="{LEFT - 8}" y="{y(decibels) + 4.0:.1f}" text-anchor="end">'
+        f"{decibels:g}</text>"
+        for decibels in (float(n) for n in range(int(low), int(high) + 1, 5))
+    ]
+    parts += [
+        f'<text class="tick" x="{x(seconds):.1f}" y="{SVG_HEIGHT - 28}" text-anchor="middle">'
+        f"{seconds:g}</text>"
+        for seconds in _ticks(end)
+    ]
+    parts.append(f'<text class="unit" x="{LEFT - 8}" y="{TOP - 12}" text-anchor="end">dB</text>')
+    parts.append(
+        f'<text class="unit" x="{SVG_WIDTH - RIGHT}" y="{SVG_HEIGHT - 8}" text-anchor="end">'
+        "seconds of training</text>"
+    )
+    return parts
+
+
+def _ticks(end: float) -> list[float]:
+    step = next((s for s in (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0) if end / s <= 8.0), 300.0)
+    return [step * i for i in range(int(end / step) + 1)]
+
+
+def _video_labels(scored: ScoredPoints, x: AxisScale) -> list[str]:
+    """Where each video's line begins, if there are several."""
+    first = {point.video: point.wall_seconds for point, _ in reversed(scored)}
+    return [
+        f'<text class="tick" x="{x(seconds):.1f}" y="{TOP - 12}">video {video}</text>'
+        for video, seconds in sorted(first.items())
+        if len(first) > 1
+    ]
+
+
+def _polylines(
+    scored: ScoredPoints, x: AxisScale, y: AxisScale, kind: str, label: str
+) -> list[str]:
+    parts = []
+    for video in sorted({point.video for point, _ in scored}):
+        points = [(p, value) for p, value in scored if p.video == video]
+        path = " ".join(f"{x(p.wall_seconds):.1f},{y(value):.1f}" for p, value in points)
+        parts.append(f'<polyline class="{kind}" points="{path}"/>')
+        parts += [
+            f'<circle class="{kind}" cx="{x(p.wall_seconds):.1f}" cy="{y(value):.1f}" r="4">'
+            f"<title>{p.wall_seconds:.1f} s: {value:.2f} dB {label}, mean over "
+            f"{len(p.frames)} held-out frames</title></circle>"
+            for p, value in points
+        ]
+    return parts

@@ -1,1 +1,0 @@
-"""What a run was given, did and reached: report.json, report.html and their pictures."""

@@ -1,0 +1,1 @@
+"""A run: its folder, training session and results."""

@@ -1,0 +1,214 @@
+"""Solved cameras joined to a recording, and written beside its avatar.
+
+When a run's cameras are solved: before it learns, or beside it where it needs only the lens.
+
+An avatar is learnt from poses in the camera of each frame; where that camera stood matters only to
+the world around it. So with a stated K and masks at hand training does not wait. Without K the
+lens must be found first; without masks they are estimated, which must know that the camera moves.
+"""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import Any, final
+
+from apps.cli.console import Console
+from apps.run.run_folder import RunFolder
+from apps.run.solver_process import SolveJob, SolverProcess
+from capture.atomic_files import atomic_file
+from capture.camera import Camera
+from capture.input_error import InputError
+from preprocess.cameras.camera_file import ASSUMED_CAMERA_SOURCE, write_cameras
+from preprocess.capture_session import Capture
+from preprocess.poses.pose_file import write_motion
+from preprocess.sfm.camera_solution import CameraSolution
+from preprocess.sfm.metric_world import MetricPlacement, place_in_metric_world, solution_report
+
+
+def apply_camera_solution(recording: Capture, solved: CameraSolution) -> Capture:
+    """The recording in the world of its solved cameras; as it was, if the camera stood still.
+
+    Args:
+        recording: With poses in the camera of each frame.
+        solved: What the pictures say.
+
+    Raises:
+        InputError: If nothing tells the size of the world.
+    """
+    if solved.still:
+        note = (
+            f"The camera stood still (what is behind the person moved by {solved.moved:.2%} of the "
+            "picture), so there was nothing to solve."
+        )
+        return replace(
+            recording,
+            notes=(*recording.notes, note),
+            camera_report=solution_report(solved, None, recording.source),
+        )
+    place = place_in_metric_world(
+        solved, recording.motion, _tracker_camera(recording), recording.shaped, recording.source
+    )
+    found = solution_report(solved, place, recording.source)
+    return replace(
+        recording,
+        cameras=place.cameras,
+        motion=place.motion,
+        camera_report=found,
+        notes=(*recording.notes, _describe_solution(found, place)),
+    )
+
+
+def write_solved_capture(recording: Capture, run: RunFolder) -> None:
+    """cameras.npz and poses.npz of the run: the capture's own walk, to be played or reused."""
+    with atomic_file(run.cameras) as path:
+        write_cameras(path, recording.cameras)
+    with atomic_file(run.poses) as path:
+        write_motion(path, replace(recording.motion, intrinsic=None, camera_from_world=None))
+
+
+def _tracker_camera(recording: Capture) -> Camera | None:
+    """The camera that the poses were made for; None if its lens was only assumed."""
+    motion, camera = recording.motion, recording.cameras[0]
+    stated = motion.intrinsic is not None or motion.assumed_focal is not None
+    return camera if stated or recording.cameras.source != ASSUMED_CAMERA_SOURCE else None
+
+
+def _describe_solution(found: dict[str, Any], place: MetricPlacement) -> str:
+    frames, scale = found["frames"], found["scale"]
+    several = f"{frames['interpolated']} interpolated, " if frames["interpolated"] else ""
+    return (
+        f"Cameras: {frames['key']} key frames solved, {frames['placed']} placed between them, "
+        f"{several}{frames['missing']} missing; focal length {found['focal_px']:.0f} px; size by "
+        f"{' and '.join(scale['cues'])}, {place.floor_points} points of the floor seen."
+    )
+
+
+MAX_FOCAL_DIFFERENCE = 0.02
+"""Of a stated focal length, before it is said that the pictures tell another one."""
+
+
+@final
+class CameraSolving:
+    """The cameras of one run, sooner or later.
+
+    Attributes:
+        beside: Whether the run learns meanwhile.
+        refused: Why there are none, if a run has learnt without them.
+    """
+
+    def __init__(self, solving: SolverProcess, *, beside: bool) -> None:
+        """Takes over a process that has begun."""
+        self._solving, self.beside = solving, beside
+        self.refused: str | None = None
+        self._asked = False
+
+    def wait_before_training(self, recording: Capture, console: Console) -> Capture:
+        """What the run learns from: the recording in its solved world, if it had to be waited for.
+
+        Raises:
+            InputError: If the cameras cannot be solved with certainty.
+        """
+        if self.beside:
+            return recording
+        try:
+            solved = self._solving.wait(console)
+            assert solved is not None  # nobody can stop it here
+            found = apply_camera_solution(recording, solved)
+        except KeyboardInterrupt as error:
+            error.add_note("Stages of the cameras that were finished are kept: the same command "
+                           "goes on from there.")  # fmt: skip
+            raise
+        _print_new_notes(recording, found, console)
+        return found
+
+    def wait_after_training(
+        self, recording: Capture, run: RunFolder, console: Console, stop: threading.Event
+    ) -> Capture:
+        """What the report is about, once the run has learnt beside the solving; it is written.
+
+        Cameras that are refused now cost nobody the avatar.
+
+        Raises:
+            OSError: If the cameras cannot be written.
+        """
+        if not self.beside:
+            return recording
+        self._asked = True
+        try:
+            solved = self._solving.wait(console, stop)
+            if solved is None:
+                return replace(recording, camera_report={"verdict": "stopped"})
+            found = apply_camera_solution(recording, solved)
+        except InputError as refusal:
+            self.refused = str(refusal)
+            return replace(recording, camera_report={"verdict": "refused", "reason": str(refusal)})
+        _print_new_notes(recording, found, console)
+        self._write(found, run, console)
+        stated, true = recording.cameras[0].focal_px[0], found.cameras[0].focal_px[0]
+        if found.camera_report is not None and abs(true / stated - 1.0) > MAX_FOCAL_DIFFERENCE:
+            console.warning(
+                f"The poses state a focal length of {stated:.0f} px, the pictures one of "
+                f"{true:.0f} px; the avatar was learnt with the former. Leave K out of the poses, "
+                "and it is learnt with the latter."
+            )
+        return found
+
+    @contextmanager
+    def save_on_exit(self, recording: Capture, run: RunFolder, console: Console) -> Iterator[None]:
+        """Writes the cameras that are solved already, and, if the block fails, those since then.
+
+        Solving takes minutes: whatever becomes of the avatar, its result is not lost.
+
+        Args:
+            recording: As `before` gave it.
+            run: Where they go; it has begun.
+            console: Where they are named.
+
+        Raises:
+            OSError: If cameras that were solved before the block cannot be written.
+        """
+        self._write(recording, run, console)
+        try:
+            yield
+        except BaseException:
+            if self.beside and not self._asked:
+                with suppress(InputError, OSError):  # what ended the block is what is said
+                    at_once = threading.Event()
+                    at_once.set()
+                    self.wait_after_training(recording, run, console, at_once)
+            raise
+
+    def _write(self, recording: Capture, run: RunFolder, console: Console) -> None:
+        if recording.camera_report is None or recording.camera_report["verdict"] != "solved":
+            return
+        write_solved_capture(recording, run)
+        console.print_artifact("cameras", run.cameras)
+        console.print_artifact("poses there", run.poses)
+
+
+@contextmanager
+def start_camera_solving(
+    job: SolveJob | None, recording: Capture, run: RunFolder
+) -> Iterator[CameraSolving | None]:
+    """Solving that begins now, if there is a job, and does not outlive the block.
+
+    Args:
+        job: What is to be solved; None if nothing is.
+        recording: The same capture, opened.
+        run: Where stages are kept.
+
+    Raises:
+        InputError: If pycolmap is missing.
+    """
+    if job is None:
+        yield None
+        return
+    beside = recording.motion.intrinsic is not None and recording.segment is None
+    with SolverProcess(job, run.path, gently=beside) as solving:
+        yield CameraSolving(solving, beside=beside)
+
+
+def _print_new_notes(before: Capture, after: Capture, console: Console) -> None:
+    for note in after.notes[len(before.notes) :]:
+        console.info(note)

@@ -1,0 +1,80 @@
+"""What looks on while an avatar is learnt: it hears of everything, and is let in between steps."""
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol, runtime_checkable
+
+from apps.report.learning_curve import CurvePoint
+from avatar.evaluation.coverage import Coverage
+from avatar.evaluation.held_out import HeldOutFrame, is_held_out
+from avatar.events import TrainEvent
+from avatar.training.trainer import Trainer
+from preprocess.observation import Observation
+from preprocess.observe import DroppedFrame
+
+
+@runtime_checkable
+class ObservableSession(Protocol):
+    """A lesson, as those see it who look on.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        curve: Scores so far.
+        coverage: What of the person has been seen so far.
+    """
+
+    trainer: Trainer
+    held_out: list[HeldOutFrame]
+    curve: list[CurvePoint]
+    coverage: Coverage
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether somebody wants it to end."""
+        ...
+
+
+@runtime_checkable
+class TrainingObserver(Protocol):
+    """Somebody who looks on. A lesson without watchers does nothing for them."""
+
+    def on_frame(self, observation: Observation, *, held_out: bool) -> None:
+        """A frame in which the person was found, before the trainer has it.
+
+        Called on the reader's thread: it must be quick, and may run no parallel kernel.
+        """
+
+    def on_event(self, event: TrainEvent) -> None:
+        """Something happened; called on the thread that trains."""
+
+    def between_steps(self, session: ObservableSession) -> None:
+        """Between two steps, on the thread that trains: kernels may run here.
+
+        What it takes counts as training time, except inside `Trainer.held_up`.
+        """
+
+
+def notify_observers(
+    observations: Iterator[Observation | DroppedFrame],
+    coverage: Coverage,
+    observers: Sequence[TrainingObserver],
+    *,
+    hold_every: int,
+    frame_count: int | None,
+) -> Iterator[Observation | DroppedFrame]:
+    """Passes observations on; watchers see them, and what will be trained on has been seen.
+
+    Args:
+        observations: As they are found.
+        coverage: Takes in those that are not held out.
+        watchers: See all of them.
+        every, total: Which are held out (`is_held_out`).
+    """
+    for position, item in enumerate(observations):
+        if isinstance(item, Observation):
+            held_out = is_held_out(position, stride=hold_every, total=frame_count)
+            if not held_out:
+                coverage.add(item)
+            for watcher in observers:
+                watcher.on_frame(item, held_out=held_out)
+        yield item

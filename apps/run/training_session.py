@@ -1,0 +1,363 @@
+"""The walk from a recording to a trained avatar: feeds the trainer, listens, keeps checkpoints."""
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, final
+
+import torch
+
+from apps.cli.console import Console, ProgressBar, format_duration
+from apps.report.cpu_contention import CpuContentionMeter, CpuTime
+from apps.report.learning_curve import CurvePoint
+from apps.report.report_schema import finite_mean, format_percent, format_psnr
+from apps.report.stream_meter import StreamMeter
+from apps.run.continual_learning import EarlierVideos, earlier_video_names
+from apps.run.run_folder import RunFolder
+from apps.run.time_estimate import describe_position, post_training_seconds
+from apps.run.training_observer import TrainingObserver, notify_observers
+from apps.run.training_result import TrainingResult
+from avatar.config import HELD_OUT_STRIDE, TrainConfig
+from avatar.deformation.rig import Rig
+from avatar.evaluation.coverage import Coverage
+from avatar.evaluation.coverage_advice import coverage_advice
+from avatar.evaluation.held_out import (
+    HeldOutFrame,
+    StreamItem,
+    add_held_out,
+    prepare_stream,
+    score_frame,
+)
+from avatar.evaluation.sharpness import overall_verdict
+from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
+from avatar.training import checkpoint
+from avatar.training.held_out_pose_fitting import score_with_fitted_poses
+from avatar.training.train import train
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import TrainingFrame
+from capture.atomic_files import atomic_file
+from capture.inbox import Inbox
+from capture.live.realtime_playback import RealtimePlayback
+from preprocess.body.body_file import write_shaped_body
+from preprocess.capture_session import Capture
+
+CHECKPOINT_INTERVAL_S = 5.0
+LATENESS_WARNING_S = 0.5
+"""A playback that lags more than this is spoken of."""
+
+
+def new_trainer(
+    recording: Capture,
+    *,
+    seconds: float,
+    steps: int | None = None,
+    seed: int,
+    refine_poses: bool,
+    hold_every: int = HELD_OUT_STRIDE,
+    device: torch.device,
+) -> Trainer:
+    """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
+    config = TrainConfig.for_budget(
+        seconds,
+        steps=steps,
+        footprint_m=recording.pixel_footprint_m(),
+        frames=recording.source.frame_count,
+        held_out_stride=hold_every,
+        seed=seed,
+    )
+    config = replace(config, refine_poses=refine_poses)
+    return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
+
+
+@final
+class TrainingSession:
+    """One recording taught to one trainer.
+
+    Attributes:
+        trainer: With the avatar as it is now.
+        held: Held-out frames that have arrived.
+        curve: Scores so far.
+        coverage: What of the person has been seen so far.
+        meter: What it saw of the stream.
+    """
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        recording: Capture,
+        run: RunFolder,
+        console: Console,
+        stop: threading.Event,
+        notes: dict[str, Any],
+        *,
+        observers: Sequence[TrainingObserver] = (),
+    ) -> None:
+        """Nothing happens yet.
+
+        Args:
+            trainer: New, or from a checkpoint.
+            recording: Its frames are read anew.
+            run: Where checkpoints go.
+            console: Where progress is shown.
+            stop: Ends training as soon as it is set.
+            notes: Kept with each checkpoint.
+            watchers: Who looks on.
+        """
+        self.trainer, self._recording, self._run = trainer, recording, run
+        self._console, self._stop, self._notes = console, stop, notes
+        self._observers = observers
+        self.curve: list[CurvePoint] = [
+            CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
+        ]
+        self.held_out: list[HeldOutFrame] = []
+        self._checkpointed_at, self._body_written = time.perf_counter(), False
+        self.meter = StreamMeter(stop, recording.source)
+        self.coverage = Coverage(recording.shaped)
+        if "coverage" in notes:
+            self.coverage.merge_state(notes["coverage"])
+
+    @property
+    def stop_requested(self) -> bool:
+        """Whether somebody wants it to end."""
+        return self._stop.is_set()
+
+    def train(self, *, restore_count: int = 0) -> TrainingResult:
+        """Trains until the time is up or somebody stops it. Scores come later (`scored`).
+
+        What was learnt since the last checkpoint is not written yet (`saving`).
+
+        Args:
+            recall: Frames that the trainer has learnt from before: they are put back into its
+                memory before the clock starts.
+
+        Raises:
+            OSError: If a checkpoint cannot be written; the one before stays.
+        """
+        source = self._recording.source
+        self._set_unpaced(restore_count > 0)
+        self._inbox = inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live)
+        try:
+            added = self._restore_frames(inbox, restore_count) - self.trainer.frames_seen
+            self._set_unpaced(False)
+            self._checkpointed_at, waited = time.perf_counter(), CpuContentionMeter(self.trainer)
+            with self._console.progress("learning", self.trainer.config.seconds) as bar:
+                for event in train(self.trainer, inbox, self.held_out):
+                    self._handle_event(event, bar)
+                    for watcher in self._observers:
+                        watcher.on_event(event)
+                        watcher.between_steps(self)
+                    if self._stop.is_set():
+                        break
+        finally:
+            source.close()
+            inbox.close()
+        self.meter.inbox_dropped, cpu = inbox.dropped, waited.measure()
+        interrupted = self._stop.is_set()
+        late = [*self._lateness_warnings(), *filter(None, [cpu.warning()])]
+        for warning in [*source.warnings, *late, *self._recording.final_notes()]:
+            self._console.warning(warning)
+        self._console.summarize_warnings()
+        if len(self.trainer.replay):
+            seen = format_percent(self.coverage.seen_share)
+            self._console.info(f"{seen} of the person was seen. {coverage_advice(self.coverage)}")
+            self._console.info(f"The package and the scores take {self._remaining_text(cpu)} more.")
+        return TrainingResult(
+            trainer=self.trainer,
+            held_out=self.held_out,
+            curve=tuple(self.curve),
+            meter=self.meter,
+            coverage=self.coverage,
+            frames_added=added + self.trainer.frames_seen,
+            interrupted=interrupted,
+            cpu_time=cpu,
+        )
+
+    @contextmanager
+    def checkpointing(self) -> Iterator[None]:
+        """Writes a checkpoint beside what happens in this block, which changes nothing learnt.
+
+        Raises:
+            OSError: If it cannot be written; the one before stays.
+        """
+        with ThreadPoolExecutor(1) as beside:
+            saved = beside.submit(self._save_checkpoint)
+            yield
+        saved.result()
+
+    def with_scores(self, result: TrainingResult) -> TrainingResult:
+        """The same with every held-out frame scored, in given poses and in fitted ones.
+
+        It takes a while, and the package need not wait for it.
+        """
+        scores = self._score_held_out()
+        self._save_checkpoint()
+        extended = EarlierVideos(self._run, self._notes).measure_forgetting(
+            self.trainer, self.held_out, self._console
+        )
+        return replace(
+            result,
+            scores=scores,
+            fitted_pose_scores=() if result.interrupted else self._score_in_fitted_poses(),
+            curve=tuple(self.curve),
+            earlier_videos=extended,
+        )
+
+    def _set_unpaced(self, unpaced: bool) -> None:
+        """What a run has seen before is not played again at its own speed."""
+        if isinstance(self._recording.source, RealtimePlayback):
+            self._recording.source.rushed = unpaced
+
+    def _frame_stream(self) -> Iterator[StreamItem]:
+        """Frames as they become ready; runs on the inbox's thread."""
+        frames = self.meter.measure_arrival(self._recording.source.frames())
+        found = self.meter.count_observations(map(self._recording.observation_builder(), frames))
+        rig, every = self.trainer.avatar.rig, self.trainer.config.held_out_stride
+        total = self._recording.source.frame_count
+        observations = notify_observers(
+            found, self.coverage, self._observers, hold_every=every, frame_count=total
+        )
+        return self.meter.measure_preparation(
+            prepare_stream(observations, rig, stride=every, total=total)
+        )
+
+    def _restore_frames(self, inbox: Inbox[StreamItem], count: int) -> int:
+        """Puts frames back into the memory of a trainer that has learnt from them before."""
+        seen = 0
+        if not count:
+            return seen
+        with self._console.status(f"reading back {count} frames"):
+            while seen < count and not (inbox.finished or self._stop.is_set()):
+                for item in inbox.take(timeout_s=0.1):
+                    if isinstance(item, HeldOutFrame):
+                        add_held_out(self.held_out, item)
+                        self.meter.mark_arrived(item.observation.frame.index, held_out=True)
+                    elif isinstance(item, TrainingFrame):
+                        self.trainer.add_frame(item, is_restored=True)
+                        seen += 1
+        return seen
+
+    def _handle_event(self, event: TrainEvent, progress: ProgressBar) -> None:
+        match event:
+            case FrameArrived(index=index, held_out=held_out):
+                self.meter.mark_arrived(index, held_out=held_out)
+                progress.update(self.trainer.scheduled_seconds, self._progress_text())
+            case Stepped():
+                self.meter.inbox_depth.add(float(self._inbox.pending))
+                progress.update(self.trainer.scheduled_seconds, self._progress_text())
+                if time.perf_counter() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
+                    self._save_checkpoint()
+            case Evaluated():
+                point = self._add_curve_point(event.scores, event.wall_seconds, event.cpu_seconds)
+                if point.psnr is not None:
+                    so_far = format_psnr(point.psnr, point.verdict, provisional=True)
+                    self._console.info(f"{event.wall_seconds:6.1f} s   {so_far}")
+            case Warned(message=message):
+                self._console.warning(message)
+
+    def _remaining_text(self, cpu: CpuTime) -> str:
+        """How long the run takes from now on, about."""
+        config, size = self.trainer.config, self.meter.size_px or (0, 0)
+        rest = post_training_seconds(
+            len(self.held_out),
+            max(size),
+            fit_poses=config.refine_poses,
+            slowdown=1.0 / max(cpu.granted_share, 0.05),
+        )
+        return f"about {format_duration(rest)}"
+
+    def _position_text(self) -> str:
+        trainer, total = self.trainer, self._recording.source.frame_count
+        return describe_position(
+            elapsed_s=trainer.wall_seconds,
+            budget_s=trainer.config.seconds,
+            step=trainer.steps,
+            steps=trainer.config.steps,
+            frames_read=None if self._inbox.finished else (self.meter.frames_read, total),
+        )
+
+    def _progress_text(self) -> str:
+        trainer, last = self.trainer, self.curve[-1] if self.curve else None
+        rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
+        parts = [self._position_text()]  # what matters most comes first: terminals cut the rest off
+        if last is not None and last.psnr is not None:
+            parts.append(
+                f"held out {format_psnr(last.psnr, last.verdict, digits=1, provisional=True)}"
+            )
+        parts += [
+            f"{format_percent(self.coverage.seen_share)} seen",
+            f"{trainer.frames_seen} frames",
+            f"{rays / 1000.0:.0f}k rays/s",
+            f"{trainer.samples / max(trainer.rays, 1):.1f} samples/ray",
+            f"{self._inbox.pending} waiting",
+        ]
+        if self._recording.source.paced:
+            parts.append(f"{1000.0 * self.meter.current_latency_s:.0f} ms behind")
+        return " · ".join(parts)
+
+    def _lateness_warnings(self) -> Iterator[str]:
+        """What a user should know about a stream that could not be kept up with."""
+        source, late = self._recording.source, self.meter.lateness_s
+        if source.dropped + self._inbox.dropped:
+            yield (
+                f"{source.dropped + self._inbox.dropped} frames gave way to later ones, because "
+                "preparing a frame takes longer than filming it. A smaller --size is faster."
+            )
+        if source.paced and not source.live and late.percentile(95.0) > LATENESS_WARNING_S:
+            yield (
+                f"The playback fell behind by up to {late.largest:.1f} s (half of the frames by "
+                f"{late.percentile(50.0):.1f} s or more): frames are not prepared as fast as they "
+                "come. No frame was lost. A smaller --size, or every other frame (--frames ::2), "
+                "is faster."
+            )
+
+    def _add_curve_point(
+        self, scores: tuple[HeldOutScore, ...], wall_s: float, cpu_s: float
+    ) -> CurvePoint:
+        point = CurvePoint(
+            wall_seconds=wall_s,
+            cpu_seconds=cpu_s,
+            frames_seen=self.trainer.frames_seen,
+            psnr=finite_mean([s.psnr for s in scores]),
+            psnr_mask=finite_mean([s.psnr_mask for s in scores]),
+            verdict=overall_verdict(scores),
+            frames=tuple((s.frame, s.psnr) for s in scores),
+            video=1 + len(earlier_video_names(self._notes)),
+        )
+        self.curve.append(point)
+        return point
+
+    def _score_held_out(self) -> tuple[HeldOutScore, ...]:
+        if not self.held_out:
+            return ()
+        scores = tuple(self._score_with_progress(self.held_out))
+        last = self.curve[-1].wall_seconds if self.curve else -1.0
+        if self.trainer.wall_seconds > last:
+            self._add_curve_point(scores, self.trainer.wall_seconds, self.trainer.cpu_seconds)
+        return scores
+
+    def _score_with_progress(self, held: Sequence[HeldOutFrame]) -> Iterator[HeldOutScore]:
+        with self._console.progress(
+            f"scoring {len(held)} held-out frames", float(len(held))
+        ) as bar:
+            for done, frame in enumerate(held, start=1):
+                yield score_frame(self.trainer.avatar, frame)
+                bar.set_count(done)
+
+    def _score_in_fitted_poses(self) -> tuple[HeldOutScore, ...]:
+        if not (self.held_out and self.trainer.config.refine_poses):
+            return ()
+        with self._console.progress("fitting poses to the held-out frames", 1.0) as bar:
+            return score_with_fitted_poses(self.trainer, self.held_out, progress=bar.set_share)
+
+    def _save_checkpoint(self) -> None:
+        curve = [vars(point) for point in self.curve]
+        notes = {**self._notes, "curve": curve, "coverage": self.coverage.to_state()}
+        checkpoint.save(self.trainer, self._run.checkpoint, notes=notes)
+        if not self._body_written:
+            with atomic_file(self._run.body_file) as path:
+                write_shaped_body(path, self._recording.shaped)
+            self._body_written = True
+        self._checkpointed_at = time.perf_counter()

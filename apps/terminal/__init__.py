@@ -1,1 +1,0 @@
-"""What every command needs: its voice, its exit codes, Ctrl-C, files written whole, threads."""

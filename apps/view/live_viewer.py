@@ -1,0 +1,242 @@
+"""Tends the page between steps: draws the avatar for whoever looks, holds still, saves packages."""
+
+import time
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from apps.cli.console import Console
+from apps.cli.interrupt import interrupt_event
+from apps.report.coverage_map import CoverageMap
+from apps.report.report_schema import format_percent, provisional_verdict
+from apps.run.package_snapshot import validation_views, write_package_snapshot
+from apps.run.run_folder import RunFolder
+from apps.run.training_observer import ObservableSession
+from apps.view.preview_poses import DANCE, FILMED, NEWEST, PreviewPoses
+from apps.view.preview_render import BrowserCamera, render_preview
+from apps.view.viser_page import FRAME_PX, ViserPage
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.evaluation.coverage_advice import coverage_advice
+from avatar.events import Evaluated, Finished, TrainEvent
+from preprocess.body.body_pose import BodyPose
+from preprocess.capture_session import Capture
+from preprocess.observation import Observation
+
+RENDER_TIME_SHARE, IDLE_RENDER_TIME_SHARE = 0.1, 0.9
+"""Of the time, how much the page may take: while the avatar learns, and while it does not."""
+MOVING_HEIGHT_PX, RESTING_HEIGHT_PX, IDLE_HEIGHT_PX = 160, 360, 720
+"""Height of the picture: while something moves, at rest, and at rest while nothing is learnt."""
+REST_DELAY_S = 0.4
+PANEL_INTERVAL_S, MAP_INTERVAL_S = 0.25, 1.0
+
+
+@final
+class LiveViewer:
+    """Looks on for a browser; a `TrainingObserver`.
+
+    Attributes:
+        page: What it looks after.
+    """
+
+    def __init__(self, recording: Capture, run: RunFolder, console: Console, port: int) -> None:
+        """Opens the page and says where.
+
+        Args:
+            recording: What is learnt from.
+            run: Where packages go.
+            console: Where it says what it does.
+            port: Tried first.
+        """
+        self._recording, self._run, self._console = recording, run, console
+        self._poser = PreviewPoses(recording)
+        self.page = ViserPage(recording.paths.video.name, port)
+        self._newest_observation: Observation | None = None
+        self._cells: tuple[BodyPose, CorrespondenceGrid] | None = None
+        self._shown: dict[int, tuple[object, ...]] = {}
+        self._body_map: CoverageMap | None = None
+        self._mapped_coverage = -1.0
+        self._next_picture = self._next_panel = self._next_map = 0.0
+        self._posed_at = 0.0
+        self._shown_observation: Observation | None = None
+        self._finished, self._note = False, ""
+        console.info(f"Watch it learn: {self.page.address}")
+
+    def on_frame(self, observation: Observation, *, held_out: bool) -> None:
+        """Shows it, soon."""
+        self._newest_observation = observation
+
+    def on_event(self, event: TrainEvent) -> None:
+        """Scores are shown at once, and the end; all else can wait for its turn."""
+        if isinstance(event, Evaluated | Finished):
+            self._next_panel = 0.0
+        self._finished = isinstance(event, Finished)
+
+    def between_steps(self, session: ObservableSession) -> None:
+        """Takes a tenth of the time at most, except while somebody has paused or saves."""
+        what = "Writing the package, after" if self._finished else "Learning,"
+        self._update_page(session, f"{what} {self._progress_text(session)}", idle=False)
+        if self.page.save_requested:
+            with session.trainer.paused():
+                self._save_package(session)
+        if self.page.paused:
+            with session.trainer.paused():
+                self._wait_while_paused(session)
+
+    def serve_until_interrupt(self, session: ObservableSession) -> None:
+        """Keeps the page after the end, until Ctrl-C."""
+        self.page.disable_controls()
+        status = f"Done after {session.trainer.wall_seconds:.0f} s"
+        self._note = f"The avatar: {self._run.package}"
+        self._next_panel = 0.0
+        with interrupt_event() as ended:
+            while not ended.wait(0.02):
+                self._update_page(session, status, idle=True)
+
+    def close(self) -> None:
+        """Takes the page down."""
+        self.page.close()
+
+    def _progress_text(self, session: ObservableSession) -> str:
+        trainer = session.trainer
+        return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
+
+    def _wait_while_paused(self, session: ObservableSession) -> None:
+        """Nothing is learnt until somebody resumes, or Ctrl-C ends everything."""
+        self._next_panel = 0.0
+        status = f"Paused after {self._progress_text(session)}"
+        while self.page.paused and not session.stop_requested:
+            self._update_page(session, status, idle=True)
+            if self.page.save_requested:
+                self._save_package(session)
+            time.sleep(0.02)
+        self._next_panel = 0.0
+
+    def _save_package(self, session: ObservableSession) -> None:
+        """Writes the package as the avatar stands."""
+        self.page.save_requested = False
+        trainer, mark = session.trainer, session.curve[-1] if session.curve else None
+        if not trainer.steps:
+            self.page.notify("Not yet", "Nothing has been learnt so far.")
+            return
+        try:
+            views = validation_views(session.held_out, self._recording)
+            taken = write_package_snapshot(
+                trainer, self._run.package, views, curve_point=mark, fine_tune=False
+            )
+        except OSError as error:
+            self.page.notify("The package could not be written", str(error))
+            return
+        if taken.export_report is None:
+            self.page.notify("No package yet", taken.refusal or "")
+            return
+        size = f"{taken.export_report.bytes / 1e6:.1f} MB after {trainer.wall_seconds:.0f} s of training"
+        notes = " ".join([f"{self._run.package}: {size}.", *taken.export_report.warnings])
+        self.page.notify("Package saved", notes)
+        self._console.info(f"Saved from the page: {self._run.package}, {size}.")
+
+    def _update_page(self, session: ObservableSession, status: str, *, idle: bool) -> None:
+        """Brings the page up to date, as far as it is time to."""
+        now = time.perf_counter()
+        if now >= self._next_panel:
+            self._next_panel = now + PANEL_INTERVAL_S
+            self._fill_panel(session, status)
+        if now >= self._next_map:
+            self._next_map = now + MAP_INTERVAL_S
+            self._fill_map(session)
+        if session.trainer.steps and now >= self._next_picture:
+            began = time.perf_counter()
+            if self._render_next_view(session, idle=idle):
+                took = time.perf_counter() - began
+                share = IDLE_RENDER_TIME_SHARE if idle else RENDER_TIME_SHARE
+                self._next_picture = began + took / share
+
+    def _fill_panel(self, session: ObservableSession, status: str) -> None:
+        trainer = session.trainer
+        last = session.curve[-1] if session.curve else None
+        psnr = None if last is None else last.psnr
+        word = provisional_verdict(None if last is None else last.verdict)
+        held_out = f"held out: {word}" if word else "held out"
+        self.page.show_status(
+            status,
+            [
+                (f"{trainer.frames_seen}", "frames"),
+                (f"{trainer.steps:,}", "steps"),
+                (format_percent(session.coverage.seen_share), "seen"),
+                ("none yet" if psnr is None else f"{psnr:.1f} dB", held_out),
+            ],
+            note=self._note,
+        )
+        self.page.show_curve(session.curve)
+        if self.page.pose_choice != NEWEST or not trainer.steps:
+            self._show_frame(self._newest_observation)  # else it comes with its picture
+
+    def _show_frame(self, newest: Observation | None) -> None:
+        if newest is not None and newest is not self._shown_observation:
+            self._shown_observation = newest
+            self.page.show_frame(_letterbox(newest.frame.rgb))
+
+    def _fill_map(self, session: ObservableSession) -> None:
+        coverage = session.coverage
+        if coverage.seen_share == self._mapped_coverage:
+            return
+        if self._body_map is None:
+            self._body_map = CoverageMap(self._recording.shaped, coverage)
+        self._mapped_coverage = coverage.seen_share
+        self.page.show_coverage(coverage_advice(coverage), self._body_map.svg())
+
+    def _render_next_view(self, session: ObservableSession, *, idle: bool) -> bool:
+        """Draws for the browser that has waited longest; whether any needed it."""
+        now = time.perf_counter()
+        looks = self.page.browser_cameras()
+        for gone in self._shown.keys() - looks.keys():
+            del self._shown[gone]
+        newest = self._newest_observation
+        pose = self._poser.pose_at(self.page.pose_choice, now - self.page.chosen_at, newest)
+        cells = self._correspondence_grid(session, pose, now)
+        plays = self.page.pose_choice in (FILMED, DANCE) or now - self._posed_at < REST_DELAY_S
+        waiting = [browser for browser in looks if browser not in self._shown]
+        for browser in [*waiting, *self._shown]:
+            look = looks[browser]
+            height = self._render_height_px(look, now, plays=plays, idle=idle)
+            wanted = (look.moved_at, id(cells), session.trainer.steps, height)
+            if self._shown.get(browser) == wanted:
+                continue
+            self._shown.pop(browser, None)  # to the end of the queue
+            self._shown[browser] = wanted
+            picture = render_preview(
+                session.trainer.avatar, pose, look.to_camera(height), cells=cells
+            )
+            self.page.show_render(browser, picture)
+            self._show_frame(newest)
+            return True
+        return False
+
+    def _render_height_px(self, look: BrowserCamera, now: float, *, plays: bool, idle: bool) -> int:
+        if plays or now - look.moved_at < REST_DELAY_S:
+            return MOVING_HEIGHT_PX
+        return IDLE_HEIGHT_PX if idle else RESTING_HEIGHT_PX
+
+    def _correspondence_grid(
+        self, session: ObservableSession, pose: BodyPose, now: float
+    ) -> CorrespondenceGrid:
+        """The pose's warp; solved anew only if the pose has changed."""
+        if self._cells is None or not np.array_equal(
+            self._cells[0].joint_rotations, pose.joint_rotations
+        ):
+            cells = CorrespondenceGrid.solve(session.trainer.avatar.rig, pose.joint_rotations)
+            self._cells, self._posed_at = (pose, cells), now
+        return self._cells[1]
+
+
+def _letterbox(rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+    """A frame in the middle of a strip that is as wide as the panel."""
+    width, height = FRAME_PX
+    scale = min(height / rgb.shape[0], width / rgb.shape[1])
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    small = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=how))
+    strip = np.full((small.shape[0], width, 3), 255, dtype=np.uint8)
+    left = (width - small.shape[1]) // 2
+    strip[:, left : left + small.shape[1]] = small
+    return strip

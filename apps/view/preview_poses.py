@@ -1,0 +1,97 @@
+"""Which pose the page shows: the newest frame's, standing still, the filmed motion, or a dance.
+
+All poses are brought to the page's world: the pelvis at its origin, y up, and the camera that
+filmed looks along -z. So the browser's first look shows the person as the video does.
+"""
+
+from typing import final
+
+import numpy as np
+
+from apps.animation.driving_motion import demo_motion
+from avatar.deformation.rig import canonical_rotations
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.capture_session import Capture
+from preprocess.observation import Observation
+
+NEWEST, STANDING, FILMED, DANCE = "Newest", "PersonInCameras", "Filmed", "Dance"
+POSE_CHOICES = (NEWEST, STANDING, FILMED, DANCE)
+DEFAULT_FPS = 30.0
+"""Of a motion that does not say how fast it is."""
+
+
+@final
+class PreviewPoses:
+    """Poses for the page, by choice and time."""
+
+    def __init__(self, recording: Capture) -> None:
+        """For one person and the motion that was filmed."""
+        self._pelvis = recording.shaped.joints[0]
+        self._cameras = recording.cameras
+        self._filmed, self._dance = recording.motion, demo_motion()
+        self._valid = np.flatnonzero(recording.motion.valid)
+
+    def pose_at(self, choice: str, seconds: float, newest: Observation | None) -> BodyPose:
+        """The pose to show.
+
+        Args:
+            choice: One of `POSE_CHOICES`.
+            seconds: Since the motion began; motions start again at their end.
+            newest: The frame that came last.
+        """
+        if choice == FILMED:
+            place = np.searchsorted(self._valid, _row_at(self._filmed, seconds))
+            row = int(self._valid[min(place, len(self._valid) - 1)])
+            return self._align_to_camera(self._filmed[row], self._camera_of_row(row))
+        if choice == DANCE:
+            pose = self._dance[_row_at(self._dance, seconds)]
+            return self._center_on_pelvis(pose.root_rotation, pose)
+        if choice == NEWEST and newest is not None:
+            return self._align_to_camera(newest.pose, newest.camera)
+        standing = BodyPose(
+            root_rotation=np.zeros(3),
+            root_translation=np.zeros(3),
+            joint_rotations=canonical_rotations(),
+        )
+        return self._center_on_pelvis(standing.root_rotation, standing)
+
+    def _camera_of_row(self, row: int) -> Camera:
+        """The camera that filmed a row of the motion."""
+        frames, track = self._filmed.frames, self._cameras
+        frame = row if frames is None else int(frames[row])
+        return track[min(frame, len(track.cameras) - 1)]
+
+    def _align_to_camera(self, pose: BodyPose, camera: Camera) -> BodyPose:
+        """Turned so that the page's camera sees what this camera saw."""
+        page_from_camera = np.diag([1.0, -1.0, -1.0])
+        turned = page_from_camera @ camera.camera_from_world[:3, :3]
+        return self._center_on_pelvis(
+            _axis_angle(turned @ rotation_matrices(pose.root_rotation)), pose
+        )
+
+    def _center_on_pelvis(self, root_rotation: np.ndarray, pose: BodyPose) -> BodyPose:
+        """The pelvis at the origin: the root turns about its rest place J0."""
+        return BodyPose(
+            root_rotation=root_rotation,
+            root_translation=-self._pelvis,
+            joint_rotations=pose.joint_rotations,
+        )
+
+
+def _row_at(motion: Motion, seconds: float) -> int:
+    """The row of a motion that is shown after so many seconds."""
+    times = motion.times_s
+    if times is None or len(times) < 2 or not np.isfinite(times).all() or times[-1] <= times[0]:
+        return int(seconds * DEFAULT_FPS) % len(motion)
+    length = (times[-1] - times[0]) * len(times) / (len(times) - 1)
+    return int(np.searchsorted(times - times[0], seconds % length, side="right")) - 1
+
+
+def _axis_angle(rotation: np.ndarray) -> np.ndarray:
+    """The axis-angle of a rotation matrix."""
+    import cv2
+
+    vector, _ = cv2.Rodrigues(rotation)
+    return np.asarray(vector, dtype=np.float64).reshape(3)

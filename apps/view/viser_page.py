@@ -1,0 +1,226 @@
+"""The page itself: a picture that a browser's camera looks at, and a panel beside it (viser)."""
+
+import io
+import logging
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from html import escape
+from importlib.resources import files
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from apps.report.learning_curve import CurvePoint
+from apps.view.preview_poses import NEWEST, POSE_CHOICES
+from apps.view.preview_render import BACKGROUND_RGB, BrowserCamera
+
+if TYPE_CHECKING:  # an optional extra, loaded when the page is opened
+    import viser  # pyright: ignore[reportMissingImports]
+
+HOST = "127.0.0.1"
+PANEL_PX = 380
+FRAME_PX = (720, 440)
+"""Width and height that a frame in the panel must fit into; it is shown at half of that."""
+TEAL, ORANGE = "#1f6f8b", "#c8742b"
+CURVE_TITLE = (
+    "<h2>Frames it never trains on: mean of those so far, dB over seconds</h2>"
+    f'<p class="legend"><i style="background:{TEAL}"></i>whole picture'
+    f'<i style="background:{ORANGE}"></i>inside the mask</p>'
+)
+INITIAL_FOV_RAD, INITIAL_DISTANCE_M = 0.6, 3.7
+"""Of the first look: a standing person fills four fifths of the picture's height."""
+CENTER_ABOVE_PELVIS_M = -0.08
+"""How far a person's middle is above the pelvis."""
+
+
+@final
+class ViserPage:
+    """What is on the page, and what those who look at it have asked for.
+
+    Buttons are pressed on viser's own threads; here that only sets a field, which whoever tends
+    the page reads when it suits.
+
+    Attributes:
+        paused: Whether training should hold still.
+        saving: Whether somebody has asked for the package.
+        choice: Which poses are to be shown (`POSE_CHOICES`).
+        chosen_at: When that was chosen, on `time.perf_counter`'s clock.
+    """
+
+    def __init__(self, name: str, port: int) -> None:
+        """Opens the page, on this machine alone.
+
+        Args:
+            name: Of what is learnt.
+            port: Tried first; the next free one is taken. 0 for any.
+        """
+        from viser import ViserServer  # pyright: ignore[reportMissingImports]
+
+        self.paused = self.save_requested = False
+        self.pose_choice, self.chosen_at = NEWEST, time.perf_counter()
+        self._browser_cameras: dict[int, BrowserCamera] = {}
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # who hangs up is no error
+        with redirect_stdout(io.StringIO()):  # viser greets there
+            self._server = ViserServer(host=HOST, port=port, label=name, verbose=False)
+        # no button asks for a public tunnel, and nobody else may: any page that a browser has
+        # open can talk to this machine
+        self._server.request_share_url = lambda verbose=True: None
+        self._configure_theme()
+        self._build_panel(name)
+        self._server.on_client_connect(self._on_connect)
+        self._server.on_client_disconnect(self._on_disconnect)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        return f"http://{HOST}:{self._server.get_port()}"
+
+    def browser_cameras(self) -> dict[int, BrowserCamera]:
+        """Where the camera of each browser is, by the browser's number."""
+        return dict(self._browser_cameras)
+
+    def show_render(self, browser: int, image: UInt8[np.ndarray, "height width 3"]) -> None:
+        """What one browser's camera sees."""
+        client = self._server.get_clients().get(browser)
+        if client is not None:
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=88)
+
+    def show_status(
+        self, status: str, figures: Sequence[tuple[str, str]], *, note: str = ""
+    ) -> None:
+        """What is going on, in a few words, a few figures with their names, and a line besides."""
+        cells = "".join(
+            f"<div><b>{escape(v)}</b><span>{escape(n)}</span></div>" for v, n in figures
+        )
+        self._status.content = _html(
+            f'<p class="status">{escape(status)}</p><div class="figures">{cells}</div>'
+            + (f'<p class="note">{escape(note)}</p>' if note else "")
+        )
+
+    def show_frame(self, picture: UInt8[np.ndarray, "height width 3"]) -> None:
+        """The newest frame."""
+        self._frame.image = picture
+        self._frame.visible = True
+
+    def show_curve(self, curve: Sequence[CurvePoint]) -> None:
+        """Scores of held-out frames so far."""
+        points = [(p.wall_seconds, p.psnr, p.psnr_mask) for p in curve if p.psnr is not None]
+        if points:
+            table = np.array([[np.nan if v is None else v for v in row] for row in points])
+            self._curve.data = tuple(table.T)
+            self._curve.visible = self._curve_title.visible = True
+
+    def show_coverage(self, sentence: str, body_map: str) -> None:
+        """What has been seen, and what to do about it."""
+        self._coverage.content = _html(f'<p class="advice">{escape(sentence)}</p>{body_map}')
+
+    def notify(self, title: str, message: str) -> None:
+        """A note that goes away by itself."""
+        for client in self._server.get_clients().values():
+            client.add_notification(title, message, auto_close_seconds=6.0)
+
+    def disable_controls(self) -> None:
+        """Nothing is learnt any more: what no longer does anything is taken away."""
+        self.paused = self.save_requested = False
+        self._pause.visible = self._save.visible = False
+
+    def close(self) -> None:
+        """Takes the page down."""
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def _configure_theme(self) -> None:
+        gui, scene = self._server.gui, self._server.scene
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(31, 111, 139))
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_PX)
+        scene.set_up_direction("+y")
+        scene.set_background_image(np.full((4, 4, 3), BACKGROUND_RGB, dtype=np.uint8), format="png")
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = (
+            (0.0, CENTER_ABOVE_PELVIS_M, INITIAL_DISTANCE_M),
+            (0.0, CENTER_ABOVE_PELVIS_M, 0.0),
+        )
+        camera.up, camera.fov = (0.0, 1.0, 0.0), INITIAL_FOV_RAD
+
+    def _build_panel(self, name: str) -> None:
+        gui = self._server.gui
+        gui.set_panel_label(name)
+        self._status = gui.add_html(_html('<p class="status">Starting</p>'))
+        self._pause = gui.add_button("Pause")
+        self._pause.on_click(lambda event: self._toggle_pause())
+        self._save = gui.add_button("Save package now", color="gray")
+        self._save.on_click(lambda event: self._request_save(saving=True))
+        poses = gui.add_button_group("Pose", POSE_CHOICES)
+        poses.on_click(lambda event: self._choose_pose(event.target.value))
+        blank = np.full((4, 4, 3), 255, dtype=np.uint8)
+        self._frame = gui.add_image(blank, format="jpeg", visible=False)
+        self._coverage = gui.add_html(_html(""))
+        self._curve_title = gui.add_html(_html(CURVE_TITLE), visible=False)
+        self._curve = self._add_curve()
+
+    def _add_curve(self) -> "viser.GuiUplotHandle":
+        from viser import uplot  # pyright: ignore[reportMissingImports]
+
+        grid = uplot.Axis_Grid(stroke="#e4dfd4", width=1)
+        return self._server.gui.add_uplot(
+            data=(np.zeros(1), np.zeros(1), np.zeros(1)),
+            series=(
+                {"label": "s"},
+                {"label": "whole picture", "stroke": TEAL, "width": 2},
+                {"label": "inside the mask", "stroke": ORANGE, "width": 2},
+            ),
+            scales={"x": {"time": False}},
+            axes=tuple(uplot.Axis(stroke="#6d675d", grid=grid, size=size) for size in (30, 44)),
+            legend={"show": False},
+            height=190,
+            visible=False,
+        )
+
+    def _on_connect(self, client: "viser.ClientHandle") -> None:
+        begins_at = np.array(client.camera.position)
+        goes_to = np.array(self._server.initial_camera.position)
+        if np.allclose(begins_at, goes_to):
+            self._update_browser_camera(client)
+
+        def moved(event: object) -> None:
+            """The first looks are from where viser puts a camera that knows no better."""
+            if client.client_id in self._browser_cameras or not np.allclose(
+                client.camera.position, begins_at
+            ):
+                self._update_browser_camera(client)
+
+        client.camera.on_update(moved)
+
+    def _on_disconnect(self, client: "viser.ClientHandle") -> None:
+        self._browser_cameras.pop(client.client_id, None)
+
+    def _update_browser_camera(self, client: "viser.ClientHandle") -> None:
+        from viser import transforms  # pyright: ignore[reportMissingImports]
+
+        camera = client.camera
+        self._browser_cameras[client.client_id] = BrowserCamera(
+            world_from_camera=transforms.SO3(camera.wxyz).as_matrix(),
+            position=np.array(camera.position),
+            fov=float(camera.fov),
+            aspect=float(camera.aspect),
+            moved_at=time.perf_counter(),
+        )
+
+    def _toggle_pause(self) -> None:
+        self.paused = not self.paused
+        self._pause.label = "Resume" if self.paused else "Pause"
+
+    def _request_save(self, *, saving: bool) -> None:
+        self.save_requested = saving
+
+    def _choose_pose(self, choice: str) -> None:
+        self.pose_choice, self.chosen_at = choice, time.perf_counter()
+
+
+def _html(content: str) -> str:
+    """Content in the page's own style."""
+    style = (files("apps") / "view" / "page.css").read_text(encoding="utf-8")
+    return f'<style>{style}</style><div class="ia">{content}</div>'

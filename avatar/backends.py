@@ -1,0 +1,204 @@
+"""Which backend a device gets: the fastest that it has and that is right on this machine.
+
+The CPU has compiled twins of every operation (`avatar.numba_kernels.numba_backend`). A GPU has none yet: the
+reference runs there, in plain torch. Kernels of our own for it would be a class beside
+`NumbaBackend` that keeps to the same protocol; `backend_for` is where it would be chosen, after
+the same self-test.
+
+Does a fast backend mean what the reference means, on this very machine?
+"""
+
+import functools
+import math
+import os
+import threading
+import warnings
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import (
+    Backend,
+    CorrespondenceTables,
+    DensityGrid,
+    MarchSettings,
+    RayBatch,
+    RaySamples,
+    SolvedCorrespondences,
+)
+from avatar.kernels.hash_levels import FEATURES_PER_LEVEL, HashLevels
+from avatar.kernels.torch_backend import TorchBackend
+from avatar.kernels.torch_skinning import skin_points
+from capture.input_error import InputError
+
+_SELF_TEST_LOCK = threading.Lock()
+
+
+def backend_for(device: torch.device) -> Backend:
+    """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
+
+    Raises:
+        InputError: If the forced backend is unknown or cannot run on the device.
+    """
+    forced = os.environ.get("IA_BACKEND", "")
+    if forced not in ("", "torch", "numba"):
+        raise InputError(
+            f"The variable IA_BACKEND is {forced!r}; expected 'torch' or 'numba', or leave it out."
+        )
+    if forced == "numba" and device.type != "cpu":
+        raise InputError(
+            f"IA_BACKEND=numba was asked for, but it runs on the CPU only, not on {device}. "
+            "Leave it out, or give --device cpu."
+        )
+    if device.type == "cpu" and forced != "torch":
+        with _SELF_TEST_LOCK:  # kernels must not run in two threads at once: who comes second waits
+            if _numba_passes_self_test():
+                return _numba_backend()
+    # a CudaBackend's seat: device.type == "cuda", and `strays` finds nothing on it
+    return TorchBackend()
+
+
+def _numba_backend() -> Backend:
+    from avatar.numba_kernels.numba_backend import (
+        NumbaBackend,  # it compiles: only where it is used
+    )
+
+    return NumbaBackend()
+
+
+@functools.cache
+def _numba_passes_self_test() -> bool:
+    """Whether the compiled kernels do here what they should; asked once, answered aloud if not."""
+    operation = failing_operation(_numba_backend())
+    if operation is not None:
+        warnings.warn(
+            f"The compiled kernel '{operation}' differs from its meaning on this machine; plain "
+            "torch is used instead, many times slower. Please report it with your processor and "
+            "the version of numba; IA_BACKEND=torch keeps it quiet.",
+            stacklevel=3,
+        )
+    return operation is None
+
+
+TEST_POINTS = 256
+TEST_CELL_M = 0.05
+RELATIVE_TOLERANCE = 1e-3
+"""Largest difference allowed, as a share of the largest value."""
+
+
+def failing_operation(backend: Backend) -> str | None:
+    """The operation in which a backend differs from the reference on 256 points, or None.
+
+    Args:
+        backend: Any but the reference itself.
+    """
+    generator = torch.Generator().manual_seed(0)
+    levels = HashLevels.spanning(
+        np.zeros(3, dtype=np.float32), np.array([1.0, 0.6, 0.4], dtype=np.float32),
+        coarsest_m=0.2, finest_m=0.02, levels=4, table_size=1024,
+    )  # fmt: skip
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
+    points = torch.rand(TEST_POINTS, 3, generator=generator) * torch.tensor([1.0, 0.6, 0.4])
+    slope = torch.randn(TEST_POINTS, levels.feature_width, generator=generator)
+    raw = torch.randn(TEST_POINTS, 4, generator=generator) + torch.tensor([0.0, 0.0, 0.0, 3.0])
+    count = torch.full((16,), TEST_POINTS // 16, dtype=torch.int32)
+    rows = torch.zeros(TEST_POINTS, dtype=torch.int32)
+    samples = RaySamples(points, torch.cumsum(count, 0) - count, count, rows)
+    target = torch.rand(16, 4, generator=generator)
+    background = torch.rand(16, 3, generator=generator)
+
+    rig, bones = _bent_tube()
+    canonical = torch.from_numpy(rig.seeds) * torch.tensor([1.0, 1.2, 1.2])
+    cells = _solve_tables(TorchBackend(), rig, bones)
+
+    def results(of: Backend) -> dict[str, torch.Tensor]:
+        grad_table = torch.zeros_like(table)
+        of.encode_backward(points, slope, levels, grad_table)
+        rendered, loss, grad = of.composite_loss(raw, samples, 0.01, target, background, 0.1, 0.1)
+        return {
+            "encode": of.encode(points, table, levels),
+            "encode_backward": grad_table,
+            "encode_points_backward": of.encode_points_backward(points, slope, table, levels),
+            "build_cells": _march_to_seeds(
+                TorchBackend(), _solve_tables(of, rig, bones), rig, bones, canonical
+            ),
+            "march": _march_to_seeds(of, cells, rig, bones, canonical),
+            "composite": of.composite(raw, samples, 0.01),
+            "composite_loss": torch.cat([rendered.flatten(), loss, grad.flatten() * len(loss)]),
+        }
+
+    expected = results(TorchBackend())
+    for name, values in results(backend).items():
+        off = float((values - expected[name]).abs().max() / expected[name].abs().max())
+        if not off <= RELATIVE_TOLERANCE or math.isnan(off):
+            return name
+    return None
+
+
+def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
+    """A tube of 256 seeds along x, and bones that bend it by half a radian in its middle."""
+    low, high = np.array([-0.3, -0.2, -0.2]), np.array([0.3, 0.2, 0.2])
+    x = np.linspace(low[0], high[0], 25)[:, None, None]
+    weights = np.zeros((25, 17, 17, 24), dtype=np.float32)
+    weights[..., 1] = 1.0 / (1.0 + np.exp(-30.0 * x))
+    weights[..., 0] = 1.0 - weights[..., 1]
+    centers = np.stack(
+        np.meshgrid(*(np.linspace(-0.95, 0.95, 20) * side for side in high), indexing="ij"), axis=-1
+    )
+    off_axis = np.linalg.norm(centers[..., 1:], axis=-1)
+    turn, along = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 16, False), np.linspace(-0.2, 0.2, 16))
+    seeds = np.stack([along, 0.05 * np.cos(turn), 0.05 * np.sin(turn)], axis=-1).reshape(-1, 3)
+    rig = Rig(
+        rest_joints=np.zeros((24, 3)), parents=np.full(24, -1),
+        canonical_rotations=np.zeros((23, 3)),
+        box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
+        skin_distance=np.abs(off_axis - 0.05).astype(np.float32), inside_skin=off_axis < 0.05,
+        seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * TEST_POINTS],
+        seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
+    )  # fmt: skip
+    bones = np.tile(np.eye(4)[:3], (24, 1, 1))
+    bones[1, :2, :2] = [[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]]
+    return rig, bones.reshape(24, 12).astype(np.float32)
+
+
+def _solve_tables(
+    of: Backend, rig: Rig, bones: Float32[np.ndarray, "24 12"]
+) -> CorrespondenceTables:
+    built: SolvedCorrespondences = of.solve_correspondences(
+        rig, bones, 0.05, TEST_CELL_M, torch.device("cpu")
+    )
+    return CorrespondenceTables(
+        torch.from_numpy(built.packed_cells.reshape(1, -1)), torch.from_numpy(built.roots[None]),
+        torch.from_numpy(built.low[None]),
+        torch.tensor([built.packed_cells.shape], dtype=torch.int32), TEST_CELL_M,
+    )  # fmt: skip
+
+
+def _march_to_seeds(
+    of: Backend,
+    cells: CorrespondenceTables,
+    rig: Rig,
+    bones: Float32[np.ndarray, "24 12"],
+    canonical: Float32[torch.Tensor, "points 3"],
+) -> Float32[torch.Tensor, "points 3"]:
+    """Where marching finds what skinning has carried off; 0 where it finds nothing."""
+    extent = rig.box_high - rig.box_low
+    low, shape = torch.from_numpy(rig.box_low), np.array(rig.skin_distance.shape, dtype=np.float32)
+    nodes_per_m = torch.from_numpy((np.array(rig.weights.shape[:3], np.float32) - 1) / extent)
+    posed = skin_points(
+        canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
+    )
+    grid = DensityGrid(
+        torch.ones(rig.skin_distance.shape, dtype=torch.uint8), torch.ones(rig.skin_distance.shape), low,
+        torch.from_numpy(shape / extent),
+    )  # fmt: skip
+    rays = RayBatch(
+        posed, torch.tensor([[0.6, 0.64, 0.48]]).repeat(len(posed), 1),
+        torch.zeros(len(posed), dtype=torch.int32), torch.zeros(len(posed)),
+    )  # fmt: skip
+    samples = of.march(rays, cells, grid, MarchSettings(9.0, math.inf, 1))
+    found = torch.zeros_like(posed)
+    found[samples.counts > 0] = samples.points
+    return found

@@ -1,0 +1,1 @@
+"""Deformation: the rig, skinning and its inverse."""

@@ -1,0 +1,192 @@
+"""What moves the avatar: one person's joints, canonical pose, box and skinning volume.
+
+Which way the skin looks: unit outward normals at its vertices, and each one's share of it.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
+from scipy.ndimage import maximum_filter
+
+from avatar.deformation.skinning_volume import skin_distance_volume, skinning_weight_volume
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import body_from_rest, world_from_body
+from preprocess.body.parametric_body import ShapedBody
+
+PART_OF_JOINT = np.array(
+    [0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13]
+)
+"""Which of 14 body parts each joint moves: root finding starts once in every near part."""
+SEED_SPACING_M = 0.02
+SKINNING_CELL_M = 0.023
+DISTANCE_CELL_M = 0.015
+
+
+def canonical_rotations() -> Float[np.ndarray, "23 3"]:
+    """The canonical A-pose: legs apart by 0.2 rad each, arms lowered by 0.8 rad.
+
+    The paper's released configuration; the root stays at rest.
+    """
+    body_pose = np.zeros(69)
+    body_pose[[2, 5, 47, 50]] = 0.2, -0.2, -0.8, 0.8
+    return body_pose.reshape(23, 3)
+
+
+class SparseSkinningNodes(NamedTuple):
+    """Nodes of the weight volume, and the joints that move them.
+
+    Attributes:
+        nodes: Their flat numbers.
+        first: Where each node's joints begin, and the end.
+        joints: Node after node.
+        shares: Weights of these joints, in (0, 1].
+    """
+
+    node_indices: Int64[np.ndarray, "node_indices"]
+    offsets: Int64[np.ndarray, "node_indices+1"]
+    joints: Int32[np.ndarray, "moving"]
+    weights: Float32[np.ndarray, "moving"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rig:
+    """One person's articulation between the canonical and the body frame. It never changes.
+
+    Attributes:
+        rest_joints: Rest joints, metres.
+        parents: Parent of each joint, -1 for the root.
+        canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
+        box_low, box_high: Corners of the canonical box, metres.
+        weights: Skinning weights on nodes `low + (i, j, k) / (count - 1) * (high - low)`.
+        distance: Distance from each occupancy cell's centre to the body's skin, metres.
+        inside: Whether that centre lies under the skin.
+        seeds: Canonical points of the skin, one per 2-cm voxel and body part: where root finding
+            starts.
+        seed_weights: Their skinning weights.
+        seed_parts: The body part of each seed.
+    """
+
+    rest_joints: Float[np.ndarray, "24 3"]
+    parents: Int[np.ndarray, "24"]
+    canonical_rotations: Float[np.ndarray, "23 3"]
+    box_low: Float32[np.ndarray, "3"]
+    box_high: Float32[np.ndarray, "3"]
+    weights: Float32[np.ndarray, "x y z 24"]
+    skin_distance: Float32[np.ndarray, "cx cy cz"]
+    inside_skin: Bool[np.ndarray, "cx cy cz"]
+    seeds: Float32[np.ndarray, "seeds 3"]
+    seed_weights: Float32[np.ndarray, "seeds 24"]
+    seed_parts: Int32[np.ndarray, "seeds"]
+
+    @classmethod
+    def from_shaped_body(cls, shaped: ShapedBody, *, margin_m: float = 0.17) -> "Rig":
+        """The rig of a shaped body.
+
+        Args:
+            shaped: The body; its pose blend shapes play no part (as in the paper's code).
+            margin_m: How far the box reaches beyond the canonical skin. Clothes must fit into it.
+        """
+        rotations, body = canonical_rotations(), shaped.body
+        transforms = body_from_rest(shaped.joints, body.parents, rotations)
+        blended = np.einsum("vj,jab->vab", body.weights, transforms)
+        vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
+        low = (vertices.min(axis=0) - margin_m).astype(np.float32)
+        high = (vertices.max(axis=0) + margin_m).astype(np.float32)
+        seeds = _seed_vertices(vertices, body.weights)
+        normals, _ = vertex_normals(vertices, body.faces)
+        distance, inside = skin_distance_volume(
+            vertices, normals, low, high, DISTANCE_CELL_M, margin_m + 0.02
+        )
+        return cls(
+            rest_joints=shaped.joints,
+            parents=body.parents,
+            canonical_rotations=rotations,
+            box_low=low,
+            box_high=high,
+            weights=skinning_weight_volume(
+                vertices, body.weights, low, high, SKINNING_CELL_M, margin_m + 0.05
+            ),
+            skin_distance=distance,
+            inside_skin=inside,
+            seeds=vertices[seeds].astype(np.float32),
+            seed_weights=body.weights[seeds].astype(np.float32),
+            seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
+        )
+
+    def skinning_nodes_within(self, reach_m: float) -> SparseSkinningNodes:
+        """What moves the weight volume's nodes about all that is nearer to the skin than this."""
+        if reach_m not in self._nodes_by_reach:
+            shape, cells = np.array(self.weights.shape[:3]), np.array(self.skin_distance.shape)
+            nearest = [
+                np.minimum(np.linspace(0, cells[k], shape[k]).astype(int), cells[k] - 1)
+                for k in range(3)
+            ]
+            near = maximum_filter(self.skin_distance[np.ix_(*nearest)] < reach_m, 3)
+            nodes = np.flatnonzero(near)
+            weights = self.weights.reshape(-1, 24)[nodes]
+            moving = weights > 0.0
+            first = np.concatenate([[0], moving.sum(axis=1).cumsum()])
+            joints = moving.nonzero()[1].astype(np.int32)
+            self._nodes_by_reach[reach_m] = SparseSkinningNodes(
+                nodes, first, joints, weights[moving]
+            )
+        return self._nodes_by_reach[reach_m]
+
+    @cached_property
+    def _nodes_by_reach(self) -> dict[float, SparseSkinningNodes]:
+        return {}
+
+    def body_from_canonical(
+        self, joint_rotations: Float[np.ndarray, "23 3"]
+    ) -> Float[np.ndarray, "24 4 4"]:
+        """The matrices that linear blend skinning blends, from canonical to body frame."""
+        posed = body_from_rest(self.rest_joints, self.parents, joint_rotations)
+        return posed @ self._rest_from_canonical
+
+    @cached_property
+    def _rest_from_canonical(self) -> Float[np.ndarray, "24 4 4"]:
+        canonical = body_from_rest(self.rest_joints, self.parents, self.canonical_rotations)
+        return np.linalg.inv(canonical)
+
+    def world_from_body(self, pose: BodyPose) -> Float[np.ndarray, "4 4"]:
+        """The root's rigid motion."""
+        return world_from_body(self.rest_joints[0], pose.root_rotation, pose.root_translation)
+
+    def weights_at(self, points: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 24"]:
+        """Trilinear skinning weights at canonical points; the border's value outside the box."""
+        last = np.array(self.weights.shape[:3]) - 1
+        place = (points - self.box_low) / (self.box_high - self.box_low) * last
+        place = np.clip(place, 0.0, last)
+        base = np.minimum(place.astype(np.int64), last - 1)
+        part = (place - base).astype(np.float32)
+        weights = np.zeros((len(points), 24), dtype=np.float32)
+        for corner in np.ndindex(2, 2, 2):  # all 24 weights of a node lie side by side
+            share = np.where(corner, part, 1.0 - part).prod(axis=1, keepdims=True)
+            weights += self.weights[tuple((base + corner).T)] * share
+        return weights
+
+
+def _seed_vertices(
+    vertices: Float[np.ndarray, "vertices 3"], weights: Float[np.ndarray, "vertices 24"]
+) -> Int[np.ndarray, "seeds"]:
+    """Vertices to start from: the first of each 2-cm voxel and body part."""
+    voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
+    keys = np.column_stack([voxels, PART_OF_JOINT[weights.argmax(axis=1)]])
+    return np.unique(keys, axis=0, return_index=True)[1]
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices"]]:
+    """Outward unit normals, and each vertex's share of the surface in square metres."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    doubled = np.cross(b - a, c - a)
+    normals, areas = np.zeros_like(vertices), np.zeros(len(vertices))
+    for k in range(3):
+        np.add.at(normals, faces[:, k], doubled)
+        np.add.at(areas, faces[:, k], np.linalg.norm(doubled, axis=1) / 6.0)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals, areas

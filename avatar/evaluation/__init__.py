@@ -1,0 +1,1 @@
+"""Evaluation: held-out scores, sharpness, body coverage."""

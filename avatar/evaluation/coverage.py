@@ -1,0 +1,166 @@
+"""Which of the skin the camera has seen, and how squarely: kept up to date frame by frame."""
+
+import base64
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, visible_points
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.observation import Observation
+
+MIN_SEEN_COSINE = 0.3
+"""A patch that is turned further from the camera than this (72°) shows nothing of itself."""
+MIN_WELL_SEEN_COSINE = 0.6
+"""From this cosine on (53°) it was seen well."""
+DEPTH_CELL_M, DEPTH_TOLERANCE_M = 0.03, 0.03
+"""Of the depth buffer in which the body hides itself."""
+MIN_PERSON_ALPHA = 0.5
+"""Alpha above which a pixel shows the person."""
+
+
+class VisibilityStage(IntEnum):
+    """How far towards being seen a patch has ever come."""
+
+    FACING_AWAY = 0
+    """It never faced the camera."""
+    OUTSIDE_IMAGE = 1
+    """It did, outside the picture."""
+    SELF_OCCLUDED = 2
+    """It did, inside the picture, behind another part of the body."""
+    OUTSIDE_MASK = 3
+    """Nothing of the body was before it, but the mask says that no person is there."""
+    SEEN = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PartCoverage:
+    """How much of a body part's surface was seen, all around and side by side.
+
+    Attributes:
+        seen: Share of its surface, in [0, 1].
+        sides: The same by side, in the order of `SIDE_NAMES`; only sides that the part has.
+    """
+
+    seen_share: float
+    sides: dict[str, float]
+
+
+@final
+class Coverage:
+    """What has been seen of one person. Costs about a millisecond a frame.
+
+    Frames may be added on one thread while others read: nothing that was seen is ever unseen.
+
+    Attributes:
+        patches: The person's skin.
+        cosines: How squarely each patch was seen at best, in [0, 1]; 0 if it never was.
+        stages: How far each has come (`Stage`).
+    """
+
+    cosines: Float32[np.ndarray, "patches"]
+    stages: UInt8[np.ndarray, "patches"]
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Nothing of this person has been seen yet."""
+        self._shaped = shaped
+        self.patches = SkinPatches.from_shaped_body(shaped)
+        self.cosines = np.zeros(len(self.patches.points), dtype=np.float32)
+        self.stages = np.zeros(len(self.patches.points), dtype=np.uint8)
+
+    def add(self, observation: Observation) -> None:
+        """Takes in what one frame shows.
+
+        A patch is seen if it faces the camera (cosine above 0.3), lands inside the picture, has
+        no other patch before it, and the mask says that a person is there.
+        """
+        camera, body = observation.camera, self._shaped.with_pose(observation.pose)
+        points, normals = pose_patches(self.patches, body.world_from_rest())
+        to_camera = camera.center_world - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        cosines = np.einsum("pa,pa->p", to_camera, normals)
+        in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        depths = in_camera[:, 2]
+        if depths.min() <= 0.0:  # somebody behind the camera is not in the picture either
+            return
+        plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+        free = visible_points(
+            plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
+        )
+        column, row = np.floor(camera.project(points)).astype(np.int64).T
+        width, height = camera.size_px
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
+        passed = (cosines > MIN_SEEN_COSINE, inside, free, alpha > MIN_PERSON_ALPHA)
+        stages = np.cumprod(passed, axis=0, dtype=np.uint8).sum(axis=0, dtype=np.uint8)
+        np.maximum(self.stages, stages, out=self.stages)
+        shown = np.where(stages == VisibilityStage.SEEN, cosines, 0.0).astype(np.float32)
+        np.maximum(self.cosines, shown, out=self.cosines)
+
+    @property
+    def seen_share(self) -> float:
+        """Share of the whole surface, in [0, 1]."""
+        return _area_share(self.patches.areas, self.cosines > 0.0)
+
+    @property
+    def well_seen_share(self) -> float:
+        """The share that was seen within 53° of squarely."""
+        return _area_share(self.patches.areas, self.cosines >= MIN_WELL_SEEN_COSINE)
+
+    def by_part(self) -> dict[str, PartCoverage]:
+        """How much of each part was seen, by its name."""
+        patches, seen = self.patches, self.cosines > 0.0
+        found: dict[str, PartCoverage] = {}
+        for part, name in enumerate(PART_NAMES):
+            here = patches.parts == part
+            sides = {
+                side: _area_share(patches.areas[among], seen[among])
+                for k, side in enumerate(SIDE_NAMES)
+                if (among := here & (patches.sides == k)).any()
+            }
+            found[name] = PartCoverage(
+                seen_share=_area_share(patches.areas[here], seen[here]), sides=sides
+            )
+        return found
+
+    def to_state(self) -> dict[str, Any]:
+        """All of it as text, for a checkpoint."""
+        steps = np.round(self.cosines * 255.0).astype(np.uint8)
+        return {
+            "cosines": base64.b64encode(steps.tobytes()).decode("ascii"),
+            "stages": base64.b64encode(self.stages.tobytes()).decode("ascii"),
+        }
+
+    def merge_state(self, state: dict[str, Any]) -> None:
+        """Adds what `to_state` of an earlier run has kept; notes of another body count nothing."""
+        cosines, stages = (
+            np.frombuffer(base64.b64decode(state[key]), dtype=np.uint8)
+            for key in ("cosines", "stages")
+        )
+        if len(stages) == len(self.stages) == len(cosines):
+            np.maximum(self.cosines, cosines.astype(np.float32) / 255.0, out=self.cosines)
+            np.maximum(self.stages, stages, out=self.stages)
+
+
+def pose_patches(
+    patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
+) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
+    """Centres and unit normals of the patches in the world, by linear blend skinning.
+
+    Args:
+        patches: At rest.
+        world_from_rest: The joints' transforms (`PosedBody.world_from_rest`).
+    """
+    joints = world_from_rest[:, :3].reshape(24, 12).astype(np.float32)
+    blended = (patches.weights @ joints).reshape(-1, 3, 4)
+    points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]
+    normals = np.einsum("pab,pb->pa", blended[:, :, :3], patches.normals)
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
+    total = float(areas.sum())
+    return float(areas[seen].sum()) / total if total else 0.0

@@ -1,0 +1,156 @@
+"""The skin in small patches: where each lies, where it looks, which side of which part it is."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial import KDTree
+
+from avatar.deformation.rig import PART_OF_JOINT, vertex_normals
+from preprocess.body.parametric_body import ShapedBody
+
+PART_NAMES = (
+    "torso", "left thigh", "right thigh", "left shin", "right shin", "left foot", "right foot",
+    "head", "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand",
+    "right hand",
+)  # fmt: skip
+"""The 14 body parts of `avatar.deformation.rig.PARTS`; left is the person's left."""
+SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
+"""Where a patch looks while the person stands in the T-pose; `under` is the underside."""
+ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)
+PATCH_M = 0.022
+ADJACENT_M = 0.045
+"""Patches whose centres are this close, and that look the same way, touch."""
+OCCLUSION_TOLERANCE_M = 0.01
+MAX_SOLE_NORMAL_Y = -0.5
+"""Feet are not asked for below this upward share of their normal: nobody shows their soles."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinPatches:
+    """Pieces of skin of about 2 cm that somebody around the person could see.
+
+    Attributes:
+        points: Their centres in the rest pose (SMPL's T-pose), metres.
+        normals: Unit outward normals in the rest pose.
+        areas: In square metres.
+        weights: Skinning weights.
+        parts: Index into `PART_NAMES`.
+        sides: Index into `SIDE_NAMES`. Arms and hands have front, back, top and under; the
+            others front, back, left and right.
+    """
+
+    points: Float32[np.ndarray, "patches 3"]
+    normals: Float32[np.ndarray, "patches 3"]
+    areas: Float32[np.ndarray, "patches"]
+    weights: Float32[np.ndarray, "patches 24"]
+    parts: Int[np.ndarray, "patches"]
+    sides: Int[np.ndarray, "patches"]
+
+    @classmethod
+    def from_shaped_body(cls, shaped: ShapedBody) -> "SkinPatches":
+        """The patches of one person: vertices of the same 2-cm voxel, part and side, together.
+
+        Left out is what nobody sees: the mouth's inside, and the soles.
+        """
+        weights = shaped.body.weights
+        normals, areas = vertex_normals(shaped.vertices, shaped.body.faces)
+        parts = PART_OF_JOINT[weights.argmax(axis=1)]
+        sides = _side_of_vertex(normals, parts)
+        voxels = np.floor(shaped.vertices / PATCH_M).astype(np.int64)
+        keys = np.column_stack([voxels, parts, sides])
+        _, first, patch = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        patch = patch.reshape(-1)
+
+        def mean(values: Float[np.ndarray, "vertices n"]) -> Float32[np.ndarray, "patches n"]:
+            total = np.zeros((len(first), values.shape[1]))
+            np.add.at(total, patch, values * areas[:, None])
+            return (total / size[:, None]).astype(np.float32)
+
+        size = np.bincount(patch, weights=areas)
+        normals = mean(normals)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        points, parts, sides = mean(shaped.vertices), parts[first], sides[first]
+        shown = _visible_from_anywhere(points, normals) & ~(
+            _is_foot(parts) & (normals[:, 1] < MAX_SOLE_NORMAL_Y)
+        )
+        return cls(
+            points=points[shown],
+            normals=normals[shown],
+            areas=size[shown].astype(np.float32),
+            weights=mean(weights)[shown],
+            parts=parts[shown],
+            sides=sides[shown],
+        )
+
+    @cached_property
+    def adjacent_pairs(self) -> Int[np.ndarray, "links 2"]:
+        """Pairs of patches that touch; the two faces of a hand do not."""
+        pairs = KDTree(self.points).query_pairs(ADJACENT_M, output_type="ndarray")
+        along = np.einsum("na,na->n", *self.normals[pairs.T])
+        return pairs[along > 0.0]
+
+
+def visible_points(
+    image_points: Float[np.ndarray, "points 2"],
+    depth: Float[np.ndarray, "points"],
+    cosine: Float[np.ndarray, "points"],
+    *,
+    cell_m: float,
+    tolerance_m: float,
+) -> Bool[np.ndarray, "points"]:
+    """Which points nothing else stands before: a depth buffer of coarse cells.
+
+    Args:
+        plane: Where they are seen, scaled to metres at the body.
+        depth: How far away they are, metres.
+        cosine: Of the angle between their normal and the direction to the eye; points that look
+            away hide nothing.
+        cell_m: Edge of a cell: no less than the points' spacing.
+        slack_m: How far a point may lie behind the nearest of its cell, beyond its own slope.
+    """
+    cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
+    columns = int(cell[:, 1].max()) + 1
+    flat = cell[:, 0] * columns + cell[:, 1]
+    nearest = np.full(int(flat.max()) + 1, np.inf)
+    faces = cosine > 0.0
+    np.minimum.at(nearest, flat[faces], depth[faces])
+    steep = np.clip(cosine, 0.1, 1.0)
+    slope = cell_m * np.sqrt(1.0 - steep**2) / steep
+    return faces & (depth <= nearest[flat] + tolerance_m + slope)
+
+
+def _side_of_vertex(
+    normals: Float[np.ndarray, "vertices 3"], parts: Int[np.ndarray, "vertices"]
+) -> Int[np.ndarray, "vertices"]:
+    """The side of its part that each vertex is on: four around an arm, four around the rest."""
+    x, y, z = normals.T
+    is_arm = (parts >= ARM_PARTS.start) & (parts < ARM_PARTS.stop)
+    across = np.where(is_arm, y, x)
+    sideways = np.where(is_arm, np.where(y > 0.0, 4, 5), np.where(x > 0.0, 2, 3))
+    return np.where(np.abs(z) >= np.abs(across), np.where(z > 0.0, 0, 1), sideways)
+
+
+def _is_foot(parts: Int[np.ndarray, "patches"]) -> Bool[np.ndarray, "patches"]:
+    return (parts >= FOOT_PARTS.start) & (parts < FOOT_PARTS.stop)
+
+
+def _visible_from_anywhere(
+    points: Float32[np.ndarray, "patches 3"], normals: Float32[np.ndarray, "patches 3"]
+) -> Bool[np.ndarray, "patches"]:
+    """Which patches anybody sees who walks around the T-pose, from above and below as well."""
+    shown = np.zeros(len(points), dtype=bool)
+    for direction in np.ndindex(3, 3, 3):
+        to_eye = np.array(direction, dtype=np.float64) - 1.0
+        if not to_eye.any():
+            continue
+        to_eye /= np.linalg.norm(to_eye)
+        right = np.cross(to_eye, [0.0, 1.0, 0.0] if abs(to_eye[1]) < 0.9 else [1.0, 0.0, 0.0])
+        plane = points @ np.column_stack([right, np.cross(right, to_eye)])
+        cosine = normals @ to_eye
+        found = visible_points(
+            plane, -points @ to_eye, cosine, cell_m=PATCH_M, tolerance_m=OCCLUSION_TOLERANCE_M
+        )
+        shown |= found & (cosine > 0.3)
+    return shown

@@ -1,0 +1,1 @@
+"""The canonical radiance field, its occupancy grid and regularizers."""

@@ -1,0 +1,44 @@
+"""The avatar: one person's rig, field and occupancy, as training left them."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.deformation.rig import Rig
+from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
+from avatar.field.radiance_field import RadianceField
+from avatar.kernels.backend_protocol import DensityGrid
+from avatar.kernels.torch_reference import activate
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Avatar:
+    """What can be rendered in any pose.
+
+    Attributes:
+        rig: Its articulation.
+        field: Its canonical colour and density.
+        occupancy: Where it may be.
+        step_m: Distance between samples along a ray that it was trained with, metres.
+    """
+
+    rig: Rig
+    field: RadianceField
+    occupancy: OccupancyGrid
+    sample_step_m: float
+
+    def rendering_grid(self) -> DensityGrid:
+        """Where a picture may show anything."""
+        return self.occupancy.for_rendering(self.sample_step_m)
+
+    def color_and_density_at(
+        self, points: Float32[Tensor, "points 3"]
+    ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
+        """Color in [0, 1] and density in 1/m at canonical points; no density in empty cells."""
+        held = in_occupied_cells(self.rendering_grid(), points).nonzero()[:, 0]
+        color, density = activate(self.field.raw_outputs_at(points[held].contiguous()))
+        all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])
+        all_colors[held], all_densities[held] = color, density
+        return all_colors, all_densities

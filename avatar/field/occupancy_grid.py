@@ -1,0 +1,274 @@
+"""Canonical occupancy: one density grid that every pose looks up after its warp.
+
+The paper keeps a grid in posed space: a union over the sequence for training, one per frame for
+rendering. Looked up in canonical space a single grid is exact for every pose, forgets none, and
+needs no pass of the network per frame.
+
+Between the legs: where photographs of few poses leave matter that is no part of anybody.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from scipy.ndimage import label
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from avatar.deformation.correspondence_grid import CLOTHING_BAND_M
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import DensityGrid
+from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+
+OCCUPANCY_DECAY = 0.9
+"""What a cell keeps of its density when a probe finds nothing. At 0.6 thin surfaces vanish."""
+INITIAL_OCCUPANCY_DECAY = 0.7
+"""The same while the first fog clears and half of the band is probed at each update."""
+MIN_STEP_OPACITY = 0.02
+"""A cell counts as empty when a step through it would be less opaque than this."""
+INITIAL_DENSITY = 1e-3
+SOLID_DENSITY = 20.0
+"""What is denser than this, in 1/m, counts as solid when pieces are told apart."""
+NEAR_SKIN_M = 0.03
+"""A piece of the person lies about this close to the skin; what floats does not."""
+INTERIOR_DEPTH_M = 0.015
+"""Deeper under the body's skin than this everybody is solid, however the body fits."""
+MIN_COMPONENT_SHARE = 0.003
+"""Pieces with less near the skin than this share of the largest are no part of the person."""
+
+
+@final
+class OccupancyGrid:
+    """Where the canonical person may be.
+
+    Attributes:
+        grid: What marching looks up; updated in place.
+        band: Flat indices of the cells near enough to the skin to hold anything.
+    """
+
+    def __init__(self, rig: Rig, device: torch.device, *, band_m: float = CLOTHING_BAND_M) -> None:
+        """Everything near the skin counts as occupied until something is known."""
+        band = torch.from_numpy(rig.skin_distance <= band_m).to(device)
+        cells = np.array(rig.skin_distance.shape, dtype=np.float32)
+        self.density_grid = DensityGrid(
+            occupied=band.to(torch.uint8),
+            density=torch.where(band, INITIAL_DENSITY, 0.0),
+            low=torch.from_numpy(rig.box_low).to(device),
+            cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
+        )
+        self.band_cells: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
+        self._in_band = band.to(torch.uint8)
+        self._interior_cells = torch.from_numpy(
+            rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)
+        ).to(device)
+        self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
+        self._near_skin = rig.skin_distance <= NEAR_SKIN_M
+        self._rig = rig
+        self._cached_empty_cells: tuple[int, Tensor] | None = None
+
+    @torch.no_grad()
+    def update(
+        self,
+        log_density_at: Callable[[Float32[Tensor, "points 3"]], Float32[Tensor, "points"]],
+        *,
+        share: float,
+        decay: float = OCCUPANCY_DECAY,
+        min_density: float = 0.0,
+        drop_floaters: bool = False,
+        sample_step_m: float,
+        generator: torch.Generator,
+    ) -> None:
+        """Probes a share of the band once, at a random place in each cell, and re-thresholds.
+
+        Args:
+            log_density_at: Log density at canonical points.
+            share: How much of the band is probed, in (0, 1].
+            decay: What a probed cell keeps of its density.
+            thinnest: Cells with less density than this, in 1/m, hold nothing, however long the
+                way through them.
+            drop_floaters: Whether pieces without contact to the rest are dropped that are small or
+                float off the skin (the paper's code keeps the largest piece alone; a foot may be
+                a piece of its own).
+            step_m: Distance between samples along a ray.
+            generator: Chooses cells and places.
+        """
+        chosen = self._draw_cells(self.band_cells, int(len(self.band_cells) * share), generator)
+        log_density = log_density_at(self._jittered_points(chosen, generator))
+        density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
+        flat = self.density_grid.density.view(-1)
+        flat[chosen] = torch.maximum(flat[chosen] * decay, density)
+        dense = (
+            self.density_grid.density > max(self._density_threshold(sample_step_m), min_density)
+        ).to(torch.uint8)
+        occupied = dilate(dense) & self._in_band
+        if drop_floaters:
+            occupied &= 1 - find_floaters(
+                self.density_grid.density > SOLID_DENSITY, self._near_skin
+            )
+        self.density_grid.occupied.copy_(occupied)
+
+    def for_rendering(self, sample_step_m: float) -> DensityGrid:
+        """The occupancy grown by one more cell, so that pruning leaves no hole in a picture.
+
+        Of what is grown those cells stay that are next to one half as dense as an occupied one, a
+        step of the paper's 1 % of opacity: a quarter fewer samples, and no farther from the sum
+        over all samples, occupied or not, than with every grown cell.
+        """
+        hazy = (self.density_grid.density > 0.5 * self._density_threshold(sample_step_m)).to(
+            torch.uint8
+        )
+        return self.density_grid._replace(
+            occupied=dilate(self.density_grid.occupied) & dilate(hazy)
+        )
+
+    def _density_threshold(self, step_m: float) -> float:
+        """Density from which a cell is occupied: while all is fog, that which is above the mean."""
+        return min(
+            MIN_STEP_OPACITY / step_m,
+            float(self.density_grid.density.view(-1)[self.band_cells].mean()),
+        )
+
+    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
+        """Random points of cells near the skin that hold nothing, at most `count`."""
+        return self._jittered_points(
+            self._draw_cells(self._empty_cells(), count, generator), generator
+        )
+
+    def sample_inner_leg(
+        self, count: int, generator: torch.Generator
+    ) -> Float32[Tensor, "points 3"]:
+        """Random points off the skin between the legs, at most `count`."""
+        return self._jittered_points(
+            self._draw_cells(self._inner_leg_cells, count, generator), generator
+        )
+
+    def sample_interior(
+        self, count: int, generator: torch.Generator
+    ) -> Float32[Tensor, "points 3"]:
+        """Random points deep under the skin, at most `count`."""
+        return self._jittered_points(
+            self._draw_cells(self._interior_cells, count, generator), generator
+        )
+
+    @cached_property
+    def _inner_leg_cells(self) -> Int64[Tensor, "cells"]:
+        """Cells of the band between the legs."""
+        between = inner_leg_cells(self._rig, self.band_cells.cpu().numpy())
+        return self.band_cells[torch.from_numpy(between).to(self.band_cells.device)]
+
+    def _empty_cells(self) -> Int64[Tensor, "cells"]:
+        """Cells of the band that hold nothing: looked up when the occupancy has changed."""
+        version = self.density_grid.occupied._version
+        if self._cached_empty_cells is None or self._cached_empty_cells[0] != version:
+            cells = self.band_cells[self.density_grid.occupied.view(-1)[self.band_cells] == 0]
+            self._cached_empty_cells = version, cells
+        return self._cached_empty_cells[1]
+
+    def _draw_cells(
+        self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
+    ) -> Int64[Tensor, "drawn"]:
+        count = count if len(cells) else 0
+        drawn = torch.randint(
+            max(len(cells), 1), (count,), generator=generator, device=generator.device
+        )
+        return cells[drawn.to(cells.device)]
+
+    def _jittered_points(
+        self, cells: Int64[Tensor, "cells"], generator: torch.Generator
+    ) -> Float32[Tensor, "cells 3"]:
+        _, ny, nz = self.density_grid.occupied.shape
+        corner = torch.stack([cells // (ny * nz), cells // nz % ny, cells % nz], dim=1)
+        within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
+        return (
+            corner + within.to(cells.device)
+        ) / self.density_grid.cells_per_m + self.density_grid.low
+
+
+def in_occupied_cells(
+    grid: DensityGrid, points: Float32[Tensor, "points 3"]
+) -> Bool[Tensor, "points"]:
+    """Which points lie in occupied cells."""
+    shape = torch.tensor(grid.occupied.shape, device=points.device)
+    cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
+    x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)
+    return ((cell >= 0) & (cell < shape)).all(dim=1) & (grid.occupied[x, y, z] != 0)
+
+
+def dilate(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
+    """The cells and their six neighbours."""
+    out = occupied.clone()
+    for axis in range(3):
+        length = occupied.shape[axis] - 1
+        out.narrow(axis, 1, length).bitwise_or_(occupied.narrow(axis, 0, length))
+        out.narrow(axis, 0, length).bitwise_or_(occupied.narrow(axis, 1, length))
+    return out
+
+
+def find_floaters(
+    solid: Bool[Tensor, "x y z"], near_skin: Bool[np.ndarray, "x y z"]
+) -> UInt8[Tensor, "x y z"]:
+    """Cells in and about those connected pieces that are no part of the person.
+
+    Args:
+        firm: What is solid.
+        near_skin: Only such cells count towards a piece's size.
+    """
+    # scipy has no types, and what pyright guesses of this function is wrong
+    pieces, count = label(solid.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
+    if count < 2:
+        return torch.zeros_like(solid, dtype=torch.uint8)
+    sizes = np.bincount(pieces.ravel(), weights=near_skin.ravel())
+    sizes[0] = 0.0
+    kept = sizes >= MIN_COMPONENT_SHARE * sizes.max()
+    kept[0] = False
+
+    def about(cells: Bool[np.ndarray, "x y z"]) -> UInt8[Tensor, "x y z"]:
+        return dilate(dilate(torch.from_numpy(cells.astype(np.uint8)).to(solid.device)))
+
+    return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))
+
+
+OFF_SKIN_M = 0.02
+"""Nearer to the skin than this clothes lie, and nothing is said about them."""
+MAX_LEG_DISTANCE_M = 0.3
+"""A leg that is farther away than this has no say."""
+MAX_DIRECTION_COSINE = 0.5
+"""Cosine of 60°: a place is between the legs if it sees them farther apart than this."""
+LEFT_LEG_PARTS, RIGHT_LEG_PARTS = (1, 3, 5), (2, 4, 6)
+"""Their body parts (`avatar.deformation.rig.PARTS`)."""
+
+
+def inner_leg_cells(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray, "cells"]:
+    """Which occupancy cells lie off the skin between the legs.
+
+    Where thighs touch in every photograph, canonical space has them apart, and skinning folds what
+    is between into them. No ray tells whether anything is there; when the legs part, it is a web.
+
+    Args:
+        rig: Whose body.
+        cells: Flat numbers of cells of `rig.distance`.
+    """
+    found = np.zeros(len(cells), dtype=bool)
+    away = (rig.skin_distance.reshape(-1)[cells] > OFF_SKIN_M) & ~rig.inside_skin.reshape(-1)[cells]
+    off = np.flatnonzero(away)
+    place = np.stack(np.unravel_index(cells[off], rig.skin_distance.shape), axis=1) + 0.5
+    points = rig.box_low + place * (rig.box_high - rig.box_low) / rig.skin_distance.shape
+    to_left, left_m = _nearest_leg_seed(rig, LEFT_LEG_PARTS, points)
+    to_right, right_m = _nearest_leg_seed(rig, RIGHT_LEG_PARTS, points)
+    apart = (to_left * to_right).sum(axis=1) < MAX_DIRECTION_COSINE
+    found[off] = apart & (np.maximum(left_m, right_m) < MAX_LEG_DISTANCE_M)
+    return found
+
+
+def _nearest_leg_seed(
+    rig: Rig, parts: tuple[int, ...], points: Float[np.ndarray, "points 3"]
+) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points"]]:
+    """Direction to the nearest seed of some body parts, and how far away it is."""
+    seeds = rig.seeds[np.isin(rig.seed_parts, parts)]
+    if not len(seeds):
+        return np.zeros_like(points), np.full(len(points), np.inf)
+    distance, index = KDTree(seeds).query(points)
+    return (seeds[index] - points) / np.maximum(distance, 1e-9)[:, None], distance

@@ -1,0 +1,235 @@
+"""The compiled CPU twins behind the common seam."""
+
+import threading
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int32, Int64
+from torch import Tensor
+
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import (
+    BlendedTransforms,
+    CorrespondenceTables,
+    DensityGrid,
+    Features,
+    HashTable,
+    MarchSettings,
+    Points,
+    PosedOccupancy,
+    PremultipliedPixels,
+    RawOutputs,
+    RayBatch,
+    RaySamples,
+    SkinningVolume,
+    SolvedCorrespondences,
+)
+from avatar.kernels.hash_levels import HashLevels
+from avatar.numba_kernels import (
+    numba_correspondence,
+    numba_hash_grid,
+    numba_rendering,
+    numba_skinning,
+)
+from baselines.instant_avatar import broyden_kernels, occupied_samples
+
+_SCRATCH = threading.local()
+MAX_REUSED_SAMPLES = 1 << 20
+"""Room for more samples than this is given back at once."""
+
+
+def _level_arrays(
+    levels: HashLevels,
+) -> tuple[
+    Float32[np.ndarray, "3"],
+    Float32[np.ndarray, "levels"],
+    Int32[np.ndarray, "levels 3"],
+    Int32[np.ndarray, "levels"],
+    Int64[np.ndarray, "levels+1"],
+]:
+    return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
+
+
+def _scratch_samples(
+    rays: int, max_samples: int
+) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
+    """Room for the samples of rays before they are packed; what a thread asked for last, if small.
+
+    Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.
+    """
+    key, room = getattr(_SCRATCH, "room", (None, None))
+    if room is None or key != (rays, max_samples):
+        room = (
+            np.empty((rays, max_samples, 3), dtype=np.float32),
+            np.empty((rays, max_samples), dtype=np.int32),
+        )
+        _SCRATCH.room = (
+            ((rays, max_samples), room)
+            if rays * max_samples <= MAX_REUSED_SAMPLES
+            else (None, None)
+        )
+    return room
+
+
+@final
+class NumbaBackend:
+    """Numba kernels on torch's CPU memory.
+
+    Only the trainer's thread may call them; `solve_correspondences` alone, which is serial, any thread may.
+    """
+
+    name = "numba"
+
+    def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
+        features = torch.empty(len(points), levels.feature_width)
+        numba_hash_grid.encode(
+            points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy()
+        )
+        return features
+
+    def encode_backward(
+        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
+    ) -> None:
+        numba_hash_grid.encode_backward(
+            points.numpy(), *_level_arrays(levels), grad_features.numpy(), grad_table.numpy()
+        )
+
+    def solve_correspondences(
+        self,
+        rig: Rig,
+        bones: Float32[np.ndarray, "24 12"],
+        band_m: float,
+        cell_m: float,
+        device: torch.device,
+    ) -> SolvedCorrespondences:
+        return SolvedCorrespondences(
+            *numba_correspondence.solve_correspondences(rig, bones, band_m, cell_m)
+        )
+
+    def march(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> RaySamples:
+        return self.march_resumable(rays, cells, grid, how)[0]
+
+    def march_resumable(
+        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+    ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
+        padded, padded_rows = _scratch_samples(len(rays.slots), how.max_samples)
+        count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
+        first = torch.empty(len(rays.slots), dtype=torch.int64)
+        numba_rendering.march(
+            *(part.numpy() for part in rays), np.float32(how.sample_step_m),
+            *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
+            *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows, count.numpy(),
+            reached.numpy(),
+        )  # fmt: skip
+        total = numba_rendering.prefix_sum(count.numpy(), first.numpy())
+        points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
+        numba_rendering.pack_samples(
+            padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
+        )
+        return RaySamples(points, first, count, rows), rays.jitter + reached
+
+    def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
+        rendered = torch.empty(len(samples.counts), 4)
+        numba_rendering.composite(
+            raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
+            rendered.numpy(),
+        )  # fmt: skip
+        return rendered
+
+    def composite_loss(
+        self,
+        raw: RawOutputs,
+        samples: RaySamples,
+        step_m: float,
+        target: PremultipliedPixels,
+        background: Float32[Tensor, "rays 3"],
+        alpha_weight: float,
+        hard_weight: float,
+    ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
+        rendered, loss = torch.empty(len(samples.counts), 4), torch.empty(len(samples.counts))
+        grad = torch.empty_like(raw)
+        numba_rendering.composite_loss(
+            raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
+            target.numpy(), background.numpy(), np.float32(alpha_weight),
+            np.float32(hard_weight), rendered.numpy(), loss.numpy(), grad.numpy(),
+        )  # fmt: skip
+        return rendered, loss, grad
+
+    def scatter_max_density(
+        self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
+    ) -> None:
+        numba_rendering.scatter_max_density(
+            points.numpy(), log_density.numpy(), grid.low.numpy(), grid.cells_per_m.numpy(),
+            grid.density.numpy(),
+        )  # fmt: skip
+
+    def encode_points_backward(
+        self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
+    ) -> Points:
+        grad = torch.empty_like(points)
+        numba_hash_grid.encode_points_backward(
+            points.numpy(), *_level_arrays(levels), table.detach().numpy(), grad_features.numpy(),
+            grad.numpy(),
+        )  # fmt: skip
+        return grad
+
+    def bone_wrenches(
+        self,
+        samples: RaySamples,
+        grad_points: Float32[Tensor, "samples 3"],
+        slots: Int32[Tensor, "rays"],
+        cells: CorrespondenceTables,
+        skin: SkinningVolume,
+        bones: Float32[Tensor, "slots 24 12"],
+    ) -> Float32[Tensor, "rays 24 6"]:
+        out = torch.zeros(len(slots), 24, 6)
+        numba_skinning.bone_wrenches(
+            samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
+            samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
+            *(part.numpy() for part in skin), bones.numpy(), out.numpy(),
+        )  # fmt: skip
+        return out
+
+    def update_roots(
+        self,
+        cells: CorrespondenceTables,
+        slot: int,
+        skin: SkinningVolume,
+        bones: Float32[Tensor, "24 12"],
+    ) -> None:
+        numba_skinning.update_roots(
+            cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
+            np.float32(cells.cell_m), cells.roots[slot].numpy(),
+            *(part.numpy() for part in skin), bones.numpy(),
+        )  # fmt: skip
+
+    def sample_occupied_cells(
+        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
+    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+        count = torch.empty(len(rays.slots), dtype=torch.int32)
+        given = (
+            *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
+        )  # fmt: skip
+        occupied_samples.count_samples_numba(*given, np.empty((0, 3), np.float32), count.numpy())
+        points = torch.empty(int(count.sum()), 3)
+        first = torch.cumsum(count, 0) - count
+        occupied_samples.write_samples_numba(*given, points.numpy(), first.numpy())
+        return points, count
+
+    def find_all_roots(
+        self,
+        points: Float32[Tensor, "points 3"],
+        slots: Int32[Tensor, "points"],
+        poses: BlendedTransforms,
+    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+        starts = poses.inverses.shape[1]
+        found = torch.empty(len(points), starts, 3)
+        valid = torch.empty(len(points), starts, dtype=torch.bool)
+        broyden_kernels.find_all_roots_numba(
+            points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
+            found.numpy(), valid.numpy(),
+        )  # fmt: skip
+        return found, valid

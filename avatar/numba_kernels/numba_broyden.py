@@ -1,0 +1,184 @@
+"""One root of skinning by Broyden's method, and how the warp bends there, compiled for the CPU."""
+
+import math
+
+import numpy as np
+
+from avatar.kernels.torch_correspondence import MAX_PROBE_CORRECTION_M
+from avatar.numba_kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.numba_kernels.numba_skinning import MATRIX_LANES, interpolate_at, transform_point
+
+F32, I32 = np.float32, np.int32
+TOLERANCE_M = 1e-4
+ITERATIONS = 12
+LONGEST_STEP_M = 0.3
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def invert_rotation(m, out):
+    """Inverse of the 3×3 part of a row-major 3×4 matrix."""
+    a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
+    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
+    det = a * p + b * q + c * r
+    s = F32(1) / (det if abs(det) > F32(1e-6) else F32(1e-6))
+    out[0], out[1], out[2] = p * s, (c * h - b * i) * s, (b * f - c * e) * s
+    out[3], out[4], out[5] = q * s, (a * i - c * g) * s, (c * d - a * f) * s
+    out[6], out[7], out[8] = r * s, (b * g - a * h) * s, (a * e - b * d) * s
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def rotate_vector(m, x, y, z):
+    """A vector turned by a row-major 3×3 matrix."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
+    """Broyden's good update of an inverse Jacobian: a step d has changed the value by y."""
+    jx, jy, jz = rotate_vector(inverse, yx, yy, yz)
+    den = dx * jx + dy * jy + dz * jz
+    den = F32(1) / (den if abs(den) > F32(1e-12) else F32(1e-12))
+    rx = dx * inverse[0] + dy * inverse[3] + dz * inverse[6]
+    ry = dx * inverse[1] + dy * inverse[4] + dz * inverse[7]
+    rz = dx * inverse[2] + dy * inverse[5] + dz * inverse[8]
+    ux, uy, uz = (dx - jx) * den, (dy - jy) * den, (dz - jz) * den
+    inverse[0] += ux * rx
+    inverse[1] += ux * ry
+    inverse[2] += ux * rz
+    inverse[3] += uy * rx
+    inverse[4] += uy * ry
+    inverse[5] += uy * rz
+    inverse[6] += uz * rx
+    inverse[7] += uz * ry
+    inverse[8] += uz * rz
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _blended_transform(transforms, low, nodes_per_m, x, y, z, out):
+    if transforms.shape[3] == MATRIX_LANES:
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, out)
+    else:
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, 12, out)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_inverse):
+    """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest.
+
+    Args:
+        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or `LANES`).
+        low, nodes_per_m: Place and scale of those nodes.
+        p: The posed point.
+        x: Where to start; the root.
+        blend: Room for `LANES` floats.
+        inverse: Inverse Jacobian to start with, row by row; what has been learnt of it.
+        cold: Whether nothing is known of it, so that the blended rotation's inverse is taken.
+    """
+    _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+    if initialize_inverse:
+        invert_rotation(blend, inverse)
+    sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
+    fx, fy, fz = sx - p[0], sy - p[1], sz - p[2]
+    rests = False
+    for _ in range(ITERATIONS):
+        size = fx * fx + fy * fy + fz * fz
+        rests = size <= F32(TOLERANCE_M * TOLERANCE_M)
+        if size > F32(1):
+            return False
+        dx, dy, dz = rotate_vector(inverse, -fx, -fy, -fz)
+        if dx * dx + dy * dy + dz * dz > F32(LONGEST_STEP_M * LONGEST_STEP_M):
+            return False  # off the volume, or in a fold: nothing that follows would be sound
+        if rests and dx * dx + dy * dy + dz * dz > F32(TOLERANCE_M * MAX_PROBE_CORRECTION_M):
+            return True
+        x[0] += dx
+        x[1] += dy
+        x[2] += dz
+        if rests:  # the last step costs nothing: nobody asks where it led
+            return True
+        _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+        sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
+        gx, gy, gz = sx - p[0], sy - p[1], sz - p[2]
+        _broyden_update(inverse, dx, dy, dz, gx - fx, gy - fy, gz - fz)
+        fx, fy, fz = gx, gy, gz
+    return fx * fx + fy * fy + fz * fz <= F32(4 * TOLERANCE_M * TOLERANCE_M)
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
+    """Where, relative to the root x of p, the root of p + d lies: linearly, and one chord step."""
+    ux, uy, uz = rotate_vector(inverse, dx, dy, dz)
+    interpolate_at(
+        transforms, low, nodes_per_m, x[0] + ux, x[1] + uy, x[2] + uz, MATRIX_LANES, blend
+    )
+    sx, sy, sz = transform_point(blend, x[0] + ux, x[1] + uy, x[2] + uz)
+    ex, ey, ez = rotate_vector(inverse, p[0] + dx - sx, p[1] + dy - sy, p[2] + dz - sz)
+    beyond = ex * ex + ey * ey + ez * ez > F32(MAX_PROBE_CORRECTION_M * MAX_PROBE_CORRECTION_M)
+    share = F32(0) if beyond else F32(1)
+    return ux + share * ex, uy + share * ey, uz + share * ez
+
+
+@compile_kernel(**NO_ALLOCATION)
+def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
+    """How roots move about the root x of a cell's centre p, from probes t towards its six faces.
+
+    A root of p + d is x + A d + Σ c_ij d_i d_j. What is known of it after this: A and the c_ii.
+
+    Args:
+        transforms, low, nodes_per_m, blend: As in `solve`.
+        p, t: Cell's centre; how far from it the warp is probed.
+        x, inverse: Its root and about the inverse Jacobian there.
+        warp: (30) root, A row by row, c_xx c_yy c_zz c_xy c_xz c_yz; the first 21 are written.
+
+    Returns:
+        Norm of all c_ii: how bent the warp is, 1/m.
+    """
+    bend, half, over = F32(0), F32(0.5) / t, F32(0.5) / (t * t)
+    for axis in range(3):
+        dx = t if axis == 0 else F32(0)
+        dy = t if axis == 1 else F32(0)
+        dz = t if axis == 2 else F32(0)
+        ax, ay, az = _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend)
+        bx, by, bz = _probe_root(transforms, low, nodes_per_m, p, -dx, -dy, -dz, x, inverse, blend)
+        warp[axis] = x[axis]
+        warp[3 + axis], warp[6 + axis], warp[9 + axis] = (
+            (ax - bx) * half, (ay - by) * half, (az - bz) * half,
+        )  # fmt: skip
+        cx, cy, cz = (ax + bx) * over, (ay + by) * over, (az + bz) * over
+        warp[12 + 3 * axis], warp[13 + 3 * axis], warp[14 + 3 * axis] = cx, cy, cz
+        bend += cx * cx + cy * cy + cz * cz
+    return math.sqrt(bend)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
+    """Betters what `probe_faces` has written by probes towards the eight corners, and adds c_ij."""
+    for c in range(3, 12):
+        warp[c] *= F32(0.5)  # the mean of what faces say and of what corners say
+    for c in range(21, 30):
+        warp[c] = F32(0)
+    mean_x, mean_y, mean_z = F32(0), F32(0), F32(0)
+    for corner in range(8):
+        i = F32(1) if corner & 4 else F32(-1)
+        j = F32(1) if corner & 2 else F32(-1)
+        k = F32(1) if corner & 1 else F32(-1)
+        ux, uy, uz = _probe_root(
+            transforms, low, nodes_per_m, p, i * t, j * t, k * t, x, inverse, blend
+        )
+        ux, uy, uz = ux / (F32(8) * t * t), uy / (F32(8) * t * t), uz / (F32(8) * t * t)
+        mean_x, mean_y, mean_z = mean_x + ux, mean_y + uy, mean_z + uz
+        for c, u in enumerate((ux, uy, uz)):
+            warp[3 + 3 * c] += F32(0.5) * t * u * i
+            warp[4 + 3 * c] += F32(0.5) * t * u * j
+            warp[5 + 3 * c] += F32(0.5) * t * u * k
+            warp[21 + c] += u * i * j
+            warp[24 + c] += u * i * k
+            warp[27 + c] += u * j * k
+    for c, mean in enumerate((mean_x, mean_y, mean_z)):
+        more = (mean - warp[12 + c] - warp[15 + c] - warp[18 + c]) / F32(6)
+        warp[12 + c] += more
+        warp[15 + c] += more
+        warp[18 + c] += more

@@ -1,0 +1,1 @@
+"""Pose refinement: Gauss-Newton steps and a prior over time."""

@@ -1,0 +1,310 @@
+"""Pose refinement: trackers' poses corrected while the avatar is learnt.
+
+A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
+gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
+wrench per bone (`avatar.numba_kernels.numba_skinning`). A few hundred rays of a frame make one Gauss-Newton
+step (`avatar.pose.gauss_newton`); exact poses are left alone, and soon asked about only seldom. What all
+frames share is no error of a frame but a change of the canonical body, so the mean correction is
+taken out again and again.
+"""
+
+import math
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import SkinningVolume
+from avatar.pose.gauss_newton import MIN_EVIDENCE, OVERRELAXATION, gauss_newton_step
+from avatar.pose.temporal_prior import TemporalPosePrior
+from avatar.training.replay_buffer import RootCorrection
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import body_from_rest, rotation_matrices
+
+MAX_RAYS_PER_FRAME = 512
+"""Rays of a frame that are kept until its pose is corrected."""
+MIN_RAYS_PER_CORRECTION = 256
+"""A frame's pose is corrected when this many of its rays have been seen since it last was."""
+MIN_POSE_GRADIENT_CELL_M = 0.025
+"""Only levels of the grid with cells as large as this pull at poses: finer ones say where to go
+from a few millimetres away, and point anywhere from farther off."""
+EVIDENCE_EMA_DECAY = 0.95
+"""Of the mean evidence, and of the share of corrections that moved a pose."""
+MAX_CORRECTION_INTERVAL = 8
+"""Steps from one pull to the next where poses are exact."""
+MAX_JOINT_STEP_M = 0.04
+"""No joint moves farther at one correction: the frame's warp must be able to follow."""
+RESOLVE_DISTANCE_M = 0.08
+"""When a joint has moved this far since the frame's warp was solved, it is solved anew."""
+MEAN_CORRECTION_DECAY = 0.2
+"""Share of the mean correction taken out of a frame's at each of its corrections."""
+FIRST_CORRECTION_STEPS = 60
+"""A frame's pose is corrected once its frame has been learnt from for so many steps: before, the
+field does not know what is seen from there, and what is new looks like what is off."""
+MIN_STEPS_BEFORE_FREEZE, MIN_ESTIMATES_BEFORE_FREEZE = 300, 3
+"""A pose is judged once its frame has been learnt from for so many steps, by so many pulls."""
+MAX_EXACT_EVIDENCE = 1.3
+"""Mean evidence, the frame's and all frames' halves, below which a pose counts as exact and stays
+as it is for good. Were it asked for ever, chance would move it, what it moves would blur the field,
+and a blurred field moves the next: at 540 px that ran away after three thousand steps."""
+FREEZE_AFTER_STEPS = 3000
+"""Steps after which any pose stays as it is: what the field shows of it by then is as much its own
+memory of that pose as evidence."""
+MAX_CORRECTION = 0.35
+"""A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
+
+
+@final
+class PoseOptimizer:
+    """The poses of the frames in replay, each with its correction.
+
+    A correction is 75 numbers: axis-angles of the root and of 23 joints, applied in each one's own
+    frame before the given rotation, and the root's shift in the given body frame, metres.
+
+    Attributes:
+        corrections: (slots, 25, 3): root rotation, joint rotations, root shift.
+        bones: Body-from-canonical matrices of the corrected poses.
+    """
+
+    def __init__(
+        self, rig: Rig, capacity: int, device: torch.device, *, avatar_frozen: bool = False
+    ) -> None:
+        """A table without poses.
+
+        Args:
+            rig: Whose body.
+            capacity: How many poses it may hold.
+            device: Where gradients are gathered.
+            frozen: Whether the avatar stays as it is, and only the poses are looked for: no pose
+                can blur it then, so all move, and no farther than their rays ask; and what they
+                share is no change of the canonical body.
+        """
+        self.rig = rig
+        self._mean_decay, self._overrelaxation = (
+            (0.0, 1.0) if avatar_frozen else (MEAN_CORRECTION_DECAY, OVERRELAXATION)
+        )
+        self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
+        self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
+        nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
+        self.skinning = SkinningVolume(
+            torch.from_numpy(rig.weights).to(device),
+            torch.from_numpy(rig.box_low).to(device),
+            torch.from_numpy(nodes / (rig.box_high - rig.box_low)).to(device),
+        )
+        self._wrenches = torch.zeros(capacity, MAX_RAYS_PER_FRAME, 24, 6, device=device)
+        self._losses = torch.zeros(capacity, MAX_RAYS_PER_FRAME, device=device)
+        self._ray_counts = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._tracker_poses: list[BodyPose | None] = [None] * capacity
+        self._joint_transforms = np.zeros((capacity, 24, 4, 4))
+        self._joints_at_solve = np.zeros((capacity, 24, 3))
+        self._rest_from_canonical = np.linalg.inv(
+            body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
+        )
+        self._descendants = _descendant_matrix(rig)
+        self._moved_share, self._evidence = 1.0, math.inf if avatar_frozen else MIN_EVIDENCE
+        self._added_at_step = np.zeros(capacity, dtype=np.int64)
+        self._can_freeze, self._is_frozen = np.zeros((2, capacity), dtype=bool)
+        self._estimate_count, self._evidence_sum = np.zeros((2, capacity))
+        self._temporal_prior = TemporalPosePrior(capacity)
+        self._is_correctable = torch.ones(capacity, dtype=torch.bool, device=device)
+
+    def set_pose(
+        self,
+        slot: int,
+        pose: BodyPose,
+        correction: Float[np.ndarray, "25 3"] | None = None,
+        *,
+        frame: int | None = None,
+        step: int = 0,
+    ) -> None:
+        """Takes in a frame's given pose.
+
+        Args:
+            slot: Its place.
+            pose: As the tracker has it.
+            correction: If one is known.
+            frame: Its number: poses of frames in a row err alike. None if nothing is in a row.
+            step: Since when it is learnt from.
+        """
+        self._tracker_poses[slot] = pose
+        self._added_at_step[slot] = step
+        self._is_correctable[slot] = True
+        self._is_frozen[slot] = False
+        self._temporal_prior.set_frame(slot, frame)
+        self._estimate_count[slot] = self._evidence_sum[slot] = 0.0
+        self.corrections[slot] = 0.0
+        if correction is not None:
+            self.corrections[slot] = correction
+        self._ray_counts[slot] = 0
+        self._update_bones(slot)
+        self._joints_at_solve[slot] = self._joint_positions(slot)
+
+    def pose(self, slot: int) -> BodyPose:
+        """The corrected pose."""
+        given = self._tracker_poses[slot]
+        assert given is not None
+        turn, *joints = self.corrections[slot, :24]
+        shift = self.corrections[slot, 24]
+        root = Rotation.from_rotvec(given.root_rotation)
+        turned = root * Rotation.from_rotvec(turn)
+        place = root.apply(shift) + given.root_translation
+        return BodyPose(
+            root_rotation=turned.as_rotvec(),
+            root_translation=place,
+            joint_rotations=(
+                Rotation.from_rotvec(given.joint_rotations) * Rotation.from_rotvec(np.array(joints))
+            ).as_rotvec(),
+        )
+
+    def freeze_converged(self, step: int) -> bool:
+        """Which poses may be corrected now; whether there are any.
+
+        Those whose frames are new wait; those that proved exact, or were refined long enough, stay
+        as they are for good.
+        """
+        held = np.array([pose is not None for pose in self._tracker_poses])
+        age = step - self._added_at_step
+        self._can_freeze = age >= MIN_STEPS_BEFORE_FREEZE
+        told = self._evidence_sum / self._estimate_count.clip(min=1)
+        exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
+            0.5 * (told + self._evidence) < MAX_EXACT_EVIDENCE
+        )
+        self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
+        open_now = held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
+        self._is_correctable.copy_(torch.from_numpy(open_now))
+        self._ray_counts *= self._is_correctable
+        return bool(open_now.any())
+
+    def accumulate(
+        self,
+        slots: Int64[Tensor, "rays"],
+        wrenches: Float32[Tensor, "rays 24 6"],
+        loss: Float32[Tensor, "rays"],
+    ) -> None:
+        """Keeps what a step's rays exert on their frames' bones; slots ascend."""
+        counts = torch.bincount(slots, minlength=len(self._ray_counts))
+        rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
+        place = self._ray_counts[slots] + rank
+        kept = (place < MAX_RAYS_PER_FRAME) & self._is_correctable[slots]
+        self._wrenches[slots[kept], place[kept]] = wrenches[kept]
+        self._losses[slots[kept], place[kept]] = loss[kept]
+        self._ray_counts = (self._ray_counts + counts * self._is_correctable).clamp(
+            max=MAX_RAYS_PER_FRAME
+        )
+
+    def correct_next(self, *, rate: float) -> int | None:
+        """Corrects the pose about which most has been found out; cells and rays must follow.
+
+        Args:
+            rate: Factor of the steps, in (0, 1].
+
+        Returns:
+            The slot, or None if no frame has seen enough rays or the pose stays as it is.
+        """
+        slot = int(self._ray_counts.argmax())
+        rows = int(self._ray_counts[slot])
+        if rows < MIN_RAYS_PER_CORRECTION:
+            return None
+        loss = self._losses[slot, :rows].cpu().numpy()
+        step = gauss_newton_step(
+            self.pose_gradients(slot), loss, self.corrections[slot], self._evidence,
+            prior=self._temporal_prior.prior_for(slot, self.corrections), overrelaxation=self._overrelaxation,
+        )  # fmt: skip
+        self._ray_counts[slot] = 0
+        self._temporal_prior.record_estimate(slot, step.unregularized)
+        self._evidence = (
+            EVIDENCE_EMA_DECAY * self._evidence + (1.0 - EVIDENCE_EMA_DECAY) * step.evidence
+        )
+        if self._can_freeze[slot]:
+            self._estimate_count[slot] += 1.0
+            self._evidence_sum[slot] += step.evidence
+        moves = bool(step.change.any())
+        self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
+        if not moves:
+            return None
+        held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
+        mean = self.corrections[held].mean(axis=0)
+        moved = self.corrections[slot] + rate * step.change - self._mean_decay * mean
+        self._apply_correction(slot, np.clip(moved, -MAX_CORRECTION, MAX_CORRECTION))
+        return slot
+
+    @property
+    def correction_interval(self) -> int:
+        """Steps from one pull at poses to the next, 1 to 8: more where poses prove to be exact."""
+        return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
+
+    def needs_resolve(self, slot: int) -> bool:
+        """Whether the slot's pose has left the one for which its warp was last solved.
+
+        Saying so counts as solving it anew.
+        """
+        places = self._joint_positions(slot)
+        moved = np.linalg.norm(places - self._joints_at_solve[slot], axis=1).max()
+        if moved > RESOLVE_DISTANCE_M:
+            self._joints_at_solve[slot] = places
+        return bool(moved > RESOLVE_DISTANCE_M)
+
+    def root_correction(self, slot: int) -> RootCorrection:
+        """How the slot's rays move."""
+        turn, shift = self.corrections[slot, 0], self.corrections[slot, 24]
+        return RootCorrection(
+            rotation=rotation_matrices(turn), shift=shift, pivot=self.rig.rest_joints[0]
+        )
+
+    def pose_gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
+        """Gradient of each kept ray's loss for the slot's correction, from its bones' wrenches.
+
+        A joint that turns by ω about its place c carries every bone below it:
+        dL/dω = -Σ (M - c × F), in the axes of the body frame; here it is expressed in those of the
+        joint, where the corrections live.
+        """
+        wrench = self._wrenches[slot, : int(self._ray_counts[slot])].cpu().numpy()
+        felt = np.zeros((25, 3, 24, 6))
+        across = np.cross(np.eye(3), self._joint_positions(slot)[:, None])  # c × F = across @ F
+        turned = self._joint_transforms[slot, :, :3, :3].swapaxes(1, 2)
+        carried = np.concatenate([turned @ across, -turned], axis=2)
+        felt[:24] = self._descendants[:, None, :, None] * carried[:, :, None]
+        # the shift lives in the given body frame, the force in the corrected one
+        felt[24, :, :, :3] = -rotation_matrices(self.corrections[slot, 0])[:, None]
+        flat = felt.reshape(75, 144).astype(np.float32)
+        return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
+
+    def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
+        """Moves a pose to its new correction, or as far towards it as its cells can follow."""
+        before, places = self.corrections[slot].copy(), self._joint_positions(slot)
+        self.corrections[slot] = correction
+        self._update_bones(slot)
+        moved = float(np.linalg.norm(self._joint_positions(slot) - places, axis=1).max())
+        if moved > MAX_JOINT_STEP_M:
+            self.corrections[slot] = before + MAX_JOINT_STEP_M / moved * (correction - before)
+            self._update_bones(slot)
+
+    def _joint_positions(self, slot: int) -> Float[np.ndarray, "24 3"]:
+        """Where the joints are, body frame, metres."""
+        posed = self._joint_transforms[slot]
+        turned = np.einsum("jab,jb->ja", posed[:, :3, :3], self.rig.rest_joints)
+        return turned + posed[:, :3, 3]
+
+    def _update_bones(self, slot: int) -> None:
+        """Lets the slot's joints and bones follow its correction."""
+        rig = self.rig
+        self._joint_transforms[slot] = body_from_rest(
+            rig.rest_joints, rig.parents, self.pose(slot).joint_rotations
+        )
+        bones = (self._joint_transforms[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
+        self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)
+
+
+def _descendant_matrix(rig: Rig) -> Float[np.ndarray, "24 24"]:
+    """1 where a joint (row) moves a bone (column)."""
+    below = np.eye(24)
+    for bone in range(24):
+        joint = int(rig.parents[bone])
+        while joint >= 0:
+            below[joint, bone] = 1.0
+            joint = int(rig.parents[joint])
+    return below

@@ -1,0 +1,131 @@
+"""What the poses around a frame's say of its error: trackers wander rather than flicker.
+
+A tracker's error is much the same from one frame to the next, so where a frame's own rays leave its
+pose open, its neighbours' corrections are a better guess than none. Whether they are is found out
+from what the rays alone would make of each pose: where errors flicker, nothing is shared.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple, final
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+MIN_NEIGHBOR_PAIRS = 12
+"""Fewer neighbours do not tell whether errors hang together."""
+MAX_FRAME_GAP = 6
+"""Frames; neighbours farther apart say nothing."""
+MIN_CORRELATION, FULL_CORRELATION = 0.1, 0.3
+"""Correlation of neighbours' errors up to which they say nothing, and from which they say all."""
+NEIGHBOR_PRECISION = 8.0
+"""How much all neighbours together are then believed, in times of the given pose."""
+
+
+class PosePrior(NamedTuple):
+    """What is believed of a correction before its frame's rays are asked.
+
+    Attributes:
+        mean: The correction that is expected: radians, and metres in the last row.
+        precision: How sure that is, in times of what is believed of a frame without neighbours.
+    """
+
+    mean: Float[np.ndarray, "25 3"]
+    precision: float
+
+
+UNINFORMATIVE_PRIOR = PosePrior(np.zeros((25, 3)), 1.0)
+"""Nobody tells anything: the given pose is as likely as it ever is."""
+
+
+@final
+class TemporalPosePrior:
+    """What is known of the frames in replay as neighbours of one another."""
+
+    def __init__(self, capacity: int) -> None:
+        """Nothing yet, of so many slots."""
+        self._frames = np.zeros(capacity, dtype=np.int64)
+        self._unregularized = np.zeros((capacity, 25, 3))
+        self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
+
+    def set_frame(self, slot: int, frame: int | None) -> None:
+        """A slot takes in a frame of this number; None if it has no neighbours."""
+        self._is_sequential[slot], self._has_estimate[slot] = frame is not None, False
+        self._frames[slot] = frame or 0
+
+    def record_estimate(self, slot: int, unregularized: Float[np.ndarray, "25 3"]) -> None:
+        """What a slot's rays alone would correct, in units of its spread."""
+        self._unregularized[slot], self._has_estimate[slot] = (
+            unregularized,
+            self._is_sequential[slot],
+        )
+
+    def prior_for(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
+        """What the others say of a slot's correction."""
+        row, asked = self._is_sequential, self._has_estimate
+        if not row[slot]:
+            return UNINFORMATIVE_PRIOR
+        alike = neighbor_correlation(self._frames[asked], self._unregularized[asked])
+        return prior_from_neighbors(
+            int(self._frames[slot]), self._frames[row], corrections[row], alike
+        )
+
+
+def neighbor_correlation(
+    frames: Int64[np.ndarray, "asked"], estimates: Float[np.ndarray, "asked 25 3"]
+) -> float:
+    """How alike the errors of neighbouring frames are, in [-1, 1]; 0 if too few tell.
+
+    Args:
+        frames: Their numbers, in any order.
+        alone: The correction that each one's rays alone ask for, or that was found, in any units.
+    """
+    order = np.argsort(frames, kind="stable")
+    apart = np.diff(frames[order])
+    near = np.flatnonzero((apart > 0) & (apart <= MAX_FRAME_GAP))
+    if len(near) < MIN_NEIGHBOR_PAIRS:
+        return 0.0
+    one, other = estimates[order[near]], estimates[order[near + 1]]
+    power = 0.5 * float((one**2).sum() + (other**2).sum())
+    return float((one * other).sum()) / max(power, 1e-12)
+
+
+def prior_from_neighbors(
+    frame: int,
+    frames: Int64[np.ndarray, "others"],
+    corrections: Float[np.ndarray, "others 25 3"],
+    error_correlation: float,
+) -> PosePrior:
+    """What frames around a frame say of its correction: their mean, the nearest counting most.
+
+    Args:
+        frame: Its number.
+        frames: The others'; its own tells nothing.
+        corrections: Of the others' poses.
+        alike: Correlation of neighbouring frames' errors.
+    """
+    share = min(
+        max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0
+    )
+    apart = np.abs(frames - frame)
+    near = (apart > 0) & (apart <= MAX_FRAME_GAP)
+    if share == 0.0 or not near.any():
+        return UNINFORMATIVE_PRIOR
+    weights = 1.0 / apart[near]
+    mean = np.einsum("s,sja->ja", weights / weights.sum(), corrections[near])
+    worth = share * NEIGHBOR_PRECISION
+    return PosePrior(worth / (1.0 + worth) * mean, 1.0 + worth)
+
+
+def interpolate_correction(
+    frame: int, corrections: Mapping[int, Float[np.ndarray, "25 3"]]
+) -> Float[np.ndarray, "25 3"]:
+    """The correction of a frame that was never learnt from, by those of its neighbours.
+
+    Args:
+        frame: Its number.
+        corrections: Of frames' poses, by their numbers.
+    """
+    if not corrections:
+        return UNINFORMATIVE_PRIOR.mean
+    frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
+    return prior_from_neighbors(frame, frames, found, neighbor_correlation(frames, found)).mean

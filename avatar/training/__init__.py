@@ -1,0 +1,1 @@
+"""Training: from observations to a trained avatar."""

@@ -1,0 +1,65 @@
+"""How alike two frames are to who learns from them, and which frames of a video are needed."""
+
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from avatar.config import TrainConfig
+from avatar.deformation.rig import Rig
+from preprocess.body.body_pose import BodyPose
+from preprocess.observation import Observation
+
+JOINT_ANGLE_WEIGHT = 0.5
+"""How much a radian of a joint counts beside a radian of the view when frames are compared."""
+MIN_KEYFRAME_DISTANCE = 0.05
+"""Frames nearer to each other than this, about 3° of view, show a person from the same side."""
+INITIAL_KEYFRAMES = TrainConfig.replay_capacity
+"""So many frames are taken whatever they show, as many as stay for replay."""
+MAX_KEYFRAME_INTERVAL_S = 0.5
+"""A person who stands still is looked at this often all the same."""
+
+
+def view_descriptor(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, " 72"]:
+    """What frames are compared by: the distance between two such vectors is like an angle.
+
+    Args:
+        origin: Where the camera is in the body frame.
+        pose: Of the body.
+
+    Returns:
+        The direction from which the body is seen, and its joints' rotations.
+    """
+    facing = origin / np.linalg.norm(origin)
+    return np.concatenate([facing, pose.joint_rotations.ravel() * JOINT_ANGLE_WEIGHT])
+
+
+@final
+class KeyframeSelector:
+    """Chooses the frames of a long stream that show something new.
+
+    At 30 frames a second most look like the one before: to make each ready would cost more than
+    it teaches, and take the time from training.
+    """
+
+    def __init__(self, rig: Rig, *, initial_keyframes: int = INITIAL_KEYFRAMES) -> None:
+        """Nothing has been seen yet; the first `room` frames are all taken."""
+        self._rig, self._initial_left = rig, initial_keyframes
+        self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
+
+    def accepts(self, observation: Observation) -> bool:
+        """Whether a frame is worth learning from, after those that were taken before."""
+        world_from_body = self._rig.world_from_body(observation.pose)
+        away = observation.camera.center_world - world_from_body[:3, 3]
+        now = view_descriptor(away @ world_from_body[:3, :3], observation.pose)
+        at = observation.frame.time_s
+        if self._last is not None:
+            time_s, before = self._last
+            alike = (
+                np.linalg.norm(now - before) < MIN_KEYFRAME_DISTANCE
+                and abs(at - time_s) < MAX_KEYFRAME_INTERVAL_S
+            )
+            if alike and not self._initial_left:
+                return False
+        self._last, self._initial_left = (at, now), max(self._initial_left - 1, 0)
+        return True

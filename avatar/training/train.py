@@ -1,0 +1,286 @@
+"""Online training: improves an avatar while frames arrive, and says what happens."""
+
+import time
+from collections.abc import Iterator
+from typing import final
+
+from avatar.evaluation.held_out import (
+    FRAMES_PER_EVALUATION,
+    HeldOutFrame,
+    RedundantFrame,
+    StreamItem,
+    add_held_out,
+    coarse_to_fine_order,
+    score_frame,
+    subsample_evenly,
+)
+from avatar.events import (
+    Evaluated,
+    Finished,
+    FrameArrived,
+    HeldOutScore,
+    Stepped,
+    TrainEvent,
+    WaitingForFrame,
+    Warned,
+)
+from avatar.training.trainer import Trainer
+from avatar.training.training_step import cosine_decay
+from capture.inbox import Inbox
+from preprocess.observe import DroppedFrame
+
+READING_FIRST_AFTER_SHARE = 0.5
+"""Share of the time after which a video that is still being read comes before training."""
+MIN_STEPS_AFTER_LAST_FRAME = 20
+"""Steps on the last frame, at the least: a new frame's rays are drawn first."""
+STREAMING_RATE_FACTOR = 0.5
+"""Factor of the learning rates while a video plays: what is shown has no falling rate behind it,
+and the mean of smaller swings is closer to what lies between them."""
+EVALUATION_TIME_SHARE = 0.015
+"""Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
+EVALUATION_TIMES_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
+"""When the curve is measured, in seconds of the schedule; then every 30 s."""
+
+
+@final
+class TrainingClock:
+    """Training time, wall and CPU, on top of what earlier runs have used; pauses do not count.
+
+    The schedule (learning rates, marks, the end) follows wall time, or, where the recipe gives a
+    number of steps, the steps made: then it is the same on every machine.
+    """
+
+    def __init__(self, trainer: Trainer) -> None:
+        """Starts now."""
+        self._trainer = trainer
+        self._wall = time.perf_counter() - trainer.wall_seconds - trainer.paused_wall_seconds
+        self._cpu = time.process_time() - trainer.cpu_seconds - trainer.paused_cpu_seconds
+
+    def read(self) -> float:
+        """Seconds of the schedule; the trainer's own wall and CPU seconds are set to now."""
+        trainer = self._trainer
+        trainer.wall_seconds = time.perf_counter() - self._wall - trainer.paused_wall_seconds
+        trainer.cpu_seconds = time.process_time() - self._cpu - trainer.paused_cpu_seconds
+        return trainer.scheduled_seconds
+
+
+def train(
+    trainer: Trainer, inbox: Inbox[StreamItem], held_out: list[HeldOutFrame]
+) -> Iterator[TrainEvent]:
+    """Trains until the time is up, or the steps are made, on whatever has arrived.
+
+    The learning rate is constant while frames arrive and falls as a cosine after the last. Of a
+    recording no frame is lost: where the time is too short to read them all beside training,
+    reading comes first, and ends after the time if it must. Frames that come at times of their own
+    are never waited for, except for the first. A live source is left when the time is up. Where
+    steps are counted, each step of a recording is preceded by one more frame until all are read.
+
+    Args:
+        trainer: Goes on from where it stands.
+        inbox: Frames as they become ready.
+        held: Held-out frames; those that arrive are appended.
+
+    Yields:
+        What happens, on the caller's thread: what the caller does with an event takes training
+        time.
+    """
+    stream, marks = _FrameIntake(trainer, inbox, held_out), _EvaluationSchedule(trainer)
+    while True:
+        now = stream.clock.read()
+        yield from stream.receive(now)
+        if len(trainer.replay) == 0:
+            if stream.ended:
+                return
+            yield WaitingForFrame()
+            continue
+        now = stream.clock.read()
+        if stream.is_done(now):
+            break
+        if marks.is_due(now):
+            yield marks.score(held_out, stream.clock)
+            continue
+        if stream.is_behind(now) or stream.needs_frame():
+            continue
+        yield _train_step(trainer, stream, now)
+    yield from _finish(trainer, paced=inbox.paced)
+
+
+def _train_step(trainer: Trainer, stream: "_FrameIntake", now: float) -> Stepped:
+    falling, wall, cpu = (
+        cosine_decay(stream.progress(now)),
+        time.perf_counter(),
+        time.process_time(),
+    )
+    result = trainer.step(
+        rate=min(falling, stream.highest_rate),
+        pose_rate=falling,
+        hard_surface_share=min(1.0, 4.0 * now / trainer.config.seconds),
+    )
+    trainer.step_wall_seconds += time.perf_counter() - wall
+    trainer.step_cpu_seconds += time.process_time() - cpu
+    stream.clock.read()
+    return Stepped(
+        step=trainer.steps,
+        wall_seconds=trainer.wall_seconds,
+        loss=float(result.loss.mean()),
+        samples_per_ray=result.sample_count / trainer.config.rays,
+        frames_seen=trainer.frames_seen,
+    )
+
+
+def _finish(trainer: Trainer, *, paced: bool) -> Iterator[Warned | Finished]:
+    config = trainer.config
+    if trainer.wall_seconds > 1.1 * config.seconds and not (config.steps or paced):
+        yield Warned(
+            message=f"Reading the video took longer than the {config.seconds:g} s that were "
+            f"given: training ended after {trainer.wall_seconds:.0f} s, when every frame had been "
+            "learnt from once. Give more --seconds, or fewer --frames."
+        )
+    yield Finished(
+        wall_seconds=trainer.wall_seconds,
+        cpu_seconds=trainer.cpu_seconds,
+        steps=trainer.steps,
+        rays=trainer.rays,
+        samples=trainer.samples,
+    )
+
+
+@final
+class _FrameIntake:
+    """What arrives while training goes on, and since when nothing more does."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        inbox: Inbox[StreamItem],
+        held: list[HeldOutFrame],
+    ) -> None:
+        self._trainer, self._inbox, self._held_out = trainer, inbox, held
+        self._began = trainer.scheduled_seconds
+        self._ended_at: float | None = None
+        self._last_frame_step: int | None = None
+        self.clock = TrainingClock(trainer)
+        self._started = len(trainer.replay) > 0  # a resumed run remembers frames
+
+    @property
+    def highest_rate(self) -> float:
+        """Factor of the field's learning rates that is never exceeded."""
+        return STREAMING_RATE_FACTOR if self._inbox.paced else 1.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will arrive."""
+        return self._ended_at is not None
+
+    def receive(self, now: float) -> Iterator[FrameArrived | Warned]:
+        """Hands what has arrived to the trainer; the clock starts with the first frame."""
+        if self.ended or (
+            self._one_frame_per_step and self._last_frame_step == self._trainer.steps
+        ):
+            return
+        # without a frame, or where reading comes first, the reader has the machine for a moment
+        waits = self._one_frame_per_step or self.is_behind(now) or len(self._trainer.replay) == 0
+        most = 1 if self._one_frame_per_step else None
+        taken = self._inbox.take(timeout_s=0.1 if waits else 0.0, max_items=most)
+        for item in taken:
+            yield from self._accept(item)
+        if taken and self._one_frame_per_step:  # whether that was the last item depends on threads
+            return
+        too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
+        if self._inbox.finished or too_late:
+            self._ended_at = self.clock.read()
+
+    def _accept(self, item: StreamItem) -> Iterator[FrameArrived | Warned]:
+        if isinstance(item, DroppedFrame):
+            yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+            return
+        if isinstance(item, RedundantFrame):
+            return
+        if not self._started:
+            self.clock, self._started = TrainingClock(self._trainer), True
+        if isinstance(item, HeldOutFrame):
+            add_held_out(self._held_out, item)
+            yield FrameArrived(index=item.observation.frame.index, held_out=True)
+            return
+        self._trainer.add_frame(item)
+        self._last_frame_step = self._trainer.steps
+        yield FrameArrived(index=item.index, held_out=False)
+
+    @property
+    def _one_frame_per_step(self) -> bool:
+        """Whether frames are read in step with training, so that a run can be repeated."""
+        return bool(self._trainer.config.steps) and not self._inbox.paced
+
+    def needs_frame(self) -> bool:
+        """Whether the next step waits for one more frame, because steps are counted."""
+        return (
+            self._one_frame_per_step
+            and not self.ended
+            and self._last_frame_step != self._trainer.steps
+        )
+
+    def is_behind(self, now: float) -> bool:
+        """Whether reading must come first for a while; a video's own pace cannot be hurried."""
+        if self._one_frame_per_step:
+            return False
+        began, end = self._began, self._trainer.config.seconds
+        late = now > began + READING_FIRST_AFTER_SHARE * (end - began)
+        return late and not (self.ended or self._inbox.paced)
+
+    def is_done(self, now: float) -> bool:
+        """Whether the schedule is over and every frame has been learnt from."""
+        config, admitted_at = self._trainer.config, self._last_frame_step
+        if not (self.ended and now >= config.seconds):
+            return False
+        farewell = 0 if config.steps or admitted_at is None else MIN_STEPS_AFTER_LAST_FRAME
+        return self._trainer.steps >= (admitted_at or 0) + farewell
+
+    def progress(self, now: float) -> float:
+        """How much of the time after the last frame has gone by, in [0, 1]; 0 before it."""
+        if self._ended_at is None:
+            return 0.0
+        tail = self._trainer.config.seconds - self._ended_at
+        return (now - self._ended_at) / max(tail, 1e-6)
+
+
+@final
+class _EvaluationSchedule:
+    """When the curve is measured, and how long that may take."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+        self._times = _evaluation_times(after=trainer.scheduled_seconds)
+        self._next = next(self._times)
+
+    def is_due(self, now: float) -> bool:
+        """Whether a mark has been reached."""
+        return now >= self._next
+
+    def score(self, held_out: list[HeldOutFrame], clock: TrainingClock) -> Evaluated:
+        """Scores held-out frames, evenly over the stream, until the time for it is spent."""
+        trainer, scores = self._trainer, list[HeldOutScore]()
+        at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
+        enough = clock.read() + EVALUATION_TIME_SHARE * trainer.config.seconds
+        for frame in coarse_to_fine_order(subsample_evenly(held_out, FRAMES_PER_EVALUATION)):
+            if scores and clock.read() > enough:
+                break
+            scores.append(score_frame(trainer.avatar, frame))
+        now = clock.read()
+        self._next = next(time for time in self._times if time > now)
+        return Evaluated(
+            wall_seconds=at,
+            cpu_seconds=cpu_at,
+            frames_seen=trainer.frames_seen,
+            scores=tuple(scores),
+        )
+
+
+def _evaluation_times(*, after: float) -> Iterator[float]:
+    for mark in EVALUATION_TIMES_S:
+        if mark > after:
+            yield mark
+    mark = EVALUATION_TIMES_S[-1] + 30.0
+    while True:
+        if mark > after:
+            yield mark
+        mark += 30.0

@@ -1,0 +1,232 @@
+"""The trainer: everything that training changes, and one step of it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from avatar.backends import backend_for
+from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.deformation.rig import Rig
+from avatar.field.avatar_model import Avatar
+from avatar.field.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
+from avatar.field.radiance_field import RadianceField
+from avatar.kernels.backend_protocol import Backend
+from avatar.kernels.hash_levels import HashLevels
+from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.training.optimizer import UncompiledAdam, update_ema
+from avatar.training.replay_buffer import ReplayBuffer
+from avatar.training.training_frame import TrainingFrame
+from avatar.training.training_step import StepResult, compute_gradients
+from baselines.instant_avatar.samplers import sampler_for
+
+NETWORK_RATE_FACTOR = 0.3
+"""The network's learning rate as a share of the table's."""
+INITIAL_OCCUPANCY_STEPS = 300
+"""Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
+CORRECTIONS_PER_STEP = 2
+
+
+@final
+class Trainer:
+    """Everything that training changes, and one step of it.
+
+    Attributes:
+        avatar: As it stands and is shown; its field is the running mean of `field`.
+        field: What steps change.
+        config: The recipe.
+        sampler: Where samples lie along rays.
+        replay: The frames it learns from.
+        poses: Their poses, corrected if the recipe says so.
+        corrections: How each frame's pose was corrected, by the frame's number in its source; a
+            frame that comes again starts from there. Clear it before another source is read. At
+            most twice as many are kept as frames in replay.
+        steps, rays, samples: How much has been done.
+        wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
+        frames_seen: Frames taken in so far, whether or not they are still kept.
+        stepping_wall, stepping_cpu: Seconds inside steps of this process, by the wall clock and of
+            CPU time.
+        paused_wall_seconds, paused_cpu_seconds: Seconds for which somebody held training up (`paused`).
+    """
+
+    def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
+        """A trainer that has seen nothing."""
+        self.config = config
+        self.backend: Backend = backend_for(device)
+        levels = HashLevels.spanning(
+            rig.box_low, rig.box_high, coarsest_m=COARSEST_M, finest_m=config.finest_m,
+            levels=config.levels, table_size=config.table_size,
+        )  # fmt: skip
+        start = torch.Generator().manual_seed(config.seed)
+        self.field = RadianceField(levels, self.backend, device, start)
+        learner = Avatar(
+            rig=rig,
+            field=self.field,
+            occupancy=OccupancyGrid(rig, device),
+            sample_step_m=config.sample_step_m,
+        )
+        self.sampler = sampler_for(config, learner)
+        self.avatar = replace(learner, field=self.field.clone())
+        self.replay = ReplayBuffer(config.replay_capacity, device)
+        self.poses = PoseOptimizer(rig, config.replay_capacity, device)
+        self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
+        self.steps = self.rays = self.samples = self.frames_seen = 0
+        self.wall_seconds = self.cpu_seconds = 0.0
+        self.step_wall_seconds = self.step_cpu_seconds = 0.0
+        self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
+        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        rate = config.learning_rate
+        self.optimizer = UncompiledAdam(
+            [
+                {"params": [self.field.table], "lr": rate, "eps": 1e-15},
+                {"params": self.field.layers, "lr": rate * NETWORK_RATE_FACTOR},
+            ],
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+
+    @property
+    def scheduled_seconds(self) -> float:
+        """Position in the schedule: wall seconds, or steps at their nominal rate."""
+        if self.config.steps:
+            return self.steps / NOMINAL_STEPS_PER_S
+        return self.wall_seconds
+
+    def add_frame(self, frame: TrainingFrame, *, is_restored: bool = False) -> None:
+        """Takes in a frame to learn from.
+
+        Args:
+            frame: Made ready.
+            again: It was learnt from before a checkpoint, and counts no second time.
+        """
+        slot = self.replay.add(frame)
+        known = self.pose_corrections.get(frame.index)
+        step = 0 if is_restored else self.steps
+        self.poses.set_pose(slot, frame.pose, correction=known, frame=frame.index, step=step)
+        if known is not None:
+            resolve_correspondences(self.avatar.rig, self.replay, self.poses, slot)
+        self.sampler.add_frame(slot, self.replay.correspondences, self.poses.bones[slot])
+        self.frames_seen += not is_restored
+        if not is_restored:
+            self._discard_old_corrections()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Time that passes in this block does not count as training."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            self.paused_wall_seconds += time.perf_counter() - wall
+            self.paused_cpu_seconds += time.process_time() - cpu
+
+    def step(
+        self, *, rate: float, hard_surface_share: float, pose_rate: float | None = None
+    ) -> StepResult:
+        """Draws rays, follows their gradient once, and keeps the occupancy up to date.
+
+        Args:
+            rate: Factor of the learning rates, in (0, 1].
+            hard_surface_share: Share of the hard-surface loss's weight, in [0, 1].
+            pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None. As it falls,
+                surfaces become firm.
+        """
+        config, field = self.config, self.field
+        falling = rate if pose_rate is None else pose_rate
+        batch = self.replay.sample_rays(config.rays, self._generator)
+        remembers = self.steps % config.occupancy_interval < 2
+        refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
+        refines = refines and self.poses.freeze_converged(self.steps)
+        result = compute_gradients(
+            field, self.sampler, self.replay.correspondences, batch, config,
+            hard_surface_share=hard_surface_share,
+            surface_share=1.0 - falling,
+            density_cache=self.avatar.occupancy.density_grid if remembers else None,
+            poses=self.poses if refines else None,
+            generator=self._generator,
+        )  # fmt: skip
+        for group, base in zip(
+            self.optimizer.param_groups, (1.0, NETWORK_RATE_FACTOR), strict=True
+        ):
+            group["lr"] = config.learning_rate * base * rate
+        self.optimizer.step()
+        field.table_grad.zero_()
+        if refines:
+            self._correct_poses(falling)
+        self.replay.update_errors(batch.rays.slots.long(), result.loss)
+        if self.steps % config.occupancy_interval == 0:
+            self._update_occupancy(1.0 - falling)
+        self.sampler.update(self.steps, self.replay.correspondences, self._generator)
+        self.steps += 1
+        update_ema(self.avatar.field, field, self.steps)
+        self.rays += config.rays
+        self.samples += result.sample_count
+        return result
+
+    def _discard_old_corrections(self) -> None:
+        """Of frames that are long gone from replay, so that memory stays bounded."""
+        if len(self.pose_corrections) > 2 * self.replay.capacity:
+            kept = set(self.replay.frame_indices)
+            self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
+
+    def _correct_poses(self, rate: float) -> None:
+        for _ in range(CORRECTIONS_PER_STEP):
+            slot = correct_one_pose(
+                self.avatar.rig, self.backend, self.replay, self.poses, rate=rate
+            )
+            if slot is not None:
+                correction = self.poses.corrections[slot].copy()
+                self.pose_corrections[self.replay.frame_indices[slot]] = correction
+
+    def _update_occupancy(self, surface_share: float) -> None:
+        clearing = self.steps < INITIAL_OCCUPANCY_STEPS
+        self.avatar.occupancy.update(
+            lambda points: self.field.raw_outputs_at(points)[:, 3],
+            share=0.5 if clearing else 0.25,
+            decay=INITIAL_OCCUPANCY_DECAY if clearing else OCCUPANCY_DECAY,
+            min_density=self.config.min_occupied_density * surface_share,
+            drop_floaters=not clearing,
+            sample_step_m=self.config.sample_step_m,
+            generator=self._generator,
+        )
+
+
+def resolve_correspondences(
+    rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, slot: int
+) -> None:
+    """Solves a frame's warp cells again and moves its rays to its corrected pose."""
+    joints = poses.pose(slot).joint_rotations
+    replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints, device=replay.device))
+    replay.correct_root(slot, poses.root_correction(slot))
+
+
+def correct_one_pose(
+    rig: Rig, backend: Backend, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
+) -> int | None:
+    """Corrects one pose; its frame's warp and rays follow.
+
+    Args:
+        rig: Whose body.
+        backend: Moves the warp cells.
+        replay: Holds the frames.
+        poses: Holds their poses, slot by slot.
+        rate: Factor of the step, in (0, 1].
+
+    Returns:
+        The slot whose pose moved, or None if too little is known about any.
+    """
+    slot = poses.correct_next(rate=rate)
+    if slot is None:
+        return None
+    if poses.needs_resolve(slot):
+        resolve_correspondences(rig, replay, poses, slot)
+    else:
+        backend.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
+        replay.correct_root(slot, poses.root_correction(slot))
+    return slot

@@ -1,0 +1,70 @@
+"""Compiling before the clock runs: a throw-away step on a throw-away frame."""
+
+import dataclasses
+import time
+
+import numpy as np
+from jaxtyping import UInt8
+
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.deformation.rig import Rig
+from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
+from avatar.render import render
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import BodyFrameRays, TrainingFrame
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose
+
+WARMUP_IMAGE_PX = 16
+
+
+def warm_up(trainer: Trainer) -> float:
+    """Compiles, or loads from disk, every kernel that training and rendering use.
+
+    Must run on the thread that will train. The trainer itself is not touched.
+
+    Returns:
+        How many seconds it took: tens on a machine's first run, about one later.
+    """
+    began = time.perf_counter()
+    rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
+    config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
+    stand_in = Trainer(rig, config, device)
+    camera = _front_camera(rig)
+    stand_in.add_frame(_dummy_frame(rig, camera))
+    stand_in.steps = FIRST_CORRECTION_STEPS
+    for _ in range(config.occupancy_interval):
+        stand_in.step(rate=1.0, hard_surface_share=1.0)
+    poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
+    stand_in.backend.update_roots(
+        stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0]
+    )
+    render(stand_in.avatar, BodyPose.rest(), camera)
+    return time.perf_counter() - began
+
+
+def _front_camera(rig: Rig) -> Camera:
+    camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (rig.rest_joints[0] + [0.0, 0.0, 3.0])
+    return Camera(
+        focal_px=(WARMUP_IMAGE_PX * 1.5, WARMUP_IMAGE_PX * 1.5),
+        center_px=(WARMUP_IMAGE_PX / 2, WARMUP_IMAGE_PX / 2),
+        size_px=(WARMUP_IMAGE_PX, WARMUP_IMAGE_PX),
+        camera_from_world=camera_from_world,
+    )
+
+
+def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:
+    pose = BodyPose.rest()
+    pixels = camera.pixel_centers().reshape(-1, 2)
+    rays = BodyFrameRays.through(pixels, camera, rig.world_from_body(pose))
+    colors: UInt8[np.ndarray, "pixels 4"] = np.full((len(pixels), 4), 255, dtype=np.uint8)
+    return TrainingFrame(
+        index=0,
+        pose=pose,
+        correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
+        origin=rays.origin,
+        directions=rays.directions,
+        colors=colors,
+        near_count=len(pixels),
+    )

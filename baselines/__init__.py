@@ -1,0 +1,1 @@
+"""Baselines: other methods, trained and scored beside ours; never imported by production code."""

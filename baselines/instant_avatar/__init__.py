@@ -1,0 +1,1 @@
+"""InstantAvatar's own skipping and root finding (Jiang et al. 2023)."""

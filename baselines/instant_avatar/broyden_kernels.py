@@ -1,0 +1,91 @@
+"""What it means to find all canonical roots of a sample, as Fast-SNARF does, in plain torch.
+
+All canonical roots of samples by Broyden's method, as in Fast-SNARF, compiled for the CPU.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int32
+from numba import prange
+from torch import Tensor
+
+from avatar.kernels.torch_skinning import broyden_roots
+from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.numba_kernels.numba_broyden import solve_root
+from avatar.numba_kernels.numba_skinning import MATRIX_LANES, transform_point
+
+START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
+"""Fast-SNARF's: a search starts where each of these bones alone would carry the sample."""
+SAME_ROOT_M = 1e-3
+"""Roots closer than this are one."""
+
+
+def find_all_roots(
+    points: Float[Tensor, "points 3"],
+    slots: Int32[Tensor, "points"],
+    blended: Float[Tensor, "slots x y z 12"],
+    low: Float[Tensor, "3"],
+    nodes_per_m: Float[Tensor, "3"],
+    inverses: Float[Tensor, "slots starts 12"],
+) -> tuple[Float[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+    """Every canonical point that skinning carries to a sample, by Broyden's method (§3.2).
+
+    Args:
+        points: Samples, each in the body frame of its slot.
+        slots: Which pose each belongs to.
+        blended: Σ w_j B_j on the nodes of the canonical box, for each slot.
+        low, nodes_per_m: Where those nodes are.
+        inverses: From body to canonical frame, of the bones that searches start with.
+
+    Returns:
+        Where each search ended, and whether that is a root which no earlier search had found.
+    """
+    starts = inverses.shape[1]
+    roots = points.new_zeros(len(points), starts, 3)
+    valid = torch.zeros(len(points), starts, dtype=torch.bool, device=points.device)
+    # a volume of blended transforms is one of twelve weights, whose bones are unit vectors
+    unit = torch.eye(12).to(points)
+    for slot in slots.unique().tolist():
+        here = (slots == slot).nonzero()[:, 0]
+        matrix = inverses[slot].unflatten(1, (3, 4))
+        target = points[here, None].expand(len(here), starts, 3)
+        start = (matrix[:, :, :3] @ target[..., None])[..., 0] + matrix[:, :, 3]
+        found, rests = broyden_roots(
+            target.flatten(0, 1), start.flatten(0, 1), blended[slot], low, nodes_per_m, unit
+        )
+        roots[here] = found.unflatten(0, (len(here), starts))
+        valid[here] = rests.unflatten(0, (len(here), starts))
+    for search in range(1, starts):
+        near = (roots[:, :search] - roots[:, search, None]).norm(dim=-1) < SAME_ROOT_M
+        valid[:, search] &= ~(near & valid[:, :search]).any(dim=1)
+    return roots, valid
+
+
+F32 = np.float32
+SAMPLES_PER_CHUNK = 256
+"""Samples that share a thread's buffers."""
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def find_all_roots_numba(points, slots, blended, low, nodes_per_m, inverses, roots, valid):
+    """Where each search of each sample ends, and whether no earlier one had found that root."""
+    count = points.shape[0]
+    for chunk in prange((count + SAMPLES_PER_CHUNK - 1) // SAMPLES_PER_CHUNK):
+        blend, inverse = np.empty(MATRIX_LANES, np.float32), np.empty(9, np.float32)
+        x = np.empty(3, np.float32)
+        for i in range(chunk * SAMPLES_PER_CHUNK, min((chunk + 1) * SAMPLES_PER_CHUNK, count)):
+            slot = slots[i]
+            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+            for start in range(inverses.shape[1]):
+                x[0], x[1], x[2] = transform_point(inverses[slot, start], px, py, pz)
+                found = solve_root(
+                    blended[slot], low, nodes_per_m, points[i], x, blend, inverse, True
+                )
+                roots[i, start, 0], roots[i, start, 1], roots[i, start, 2] = x[0], x[1], x[2]
+                for other in range(start):
+                    dx = roots[i, other, 0] - x[0]
+                    dy = roots[i, other, 1] - x[1]
+                    dz = roots[i, other, 2] - x[2]
+                    if valid[i, other] and dx * dx + dy * dy + dz * dz < F32(SAME_ROOT_M**2):
+                        found = False
+                valid[i, start] = found

@@ -1,0 +1,140 @@
+"""What it means to place samples through a grid of the body frame, in plain torch.
+
+Samples along rays in the occupied cells of a body frame's grid, compiled for the CPU.
+
+The lattice is walked twice: once to count, once to write, for nobody knows before how many
+samples a ray will have.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int32, Integer
+from numba import prange
+from torch import Tensor
+
+from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.numba_kernels.numba_rendering import nonzero
+
+
+def sample_occupied_cells(
+    origins: Float32[Tensor, "rays 3"],
+    directions: Float32[Tensor, "rays 3"],
+    slots: Int32[Tensor, "rays"],
+    jitter: Float32[Tensor, "rays"],
+    step_m: float,
+    occupied: Integer[Tensor, "slots cells"] | Bool[Tensor, "slots cells"],
+    low: Float32[Tensor, "slots 3"],
+    cells_per_m: Float32[Tensor, "slots 3"],
+    shape: Int32[Tensor, "slots 3"],
+    near: Float32[Tensor, "slots 3"],
+    far: Float32[Tensor, "slots 3"],
+) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+    """Samples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
+
+    A ray enters the box between `near` and `far`, and ends where it leaves it. Beyond the grid its
+    outermost cells count.
+
+    Returns:
+        Points of the body frame, ray by ray, and how many each ray has.
+    """
+    slot = slots.long()
+    towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
+    walls = (near[slot] - origins) / towards, (far[slot] - origins) / towards
+    enter = torch.minimum(*walls).amax(dim=1).clamp(min=0.0)
+    leave = torch.maximum(*walls).amin(dim=1)
+    longest = float((leave - enter).max()) if len(slot) else 0.0
+    steps = math.ceil(max(longest, 0.0) / step_m) + 1
+    t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * step_m
+    points = origins[:, None] + t[..., None] * directions[:, None]
+    cell = ((points - low[slot][:, None]) * cells_per_m[slot][:, None]).long().clamp(min=0)
+    cell = torch.minimum(cell, shape[slot][:, None].long() - 1)
+    sides = shape[slot].long()
+    flat = (cell[..., 0] * sides[:, None, 1] + cell[..., 1]) * sides[:, None, 2] + cell[..., 2]
+    kept = (t < leave[:, None]) & (occupied[slot[:, None], flat] > 0)
+    return points[kept], kept.sum(dim=1).int()
+
+
+F32, I32 = np.float32, np.int32
+
+
+@compile_kernel(**FAST_MATH)
+def _march_ray_numba(
+    origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, near, far, points, first
+):
+    """Samples of one ray; they are written from row `first` on, unless it is negative."""
+    enter, leave = F32(0), F32(1e9)
+    for axis in range(3):
+        direction = nonzero(towards[axis])
+        one, other = (near[axis] - origin[axis]) / direction, (far[axis] - origin[axis]) / direction
+        enter = max(enter, min(one, other))
+        leave = min(leave, max(one, other))
+    kept, step = 0, 0
+    while True:
+        t = enter + (F32(step) + jitter) * step_m
+        if t >= leave:
+            return kept
+        x = origin[0] + t * towards[0]
+        y = origin[1] + t * towards[1]
+        z = origin[2] + t * towards[2]
+        i = min(max(I32((x - low[0]) * cells_per_m[0]), I32(0)), shape[0] - I32(1))
+        j = min(max(I32((y - low[1]) * cells_per_m[1]), I32(0)), shape[1] - I32(1))
+        k = min(max(I32((z - low[2]) * cells_per_m[2]), I32(0)), shape[2] - I32(1))
+        if occupied[(i * shape[1] + j) * shape[2] + k] > 0:
+            if first >= 0:
+                points[first + kept, 0] = x
+                points[first + kept, 1] = y
+                points[first + kept, 2] = z
+            kept += 1
+        step += 1
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def count_samples_numba(
+    origins,
+    directions,
+    slots,
+    jitter,
+    step_m,
+    occupied,
+    low,
+    cells_per_m,
+    shape,
+    near,
+    far,
+    nowhere,
+    counts,
+):
+    """How many samples each ray has."""
+    for ray in prange(origins.shape[0]):
+        slot = slots[ray]
+        counts[ray] = _march_ray_numba(
+            origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
+            cells_per_m[slot], shape[slot], near[slot], far[slot], nowhere, -1,
+        )  # fmt: skip
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def write_samples_numba(
+    origins,
+    directions,
+    slots,
+    jitter,
+    step_m,
+    occupied,
+    low,
+    cells_per_m,
+    shape,
+    near,
+    far,
+    points,
+    first,
+):
+    """Writes each ray's samples, from its own row on."""
+    for ray in prange(origins.shape[0]):
+        slot = slots[ray]
+        _march_ray_numba(
+            origins[ray], directions[ray], jitter[ray], step_m, occupied[slot], low[slot],
+            cells_per_m[slot], shape[slot], near[slot], far[slot], points, first[ray],
+        )  # fmt: skip

@@ -1,0 +1,189 @@
+"""What skipping empty space is worth, for a training step and for a picture.
+
+On: as the trainer and the renderer do it. Off, as the paper has it: a metre before to a metre
+behind the body, on every ray, our step and our field, every sample warped and asked. Off, as a
+harder measure: only what lies between the walls of the posed person's box. No ray ends early in
+either (`benchmarks.dense_sampling`).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from avatar.evaluation.held_out import HeldOutFrame, composite_on_white
+from avatar.evaluation.image_metrics import psnr
+from avatar.kernels.backend_protocol import RayBatch
+from avatar.render import correspondence_tables, render
+from avatar.training.replay_buffer import ReplayBuffer
+from avatar.training.training_frame import BodyFrameRays, TrainingFrame
+from avatar.training.training_step import cosine_decay
+from benchmarks.dense_sampling import DenseSampler, dense_as_in_paper, dense_in_box
+from benchmarks.measurements import Measurement
+from benchmarks.sample_training import LoadedTrainer
+from benchmarks.stopwatch import time_interleaved
+
+RAYS_AT_ONCE = 1 << 14
+NEGLIGIBLE_RATE = 1e-6
+"""Learning rates' factor: the avatar hardly changes while it is timed."""
+PAPER_FRAMES = 12
+"""Frames that the paper's scheme draws its rays from: their cells, continued, take much room."""
+PAPER = "off as in the paper: ±1 m about the body on every ray"
+BOX = "off: between the walls of the person's box only"
+
+
+def skipping_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+    """All ratios."""
+    held = seen.held_out[len(seen.held_out) // 2].with_correspondences(seen.trainer.avatar.rig)
+    return [*_training(seen, device), *_rendering(seen, held, device)]
+
+
+def _training(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+    trainer, every = seen.trainer, seen.trainer.config.occupancy_interval
+    rays, counts = trainer.config.rays, {"paper": [], "box": []}
+    grid = trainer.avatar.occupancy.density_grid
+    box = dense_in_box(trainer.replay.correspondences, grid.low + 0.5 / grid.cells_per_m)
+    some = seen.frames[:: max(1, len(seen.frames) // PAPER_FRAMES)]
+    paper, store = dense_as_in_paper(some, trainer.avatar.rig.rest_joints[0], device)
+    boxed, papers = dense_step(seen, box, trainer.replay), dense_step(seen, paper, store)
+
+    def skipping() -> None:
+        for _ in range(every):  # the occupancy's update is one of them
+            trainer.step(rate=NEGLIGIBLE_RATE * cosine_decay(0.0), hard_surface_share=1.0)
+
+    before = trainer.samples
+    times = time_interleaved(
+        {
+            "on": skipping,
+            "box": lambda: counts["box"].append(boxed()),
+            "paper": lambda: counts["paper"].append(papers()),
+        },
+        device,
+    )
+    on = times["on"] / every
+    asked = (trainer.samples - before) / (6 * every * rays)
+
+    def beside(off: str) -> str:
+        return (
+            f"on {1000 * on:.1f} ms ({asked:.1f} samples/ray), off {1000 * times[off]:.0f} ms "
+            f"({counts[off][-1] / rays:.0f} samples/ray); drawing, Adam and occupancy included"
+        )
+
+    return [
+        Measurement(
+            name=f"empty-space skipping, whole training step, times; {PAPER}",
+            value=times["paper"] / on, required="3", stretch_goal="10",
+            context=f"paper 1.77; {beside('paper')}; warp by look-up, without Broyden's search",
+        ),
+        Measurement(
+            name=f"the same; {BOX}", value=times["box"] / on, required="printed",
+            context=beside("box"),
+        ),
+    ]  # fmt: skip
+
+
+def dense_step(
+    seen: LoadedTrainer, unskipped: DenseSampler, replay: ReplayBuffer
+) -> Callable[[], int]:
+    """A training step without skipping; it returns how many samples it had."""
+    trainer, config, field = seen.trainer, seen.trainer.config, seen.trainer.avatar.field
+    grid = trainer.avatar.occupancy.density_grid
+    chance = torch.Generator(device=replay.device).manual_seed(0)
+
+    def step() -> int:
+        batch = replay.sample_rays(config.rays, chance)
+        samples = unskipped.samples(field.backend, batch.rays, grid, config.sample_step_m)
+        activations = field.forward(samples.points)
+        unskipped.clear_substitutes(activations.raw, samples.root_rows)
+        background = torch.rand(config.rays, 3, generator=chance, device=chance.device)
+        _, _, grad = field.backend.composite_loss(
+            activations.raw, samples, config.sample_step_m, batch.target, background,
+            config.alpha_weight, config.hard_surface_weight,
+        )  # fmt: skip
+        field.backward(activations, grad)
+        trainer.optimizer.step()
+        field.table_grad.zero_()
+        return len(samples.points)
+
+    return step
+
+
+def _rendering(seen: LoadedTrainer, held: HeldOutFrame, device: torch.device) -> list[Measurement]:
+    avatar, observation = seen.trainer.avatar, held.observation
+    pose, camera = observation.pose, observation.camera
+    grid, pictures = avatar.occupancy.density_grid, dict[str, np.ndarray]()
+    box = dense_in_box(
+        correspondence_tables(held.correspondences, device), grid.low + 0.5 / grid.cells_per_m
+    )
+    paper, _ = dense_as_in_paper([whole_frame(seen, held)], avatar.rig.rest_joints[0], device)
+
+    def skipping() -> None:
+        pictures["on"] = render(avatar, pose, camera, cells=held.correspondences)
+
+    def without(unskipped: DenseSampler, name: str) -> None:
+        pictures[name] = dense_picture(seen, held, unskipped)
+
+    times = time_interleaved(
+        {
+            "on": skipping,
+            "box": lambda: without(box, "box"),
+            "paper": lambda: without(paper, "paper"),
+        },
+        device, rounds=5, fewer_rounds={"box": 3, "paper": 2},
+    )  # fmt: skip
+    width, height = camera.size_px
+
+    def beside(off: str) -> str:
+        alike = psnr(composite_on_white(pictures["on"]), composite_on_white(pictures[off]))
+        return (
+            f"on {1000 * times['on']:.0f} ms, off {1000 * times[off]:,.0f} ms; both pictures agree "
+            f"to {alike:.1f} dB PSNR"
+        )
+
+    return [
+        Measurement(
+            name=f"empty-space skipping, whole {width}x{height} picture, times; {PAPER}",
+            value=times["paper"] / times["on"], required="15", stretch_goal="40",
+            context=f"paper 15; {beside('paper')}; warp by look-up, without Broyden's search",
+        ),
+        Measurement(
+            name=f"the same; {BOX}", value=times["box"] / times["on"], required="printed",
+            context=beside("box"),
+        ),
+    ]  # fmt: skip
+
+
+def whole_frame(seen: LoadedTrainer, held: HeldOutFrame) -> TrainingFrame:
+    """A held-out frame with every pixel of its picture."""
+    observation, rig = held.observation, seen.trainer.avatar.rig
+    pixels = observation.camera.pixel_centers().reshape(-1, 2)
+    rays = BodyFrameRays.through(pixels, observation.camera, rig.world_from_body(observation.pose))
+    return TrainingFrame(
+        index=observation.frame.index, pose=observation.pose, correspondences=held.correspondences,
+        origin=rays.origin, directions=rays.directions,
+        colors=np.zeros((len(pixels), 4), dtype=np.uint8), near_count=len(pixels),
+    )  # fmt: skip
+
+
+def dense_picture(
+    seen: LoadedTrainer, held: HeldOutFrame, unskipped: DenseSampler
+) -> Float32[np.ndarray, "height width 4"]:
+    """Premultiplied RGBA of a held-out frame without skipping."""
+    avatar, frame = seen.trainer.avatar, whole_frame(seen, held)
+    field, grid = avatar.field, avatar.occupancy.density_grid
+    origin = torch.from_numpy(frame.origin).to(grid.low)
+    parts = []
+    for chunk in torch.from_numpy(frame.directions).to(grid.low).split(RAYS_AT_ONCE):
+        count = len(chunk)
+        rays = RayBatch(
+            origin.expand(count, 3).contiguous(),
+            chunk,
+            torch.zeros(count, dtype=torch.int32, device=grid.low.device),
+            torch.full((count,), 0.5, device=grid.low.device),
+        )
+        samples = unskipped.samples(field.backend, rays, grid, avatar.sample_step_m)
+        raw = unskipped.clear_substitutes(field.raw_outputs_at(samples.points), samples.root_rows)
+        parts.append(field.backend.composite(raw, samples, avatar.sample_step_m))
+    width, height = held.observation.camera.size_px
+    return torch.cat(parts).reshape(height, width, 4).cpu().numpy()

@@ -1,0 +1,112 @@
+"""A clip played again and again: what a long video costs in memory.
+
+python -m benchmarks.long_video CAPTURE RUN     (the process that is measured)
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from apps.cli.console import Console
+from apps.run.run_folder import RunFolder
+from avatar.training.warmup import warm_up
+from benchmarks.hardware import ROOT
+from benchmarks.measurements import Measurement
+from benchmarks.sample_training import open_sample
+from capture.source_opening import open_source
+from preprocess.body.body_pose import Motion
+from preprocess.poses.pose_file import read_motion, write_motion
+
+LOOPS = 5
+FIRST, LAST = 300, 3000
+SECONDS = 60.0
+MIB = 1 << 20
+
+
+def write_looped_capture(capture: Path, out: Path) -> Path:
+    """A capture folder that holds another's frames several times over."""
+    if out.exists():
+        return out
+    part = out.with_name(out.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    (part / "masks").mkdir(parents=True)
+    source = open_source(capture)
+    frames = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR) for frame in source.frames()]
+    code = cv2.VideoWriter.fourcc(*"FFV1")
+    video = cv2.VideoWriter(str(part / "video.mkv"), code, 30.0, source.size_px)
+    masks = sorted((capture / "masks").iterdir())
+    for number in range(LOOPS * len(frames)):
+        video.write(frames[number % len(frames)])
+        (part / "masks" / f"{number:06d}.png").hardlink_to(masks[number % len(frames)])
+    video.release()
+    shutil.copy(capture / "cameras.npz", part)
+    motion = read_motion(capture / "poses.npz")
+    rows = np.tile(np.arange(len(motion)), LOOPS)
+    repeated: dict[str, Any] = {
+        item.name: getattr(motion, item.name)[rows]
+        for item in fields(Motion)
+        if item.name in ("root_rotations", "root_translations", "joint_rotations", "valid")
+    }
+    write_motion(part / "poses.npz", replace(motion, frames=None, times_s=None, **repeated))
+    part.rename(out)
+    return out
+
+
+def measure_memory_growth(capture: Path, looped: Path) -> Iterator[Measurement]:
+    """Memory of a process that learns from the looped clip."""
+    long = write_looped_capture(capture, looped)
+    command = [sys.executable, "-m", "benchmarks.long_video", str(long), str(long / "run")]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+    first, last, read = (float(word) for word in done.stdout.split()[-3:])
+    yield Measurement(
+        name=f"memory growth from frame {FIRST} to frame {LAST:,}, MiB",
+        value=(last - first) / MIB,
+        required="≤ 100",
+        stretch_goal="≤ 20",
+        context=f"resident: {first / MIB:.0f} MiB at the first, {last / MIB:.0f} at the last; "
+        f"{read:.0f} frames read as fast as the trainer takes them",
+    )
+
+
+def resident_bytes() -> int:
+    """Bytes of this process that are in memory now (Linux)."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def main() -> None:
+    """Learns, and prints what was resident at two frames, and how many were read."""
+    import torch
+
+    from apps.run.training_session import TrainingSession, new_trainer
+
+    capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
+    recording, device = open_sample(capture), torch.device("cpu")
+    trainer = new_trainer(recording, seconds=SECONDS, seed=0, refine_poses=True, device=device)
+    warm_up(trainer)
+    at: dict[int, int] = {}
+    add = trainer.add_frame
+
+    def counted(*arguments: Any, **more: Any) -> None:
+        add(*arguments, **more)
+        at[lesson.meter.frames_read] = resident_bytes()
+
+    trainer.add_frame = counted
+    lesson = TrainingSession(trainer, recording, run, Console(), threading.Event(), {})
+    lesson.train()
+    shutil.rmtree(run.path, ignore_errors=True)
+    early = min((count for count in at if count >= FIRST), default=max(at))
+    print(at[early], at[max(at)], lesson.meter.frames_read)
+
+
+if __name__ == "__main__":
+    main()

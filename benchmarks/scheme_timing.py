@@ -1,0 +1,63 @@
+"""One avatar drawn by each scheme of skipping and warping: what a picture costs, and how good."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar.config import RootScheme, SkippingScheme
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.evaluation.held_out import HeldOutFrame, score_rendering
+from avatar.field.avatar_model import Avatar
+from avatar.render import render
+from baselines.instant_avatar.samplers import render_sampler
+from benchmarks.paired_training import VariantQuality
+
+
+@dataclass(frozen=True, kw_only=True)
+class SchemeTiming:
+    """What pictures by one scheme cost, and how good they are.
+
+    Attributes:
+        name: Of the scheme.
+        setup_ms: Core milliseconds a new pose takes: warp cells or blended transforms, and the
+            pose's grid if there is one. Median.
+        render_ms: Core milliseconds of the picture itself. Median.
+        quality: Of the pictures.
+    """
+
+    name: str
+    setup_ms: float
+    render_ms: float
+    quality: VariantQuality
+
+
+def time_scheme(
+    name: str,
+    avatar: Avatar,
+    pictures: Sequence[HeldOutFrame],
+    *,
+    skipping: SkippingScheme,
+    roots: RootScheme,
+) -> SchemeTiming:
+    """Draws every picture; the first is drawn once before, so that kernels are compiled."""
+    ready, draw, scores = [], [], []
+    for picture in [pictures[0], *pictures]:
+        seen = picture.observation
+        began = time.process_time()
+        cells = CorrespondenceGrid.solve(avatar.rig, seen.pose.joint_rotations)
+        if roots == "broyden":  # of the cells only their box is used, which costs nothing
+            began = time.process_time()
+        along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots=roots)
+        prepared = time.process_time()
+        image = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
+        ready.append(1000.0 * (prepared - began))
+        draw.append(1000.0 * (time.process_time() - prepared))
+        scores.append(score_rendering(image, picture))
+    return SchemeTiming(
+        name=name,
+        setup_ms=float(np.median(ready[1:])),
+        render_ms=float(np.median(draw[1:])),
+        quality=VariantQuality.of(scores[1:]),
+    )

@@ -1,0 +1,146 @@
+"""One step and the encoding alone: ours, plain torch, and the paper's algorithm."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.field.field_priors import sample_tv_pairs
+from avatar.kernels import torch_reference
+from avatar.kernels.backend_protocol import MarchSettings
+from avatar.kernels.torch_backend import TorchBackend
+from avatar.training.replay_buffer import ReplayBuffer, TrainingBatch
+from avatar.training.training_step import compute_gradients
+from baselines.instant_avatar.autograd_steps import (
+    AutogradField,
+    PaperStepInputs,
+    autograd_step,
+    paper_step,
+)
+from benchmarks.measurements import Measurement
+from benchmarks.sample_training import LoadedTrainer
+from benchmarks.stopwatch import time_interleaved
+
+POINTS = 65_536
+
+
+def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+    """The step on 1,024 rays of one frame, by all three."""
+    trainer, config = seen.trainer, seen.trainer.config
+    avatar, field = trainer.avatar, trainer.avatar.field
+    frame = seen.frames[len(seen.frames) // 3]
+    replay = ReplayBuffer(1, device)
+    replay.add(frame)
+    batch = replay.sample_rays(config.rays, _seeded(device))
+    how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
+    grid = avatar.occupancy.density_grid
+    samples = field.backend.march(batch.rays, replay.correspondences, grid, how)
+    chance = _seeded(device)
+    empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
+    near = sample_tv_pairs(samples.points, config, chance)
+    background = torch.rand(config.rays, 3, generator=chance, device=device)
+    plain, scene = AutogradField(field), PaperStepInputs.of(avatar.rig, frame, seen.frames, grid)
+    counts: list[tuple[int, int]] = []
+
+    def ours() -> None:
+        field.table_grad.zero_()
+        compute_gradients(
+            field, seen.trainer.sampler, replay.correspondences, batch, config,
+            hard_surface_share=1.0, generator=_seeded(device),
+        )  # fmt: skip
+
+    alternatives: dict[str, Callable[[], object]] = {
+        "ours": ours,
+        "torch": lambda: autograd_step(plain, samples, empty, near, batch, background, config),
+        "march": lambda: TorchBackend().march(batch.rays, replay.correspondences, grid, how),
+        "paper": lambda: counts.append(
+            paper_step(scene, plain, batch, empty, background, config)
+        ),
+    }  # fmt: skip
+    ours()
+    strays = _largest_difference(field.parameters(), alternatives["torch"]())
+    times = time_interleaved(alternatives, device, fewer_rounds={"paper": 2})
+    kept, roots = (count / config.rays for count in counts[-1])
+    return _step_marks(times, len(samples.points) / config.rays, strays, kept, roots, batch)
+
+
+def _step_marks(
+    times: dict[str, float],
+    mine: float,
+    strays: float,
+    kept: float,
+    roots: float,
+    batch: TrainingBatch,
+) -> list[Measurement]:
+    ms = {name: 1000.0 * time for name, time in times.items()}
+    rays = f"{len(batch.target):,} rays of one frame"
+    return [
+        Measurement(
+            name="one step vs plain torch on the same samples, times",
+            value=ms["torch"] / ms["ours"], required="4", stretch_goal="8",
+            context=f"{rays}, {mine:.1f} samples/ray: {ms['ours']:.1f} ms with marching, torch "
+            f"{ms['torch']:.0f} ms without (its own marching: +{ms['march']:.0f} ms, not counted); "
+            f"largest difference of a gradient {strays:.0e} of its largest",
+        ),
+        Measurement(
+            name="one step vs the paper's algorithm in plain torch, times",
+            value=ms["paper"] / ms["ours"], required="100", stretch_goal="400",
+            context=f"same rays: {ms['paper']:,.0f} ms; {kept:.1f} of 128 samples/ray survive the "
+            f"union grid, the field is asked at {roots:.1f} roots/ray",
+        ),
+    ]  # fmt: skip
+
+
+def _largest_difference(parameters: list[torch.nn.Parameter], plain: object) -> float:
+    """Largest difference between gradients, each relative to its parameter's largest."""
+    assert isinstance(plain, tuple)
+    both = zip(parameters, plain, strict=True)
+    return max(float((p.grad - g).abs().max() / g.abs().max()) for p, g in both)
+
+
+def encode_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+    """The hash grid forward and backward at training samples."""
+    field = seen.trainer.avatar.field
+    points = training_points(seen, POINTS)
+    grad = torch.randn(POINTS, field.levels.feature_width, generator=_seeded(device), device=device)
+    table = field.table.detach().clone().requires_grad_()
+
+    def ours() -> None:
+        field.table_grad.zero_()
+        field.backend.encode(points, field.table, field.levels)
+        field.backend.encode_backward(points, grad, field.levels, field.table_grad)
+
+    def plain() -> None:
+        torch.autograd.grad(torch_reference.encode(points, table, field.levels), table, grad)
+
+    times = time_interleaved({"ours": ours, "torch": plain}, device)
+    mega = {name: POINTS / time / 1e6 for name, time in times.items()}
+    levels = f"{len(field.levels.cells_per_m)} levels, {field.levels.entries:,} entries"
+    return [
+        Measurement(
+            name="encode forward + backward vs plain torch, times",
+            value=times["torch"] / times["ours"], required="8", stretch_goal="15",
+            context=f"{POINTS:,} points of training rays, {levels}: {mega['ours']:.2f} and "
+            f"{mega['torch']:.3f} million points/s",
+        )
+    ]  # fmt: skip
+
+
+def training_points(seen: LoadedTrainer, count: int) -> Float32[Tensor, "count 3"]:
+    """Canonical samples as training draws them, ray by ray."""
+    trainer, config = seen.trainer, seen.trainer.config
+    how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
+    chance = _seeded(trainer.replay.device)
+    found: list[Tensor] = []
+    while sum(map(len, found)) < count:
+        batch = trainer.replay.sample_rays(config.rays, chance)
+        grid = trainer.avatar.occupancy.density_grid
+        found.append(
+            trainer.backend.march(batch.rays, trainer.replay.correspondences, grid, how).points
+        )
+    return torch.cat(found)[:count].contiguous()
+
+
+def _seeded(device: torch.device) -> torch.Generator:
+    return torch.Generator(device=device).manual_seed(0)

@@ -1,0 +1,246 @@
+"""OpenCV without its noise on stderr: what is wrong with a file is said in our own words.
+
+A folder of pictures as frames, in natural order; and the reading of one picture.
+"""
+
+import io
+import os
+import re
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from capture.frame import Frame
+from capture.input_error import InputError
+from capture.source import FrameSelection
+
+LOG_LEVEL_SILENT = 0
+"""OpenCV's own number."""
+
+
+@cache
+def silence_opencv() -> None:
+    """Silences OpenCV and its FFmpeg; to be called before a file is opened."""
+    import cv2  # heavy, and this file must not make others so
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
+    set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
+    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
+
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+
+EXIF_ORIENTATION = 0x0112
+EXIF_QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
+"""By EXIF's orientation: turns by 90° against the clock that make a stored picture upright."""
+EXIF_TRANSPOSE = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""The same with those that are mirrored, for pixels."""
+
+TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
+"""How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
+
+ALPHA_SAMPLES = 5
+"""Pictures, evenly spread, that are asked whether an alpha channel cuts the person out."""
+ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
+"""Kinds of pictures that can have an alpha channel."""
+MIN_TRANSPARENT_FRACTION = 0.01
+"""Share of the pixels that an alpha channel must clear to be a mask: rounded corners clear less."""
+
+ASSUMED_FPS = 30.0
+"""Pictures a second, where nobody has said when each was taken."""
+
+
+def natural_sort_key(path: Path) -> list[tuple[int, str]]:
+    """Sorts `image_9` before `image_10`."""
+    return [
+        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)
+    ]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The pictures in a folder, in natural order."""
+    images = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted((file for file in images if not file.name.startswith(".")), key=natural_sort_key)
+
+
+def read_image(
+    path: Path,
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
+    """One upright picture as RGB, and its alpha channel if it has one.
+
+    Raises:
+        InputError: If it cannot be decoded, or is not complete.
+    """
+    data = path.read_bytes()
+    if not _is_complete(data):
+        raise InputError(f"{path} is cut off; the file is not complete.")
+    encoded = np.frombuffer(data, np.uint8)
+    picture = _decode(encoded, cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise InputError(f"{path} is no picture that can be decoded; it is empty or damaged.")
+    alpha = None
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        alpha = picture[..., 3]
+        alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
+        alpha = np.ascontiguousarray(_rotate_alpha(alpha, data))
+    picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
+    if picture is None:
+        raise InputError(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
+    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    if alpha is not None and alpha.shape != rgb.shape[:2]:
+        raise InputError(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
+    return rgb, alpha
+
+
+def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
+    """Whether an alpha channel says where the person is: an opaque one says nothing."""
+    return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
+
+
+def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
+    """Whether the alpha channel of any of a few pictures, spread over all, cuts the person out.
+
+    One picture is no evidence: matting tools write the first ones opaque, or where they see nobody.
+    """
+    able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
+    places = np.linspace(0, len(able) - 1, min(ALPHA_SAMPLES, len(able))).round().astype(int)
+    for path in (able[place] for place in places):
+        try:
+            alpha = read_image(path)[1]
+        except (InputError, OSError):  # damaged or half written; another one says it
+            continue
+        if has_cutout_alpha(alpha):
+            return True
+    return False
+
+
+def exif_orientation(data: bytes) -> int:
+    """EXIF's orientation of an encoded picture, 1 to 8; 1 (upright) where there is none."""
+    tagged = data.startswith(TIFF_MAGIC) or any(
+        mark in data for mark in (b"Exif", b"eXIf", b"EXIF")
+    )
+    if not tagged:  # looking closer would decode a PNG
+        return 1
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            found = picture.getexif().get(EXIF_ORIENTATION, 1)
+    except Exception:  # damaged tags; of many types, and OpenCV leaves the picture as it is, too
+        return 1
+    return found if found in EXIF_TRANSPOSE else 1
+
+
+def _rotate_alpha(
+    alpha: UInt8[np.ndarray, "_ _"], data: bytes
+) -> UInt8[np.ndarray, "height width"]:
+    """An alpha channel as it was stored, made upright as OpenCV makes the colours."""
+    found = exif_orientation(data)
+    if found == 1 or data.startswith(TIFF_MAGIC):
+        return alpha
+    return np.asarray(Image.fromarray(alpha).transpose(EXIF_TRANSPOSE[found]))
+
+
+def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
+    silence_opencv()
+    try:
+        return cv2.imdecode(encoded, mode) if len(encoded) else None
+    except cv2.error:  # sizes that OpenCV refuses
+        return None
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether a PNG or JPEG has its end (some decoders fill the missing rest in silence)."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-1024:]
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[-65536:]
+    return True
+
+
+class ImageFolder:
+    """A folder of pictures; picture i was taken at i / 30 s."""
+
+    live = False
+    paced = False
+    started_at = 0.0
+    waited_s = 0.0
+    dropped = 0
+
+    def __init__(self, path: Path, selection: FrameSelection) -> None:
+        """Lists the folder and reads the first picture that can be read.
+
+        Raises:
+            InputError: If there is none, or none is wanted.
+        """
+        self.path = path
+        self.selection = selection
+        self.warnings: list[str] = []
+        self._images = list_images(path)
+        self.frames_in_file = len(self._images)
+        self.frame_count: int | None = selection.count(self.frames_in_file)
+        if not self.frame_count:
+            raise InputError(
+                f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
+                f"; at least one was expected from number {selection.start} on."
+            )
+        self.duration_s: float | None = selection.span(self.frames_in_file) / ASSUMED_FPS
+        self.size_px, self.quarter_turns = self._look()
+        self.has_alpha = any_has_cutout_alpha(
+            [p for i, p in enumerate(self._images) if selection.contains(i)]
+        )
+
+    def frames(self) -> Iterator[Frame]:
+        """The wanted pictures in order; every call starts anew."""
+        previous = None
+        for index, path in enumerate(self._images):
+            if not self.selection.contains(index):
+                continue
+            try:
+                rgb, alpha = read_image(path)
+            except (InputError, OSError) as cause:  # damaged, or the disk was unplugged
+                self._warn(f"{cause} It was left out.")
+                continue
+            if rgb.shape[1::-1] != self.size_px:
+                self._warn(
+                    f"{path.name} has {rgb.shape[1]}x{rgb.shape[0]} px, the first picture "
+                    f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
+                )
+                continue
+            repeated = previous is not None and np.array_equal(rgb, previous)
+            flags = frozenset({"repeated"} if repeated else ())
+            yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, flags=flags, alpha=alpha)
+            previous = rgb
+
+    def count_frames(self) -> int:
+        """How many pictures the folder holds."""
+        return len(self._images)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _look(self) -> tuple[tuple[int, int], int]:
+        """Size of the first picture that can be read, and by how many quarters it is turned."""
+        for path in self._images:
+            try:
+                rgb, _ = read_image(path)
+            except InputError:
+                continue
+            turns = EXIF_QUARTER_TURNS.get(exif_orientation(path.read_bytes()), 0)
+            return (rgb.shape[1], rgb.shape[0]), turns
+        raise InputError(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings:
+            self.warnings.append(message)

@@ -1,0 +1,1 @@
+"""Live sources: cameras, growing folders, recordings played in real time."""

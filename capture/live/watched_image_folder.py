@@ -1,0 +1,206 @@
+"""A folder of pictures that still grows: each is taken when it is complete."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.frame import Frame
+from capture.image_folder import (
+    EXIF_QUARTER_TURNS,
+    any_has_cutout_alpha,
+    exif_orientation,
+    list_images,
+    natural_sort_key,
+    read_image,
+)
+from capture.input_error import InputError
+from capture.live.pacing_clock import PacingClock
+from capture.source import FrameSelection
+
+DONE_FILE_NAME = "DONE"
+"""A file of this name in the folder says that no more pictures will come."""
+IDLE_TIMEOUT_S = 10.0
+"""No new picture for so long is the end, too."""
+POLL_INTERVAL_S = 0.05
+DAMAGED_AFTER_S = 2.0
+"""A picture that cannot be read so long after its last change is damaged, not incomplete."""
+MAX_PENDING = 8
+"""Of more pictures than this that wait, so many are taken, evenly, the newest among them."""
+MAX_PENDING_AT_START = 200
+"""The same of those that are there already when the watch begins."""
+
+Picture = tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]
+
+
+@final
+class WatchedImageFolder:
+    """A live source: pictures that another program writes, in natural order.
+
+    Attributes:
+        dropped: How many pictures were passed over, because too many were waiting.
+        started_at: When the first picture was written, in seconds since 1970.
+    """
+
+    live = paced = True
+    frames_in_file = 0
+    frame_count: int | None = None
+    duration_s: float | None = None
+
+    def __init__(
+        self,
+        path: Path,
+        selection: FrameSelection,
+        pace: PacingClock,
+        *,
+        idle_s: float = IDLE_TIMEOUT_S,
+    ) -> None:
+        """Waits for the first picture.
+
+        Args:
+            path: The folder, which may be empty.
+            selection: Which pictures are wanted, counted in natural order.
+            pace: Its clock; ending it ends the watch.
+            idle_s: No new picture for so long is the end.
+
+        Raises:
+            InputError: If there is no such folder, or no picture in it after `idle_s`.
+        """
+        if not path.is_dir():
+            raise InputError(
+                f"{path} is no folder; --live watches a folder of pictures that grows."
+            )
+        self.path = path
+        self.selection = selection
+        self.warnings: list[str] = []
+        self.dropped = 0
+        self._pace, self._idle_s = pace, idle_s
+        self._there_before: set[Path] = set()
+        first, (rgb, _) = self._first()
+        self.quarter_turns = EXIF_QUARTER_TURNS.get(exif_orientation(first.read_bytes()), 0)
+        there = list_images(path)
+        self.started_at = min(map(_modified_at, there), default=time.time())
+        self.size_px, self.has_alpha = (rgb.shape[1], rgb.shape[0]), any_has_cutout_alpha(there)
+
+    @property
+    def waited_s(self) -> float:
+        """How long it has been waited for pictures."""
+        return self._pace.waited_s
+
+    def frames(self) -> Iterator[Frame]:
+        """The pictures as they are completed."""
+        last_s = 0.0
+        for index, path in self._arriving():
+            if self.selection.is_past_end(index):
+                return
+            if not self.selection.contains(index):
+                continue
+            picture = self._complete(path)
+            if picture is None:
+                continue
+            written = _modified_at(path)
+            last_s = max(last_s, written - self.started_at)
+            age_s = 0.0 if path in self._there_before else max(0.0, time.time() - written)
+            yield Frame(
+                index=index,
+                time_s=last_s,
+                rgb=picture[0],
+                alpha=picture[1],
+                due_s=self._now() - age_s,
+                name=path.stem,
+            )
+
+    def count_frames(self) -> int:
+        """How many pictures there are by now."""
+        return len(list_images(self.path))
+
+    def close(self) -> None:
+        """Ends the watch, also in the middle of a wait."""
+        self._pace.stop()
+
+    def _first(self) -> tuple[Path, Picture]:
+        """The first picture that can be read."""
+        deadline = self._now() + self._idle_s
+        while True:
+            for path in list_images(self.path):
+                try:
+                    return path, read_image(path)
+                except (InputError, OSError):
+                    continue
+            if self._now() >= deadline:
+                raise InputError(
+                    f"No picture came into {self.path} within {self._idle_s:.0f} s (--idle-seconds)"
+                    "; expected PNG, JPEG or the like, written one after the other."
+                )
+            self._pace.wait_until(self._now() + POLL_INTERVAL_S)
+
+    def _arriving(self) -> Iterator[tuple[int, Path]]:
+        """Place in natural order and path of each picture that is to be taken."""
+        count, newest, quiet_since = 0, None, self._now()
+        while not self._pace.stopped:
+            looked_at = self._now()
+            try:
+                done = self._is_done()  # before looking: what came until then is taken
+                images = list_images(self.path)
+            except OSError as error:
+                self._warn(f"{self.path} can no longer be read ({error.strerror}).")
+                return
+            if newest is None:
+                new, most, self._there_before = images, MAX_PENDING_AT_START, set(images)
+            else:
+                new, most = [p for p in images if natural_sort_key(p) > newest], MAX_PENDING
+            if new:
+                chosen = np.linspace(0, len(new) - 1, min(most, len(new))).round().astype(int)
+                self.dropped += len(new) - len(chosen)
+                yield from ((count + int(i), new[i]) for i in chosen)
+                count, newest, quiet_since = (
+                    count + len(new),
+                    natural_sort_key(new[-1]),
+                    self._now(),
+                )
+                continue
+            if done or self._now() - quiet_since >= self._idle_s:
+                return
+            # long folders are looked at less often
+            self._pace.wait_until(
+                self._now() + max(POLL_INTERVAL_S, 4.0 * (self._now() - looked_at))
+            )
+
+    def _now(self) -> float:
+        return self._pace.now()
+
+    def _complete(self, path: Path) -> Picture | None:
+        """A picture once it is whole; None if it never is."""
+        while not self._pace.stopped:
+            try:
+                picture = read_image(path)
+            except (InputError, OSError) as cause:
+                if time.time() - _modified_at(path) > DAMAGED_AFTER_S:
+                    self._warn(f"{cause} It was left out.")
+                    return None
+                self._pace.wait_until(self._now() + POLL_INTERVAL_S)
+                continue
+            if picture[0].shape[1::-1] == self.size_px:
+                return picture
+            self._warn(f"{path.name} is not of the first picture's size. It was left out.")
+            return None
+        return None
+
+    def _is_done(self) -> bool:
+        places = [self.path, self.path.parent] if self.path.name == "images" else [self.path]
+        return any((place / DONE_FILE_NAME).exists() for place in places)
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings and len(self.warnings) < 100:
+            self.warnings.append(message)
+
+
+def _modified_at(path: Path) -> float:
+    """When a file was last written to, in seconds since 1970; long ago, if it is gone."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

@@ -1,0 +1,92 @@
+"""Opens what frames come from: a video file, a folder of pictures, a capture folder, a camera."""
+
+from pathlib import Path
+
+from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
+from capture.input_error import InputError
+from capture.live.camera_device import CameraDevice
+from capture.live.pacing_clock import PacingClock
+from capture.live.watched_image_folder import WatchedImageFolder
+from capture.source import FrameSelection, FrameSource
+from capture.video import VIDEO_SUFFIXES, VideoFile
+
+HEIC_SUFFIXES = frozenset({".heic", ".heif"})
+NON_VIDEO_SUFFIXES = HEIC_SUFFIXES | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
+"""Endings of files that people name by mistake."""
+SIDE_VIDEO_PREFIXES = ("mask", "preview")
+"""How the names of videos begin that lie beside the one that is meant."""
+
+
+def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
+    """Opens a video file, a folder of pictures or a native capture folder.
+
+    Args:
+        path: A video, a folder of pictures, or a folder with `images/` or a single video in it.
+        frames: Which frames are wanted; they keep their numbers. All if None.
+
+    Raises:
+        InputError: If there is nothing there that can be read.
+    """
+    selection = FrameSelection.of(frames)
+    if not path.exists():
+        raise InputError(f"{path} does not exist; a video or a folder of pictures was expected.")
+    if not path.is_dir():
+        if path.suffix.lower() in IMAGE_SUFFIXES | NON_VIDEO_SUFFIXES:
+            raise InputError(
+                f"{path} is no video; expected one ({', '.join(sorted(VIDEO_SUFFIXES))}), or a "
+                "folder of pictures."
+            )
+        return VideoFile(path, selection)
+    if (path / "images").is_dir():
+        return ImageFolder(path / "images", selection)
+    videos = _list_videos(path)
+    if list_images(path) and not videos:
+        return ImageFolder(path, selection)
+    if len(videos) != 1:
+        raise _ambiguous_folder_error(path, videos)
+    return VideoFile(videos[0], selection)
+
+
+def _list_videos(folder: Path) -> list[Path]:
+    """List the videos in a folder; masks and a preview do not count where there is another."""
+    files = (file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
+    seen = sorted(file for file in files if not file.name.startswith("."))
+    return [file for file in seen if not file.stem.lower().startswith(SIDE_VIDEO_PREFIXES)] or seen
+
+
+def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
+    """What is said of a folder that is neither pictures nor one video."""
+    if videos:
+        found, advice = ", ".join(file.name for file in videos), "Name the video itself."
+    else:
+        endings = {file.suffix.lower() for file in path.iterdir() if file.suffix}
+        found = f"files ending in {', '.join(sorted(endings))}" if endings else "neither"
+        heic = "HEIC pictures must be converted, to JPEG or PNG."
+        advice = heic if endings & HEIC_SUFFIXES else "Name the folder that holds them."
+    return InputError(
+        f"{path} is a folder; expected pictures, `images/` or a single video in it, found "
+        f"{found}. {advice}"
+    )
+
+
+def open_live_source(
+    path: Path, camera: str | None, frames: slice | None, pace: PacingClock, *, idle_s: float
+) -> FrameSource:
+    """Opens a camera, or a folder that another program writes pictures to.
+
+    Args:
+        path: The folder; a capture folder's pictures lie in its `images/`.
+        camera: Number or address of a camera instead.
+        frames: Which frames are wanted. All if None.
+        pace: The clock of a folder.
+        idle_s: No new picture for so long is a folder's end.
+
+    Raises:
+        InputError: If there is no such camera, or no picture comes into the folder.
+        OSError: If the camera cannot be used now.
+    """
+    selection = FrameSelection.of(frames)
+    if camera is not None:
+        return CameraDevice(camera, selection, pace)
+    inside = path / "images"
+    return WatchedImageFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)

@@ -1,0 +1,1 @@
+"""Baking: the field sampled into tables, and fine-tuned."""

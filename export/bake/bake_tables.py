@@ -1,0 +1,306 @@
+"""Why an avatar is not written.
+
+The part of a rig's skinning volume that a package needs: cells in which rays are followed.
+
+Bakes a trained field into the tables that the player draws.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8, UInt16
+
+from avatar.deformation.rig import Rig
+from export.bake.bake_kernels import dilate, mark_visible_nodes
+from export.bake.field_grid import MIN_DENSITY, FieldFunction, FieldGrid, sample_field_grid
+from export.bake.proxy_surface import ProxySurface, extract_proxy_surface
+from export.package.player_tables import (
+    BRICK_NODES,
+    BRICK_SIZE,
+    COLOR_CODE_STEP,
+    DENSITY_CODE_STEP,
+    SURFEL_BITS,
+    THICKNESS_STEP_M,
+    WEIGHT_SCALE,
+    BrickTable,
+    PlayerTables,
+    SkinningGrid,
+    SurfelTable,
+    encode_density,
+    round_codes,
+)
+from export.package.render_settings import QUALITY_TIERS
+from preprocess.body.kinematics import body_from_rest
+
+
+class ExportRefused(RuntimeError):  # noqa: N818 - names what happened
+    """Nothing to draw, or a graph that does not compute what it should; nothing is written."""
+
+
+OUTER_MARGIN_M = 0.012
+"""Rays begin at most about so far outside of the hull."""
+PROBE_SPACING_M = 0.012
+"""Distance between the points along a normal that are looked at: much less than a cell."""
+
+
+def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
+    """The skin under a hull, as deep as one sees.
+
+    Args:
+        rig: Whose.
+        hull: The hull.
+    """
+    shape = np.array(rig.weights.shape[:3])
+    step_m = (rig.box_high - rig.box_low) / (shape - 1)
+    depths = np.arange(
+        -OUTER_MARGIN_M, float(surface.thickness.max()) + PROBE_SPACING_M, PROBE_SPACING_M
+    )
+    within = depths <= surface.thickness[:, None] + PROBE_SPACING_M
+    points = surface.positions[:, None] - surface.normals[:, None] * depths[:, None].astype(
+        np.float32
+    )
+    cells = np.floor((points[within] - rig.box_low) / step_m).astype(np.int64)
+    touched = np.zeros(shape - 1, dtype=bool)
+    touched[tuple(np.clip(cells, 0, shape - 2).T)] = True
+    cells = np.argwhere(touched)
+    first, last = cells.min(axis=0), cells.max(axis=0) + 2
+    stored = np.zeros(last - first, dtype=bool)
+    for corner in np.ndindex(2, 2, 2):
+        stored[tuple((cells - first + corner).T)] = True
+    index = np.zeros(stored.shape, dtype=np.int32)
+    index[stored] = np.arange(1, stored.sum() + 1)
+    part = rig.weights[first[0] : last[0], first[1] : last[1], first[2] : last[2]]
+    codes = np.zeros((24, stored.sum() + 1), dtype=np.uint16)
+    codes[0, 0] = WEIGHT_SCALE
+    codes[:, 1:] = encode_weights(part[stored]).T
+    return SkinningGrid(
+        low=(rig.box_low + first * step_m).astype(np.float32),
+        step_m=step_m.astype(np.float32),
+        index=index,
+        weight_codes=codes,
+    )
+
+
+def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarray, "nodes 24"]:
+    """Weights × `WEIGHT_SCALE`, rounded so that each row sums to it (the largest makes up)."""
+    codes: Int64[np.ndarray, "nodes 24"] = np.round(weights * WEIGHT_SCALE).astype(np.int64)
+    rows = np.arange(len(codes))
+    codes[rows, codes.argmax(axis=1)] += WEIGHT_SCALE - codes.sum(axis=1)
+    return codes.astype(np.uint16)
+
+
+FAINT_DENSITY_FRACTION = 0.1
+"""The hull's level is at most this share of what the densest percent of a field reaches."""
+BRICK_MARGIN_M = 0.012
+"""Bricks reach this far outside of the hull."""
+VOXEL_TO_CELL_RATIO = 0.53
+"""Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
+MIN_VOXEL_M, MAX_VOXEL_M = 0.0038, 0.006
+FINER_VOXEL_FACTOR = 0.62
+"""So much finer are voxels where the player is too far from the renderer: 1 to 1.5 dB, and twice
+the bytes. An avatar learnt from few photographs weighs less than others."""
+QUICK_VOXEL_FACTOR = 1.5
+"""How much coarser a package is that cannot wait."""
+POSITION_CODE_STEP, NORMAL_CODE_STEP = 32, 7
+"""Codes are rounded to multiples of these, a millimetre and three degrees, so that they deflate
+well."""
+FINE_TUNING_PICTURES = 16
+"""Pictures that bricks are fine-tuned on, half a second each."""
+EMPTY_AVATAR_MESSAGE = (
+    f"The avatar is empty: its density is nowhere above {MIN_DENSITY:g} per metre. "
+    "No package was written. Train it longer (--resume), or check the masks."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeConfig:
+    """How finely an avatar is baked.
+
+    Attributes:
+        voxel_m: Distance between brick voxels.
+        surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
+        surface_density: Density of the hull's level set, 1/m; less where the whole field is faint.
+        tiers: Which qualities the package has; "hq" is always among them.
+        tuned: On how many pictures bricks are fine-tuned; 0 for none.
+    """
+
+    voxel_m: float = 0.004
+    surfel_spacing_m: float = 0.006
+    surface_density: float = 20.0
+    tiers: tuple[str, ...] = tuple(QUALITY_TIERS)
+    fine_tuning_pictures: int = 0
+
+    @classmethod
+    def for_cell_size(cls, finest_cell_m: float) -> "BakeConfig":
+        """For a field whose finest cells are that long: about two voxels each; fine-tuned."""
+        voxel_m = float(np.clip(VOXEL_TO_CELL_RATIO * finest_cell_m, MIN_VOXEL_M, MAX_VOXEL_M))
+        return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
+
+    def with_finer_voxels(self) -> "BakeConfig":
+        """For an avatar that these voxels do not show well enough."""
+        return replace(self, voxel_m=FINER_VOXEL_FACTOR * self.voxel_m)
+
+    def quick(self) -> "BakeConfig":
+        """For a package that is wanted at once, and that a finer one will follow."""
+        return replace(
+            self,
+            voxel_m=min(QUICK_VOXEL_FACTOR * self.voxel_m, MAX_VOXEL_M),
+            surfel_spacing_m=QUICK_VOXEL_FACTOR * self.surfel_spacing_m,
+            tiers=("hq",),
+            fine_tuning_pictures=0,
+        )
+
+
+def bake_field(
+    field_at: FieldFunction,
+    rig: Rig,
+    *,
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    config: BakeConfig | None = None,
+) -> PlayerTables:
+    """The tables of a trained field.
+
+    Args:
+        field_at: The field; asked only inside `occupied`.
+        rig: What moves it.
+        occupied: Cells of the rig's box that are not empty, as in `rig.distance`.
+        config: How finely.
+
+    Raises:
+        ExportRefused: If there is nothing to be seen in the field.
+    """
+    config = config or BakeConfig()
+    return bake_tables(sample_field(field_at, rig, occupied=occupied, config=config), rig, config)
+
+
+def sample_field(
+    field_at: FieldFunction,
+    rig: Rig,
+    *,
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    config: BakeConfig,
+) -> FieldGrid:
+    """The first half of baking: all that the field is asked for. Arguments as of `bake`."""
+    if not occupied.any():
+        raise ExportRefused(EMPTY_AVATAR_MESSAGE)
+    return sample_field_grid(field_at, rig, occupied, config.voxel_m)
+
+
+def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
+    """The second half: numpy and serial kernels only, on whatever thread.
+
+    Args:
+        lattice: What the field said.
+        rig: What moves it.
+        config: How finely.
+
+    Raises:
+        ExportRefused: If there is nothing to be seen in the field.
+    """
+    hull = _surface_within_surfel_limit(grid, config)
+    canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
+    pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
+    reached = _visible_nodes(grid, hull)
+    return PlayerTables(
+        surfels=_encode_surfels(hull),
+        bricks=_encode_bricks(grid, reached),
+        skinning=bake_skinning(rig, hull),
+        pelvis=pelvis.astype(np.float32),
+        reach_m=_max_reach_m(rig),
+    )
+
+
+def _surface_within_surfel_limit(lattice: FieldGrid, config: BakeConfig) -> ProxySurface:
+    """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
+    visible = lattice.density[lattice.density > MIN_DENSITY]
+    if visible.size == 0:
+        raise ExportRefused(EMPTY_AVATAR_MESSAGE)
+    level = min(config.surface_density, FAINT_DENSITY_FRACTION * float(np.percentile(visible, 99)))
+    spacing_m = config.surfel_spacing_m
+    while True:
+        hull = extract_proxy_surface(lattice, level=level, spacing_m=spacing_m)
+        if 0 < len(hull.positions) < 1 << SURFEL_BITS:
+            return hull
+        spacing_m *= 1.02 * max(1.0, len(hull.positions) / (1 << SURFEL_BITS)) ** 0.5
+
+
+def _max_reach_m(rig: Rig) -> float:
+    """No visible point gets farther from the pelvis in any pose, metres: bones and clothes."""
+    along = np.zeros(len(rig.parents))
+    for joint, parent in enumerate(rig.parents):
+        if parent >= 0:
+            bone = np.linalg.norm(rig.rest_joints[joint] - rig.rest_joints[parent])
+            along[joint] = along[parent] + bone
+    return float(along.max() + 0.35)
+
+
+def _encode_surfels(hull: ProxySurface) -> SurfelTable:
+    low = hull.positions.min(axis=0)
+    extent_m = float((hull.positions.max(axis=0) - low).max())
+    codes = np.round((hull.positions - low) / extent_m * 65535.0).astype(np.uint16)
+    order = np.argsort(_morton_order(codes), kind="stable")
+    thickness = np.round(hull.thickness[order] / THICKNESS_STEP_M)
+    return SurfelTable(
+        low=low,
+        extent_m=extent_m,
+        spacing_m=hull.spacing_m,
+        position_codes=round_codes(codes[order], POSITION_CODE_STEP, 65535),
+        normal_codes=np.round(hull.normals[order] * 127.0 / NORMAL_CODE_STEP).astype(np.int8)
+        * np.int8(NORMAL_CODE_STEP),
+        thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
+    )
+
+
+def _morton_order(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "points"]:
+    """Place along a Z-order curve (10 bits an axis): neighbours in space lie close in memory."""
+    order = np.zeros(len(codes), dtype=np.int32)
+    for bit in range(10):
+        for axis in range(3):
+            set_bits = (codes[:, axis] >> (6 + bit) & 1).astype(np.int32)
+            order |= set_bits << (3 * bit + axis)
+    return order
+
+
+def _encode_bricks(lattice: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> BrickTable:
+    """The visible part of the lattice near the hull, cut into bricks."""
+    counts = np.array(lattice.density.shape) // BRICK_SIZE
+    places = np.flatnonzero(reached)
+    seen = encode_density(lattice.density.ravel()[places])
+    seen = np.where(
+        seen > 0, np.maximum(round_codes(seen, DENSITY_CODE_STEP, 255), DENSITY_CODE_STEP), 0
+    )
+    codes = np.zeros(lattice.density.shape, dtype=np.uint8)
+    codes.ravel()[places] = seen
+    visible = dilate(codes > 0)
+    blocks = _overlapping_blocks(visible)
+    used = blocks.any(axis=(3, 4, 5))
+    index = np.zeros(counts, dtype=np.int32)
+    index[used] = np.arange(1, used.sum() + 1)
+    voxels = np.zeros((used.sum() + 1, BRICK_NODES, BRICK_NODES, BRICK_NODES, 4), dtype=np.uint8)
+    voxels[1:, ..., 3] = _overlapping_blocks(codes)[used]
+    shown = blocks[used]
+    for channel in range(3):
+        values = _overlapping_blocks(lattice.rgb[..., channel])[used]
+        voxels[1:, ..., channel] = round_codes(values, COLOR_CODE_STEP, 255) * shown
+    return BrickTable(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
+
+
+def _overlapping_blocks(
+    nodes: Shaped[np.ndarray, "x y z"],
+) -> Shaped[np.ndarray, "blocks_x blocks_y blocks_z 9 9 9"]:
+    """A lattice's blocks of 8 cells along each side; neighbours share a layer of nodes."""
+    blocks = np.lib.stride_tricks.sliding_window_view(nodes, (BRICK_NODES,) * 3)
+    return blocks[::BRICK_SIZE, ::BRICK_SIZE, ::BRICK_SIZE]
+
+
+def _visible_nodes(lattice: FieldGrid, hull: ProxySurface) -> Bool[np.ndarray, "x y z"]:
+    """Nodes that rays see: from a little outside of the hull as deep as its thickness."""
+    reached = np.zeros(lattice.density.shape, dtype=bool)
+    mark_visible_nodes(
+        reached, lattice.low, np.float32(lattice.voxel_m), hull.positions, hull.normals,
+        hull.thickness, np.float32(BRICK_MARGIN_M),
+    )  # fmt: skip
+    gap = 1 + 2 * int(np.ceil(hull.spacing_m / lattice.voxel_m))  # between neighbouring surfels
+    for _ in range(gap // 2):
+        reached = dilate(reached)
+    return reached

@@ -1,0 +1,1 @@
+"""The ONNX graph that draws a package."""

@@ -1,0 +1,341 @@
+"""Nodes that read colour and density out of the bricks.
+
+Nodes that follow rays through canonical space, and gather colour on the way.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from export.graph.graph_context import GraphContext, VectorValue, adjugate, dot, gather_vector
+from export.graph.graph_skinning import (
+    PosedNodeValues,
+    invert_jacobian,
+    locate_skinning_cell,
+    skin_points,
+)
+from export.graph.onnx_builder import GraphBuilder, GraphValue
+from export.package.player_tables import BRICK_NODES, BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
+
+VOXEL_STRIDES = (BRICK_NODES * BRICK_NODES, BRICK_NODES, 1)
+"""Steps along x, y and z inside a brick."""
+COLOR_WEIGHT_SCALE = 256
+"""Weights of colours are integers that sum to this: two channels share a multiplication."""
+VOXEL_OFFSET_BITS = 10
+"""A voxel's place inside its brick takes so many bits, the brick's block the others."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrickTetrahedra:
+    """Tetrahedra that hold some points: values of the graph, one entry a point.
+
+    A cell is cut into six tetrahedra along its diagonal. The one that holds a point is walked
+    from the cell's lower to its upper corner along the axes in the order of their fractions.
+
+    Attributes:
+        corners: Addresses of the four voxels on that way.
+        fractions: How far the point is along each of the three edges, the largest first.
+    """
+
+    corners: list[GraphValue]
+    fractions: VectorValue
+
+
+def locate_tetrahedra(scene: GraphContext, lattice: VectorValue) -> BrickTetrahedra:
+    """The tetrahedra about lattice coordinates, (point - low) / voxel_m."""
+    graph, bricks = scene.graph, scene.tables.bricks
+    packed, fraction = None, []
+    for axis, coordinate in enumerate(lattice):
+        inside = coordinate.clip(0.0, bricks.index.shape[axis] * BRICK_SIZE - 1e-3)
+        voxel = inside.cast(np.int32)
+        fraction.append(inside - voxel.cast(np.float32))
+        part = graph.constant(_packed_addresses(bricks, axis)).gather(voxel)
+        packed = part if packed is None else packed + part
+    assert packed is not None
+    # as floats: two bits of the place may be lost, but it never reaches the next block
+    block = (packed.cast(np.float32) * (1.0 / (1 << VOXEL_OFFSET_BITS))).cast(np.int32)
+    base = packed + _brick_offsets(scene).gather(block)
+    x, y, z = fraction
+    largest, smallest = x.maximum(y, z), x.minimum(y, z)
+    middle = (x + y + z) - largest - smallest
+    corners = _tetrahedron_corners(graph, base, fraction, largest, smallest)
+    return BrickTetrahedra(corners=corners, fractions=[largest, middle, smallest])
+
+
+def _packed_addresses(bricks: BrickTable, axis: int) -> np.ndarray:
+    """For each voxel along an axis its part of the block's number and of the place inside."""
+    voxel = np.arange(bricks.index.shape[axis] * BRICK_SIZE, dtype=np.int32)
+    blocks = int(np.prod(bricks.index.shape[axis + 1 :]))
+    packed = (
+        voxel // BRICK_SIZE * blocks << VOXEL_OFFSET_BITS
+    ) + voxel % BRICK_SIZE * VOXEL_STRIDES[axis]
+    return packed.astype(np.int32)
+
+
+def _brick_offsets(scene: GraphContext) -> GraphValue:
+    """What added to a packed place gives the voxel's address, for each block."""
+    offset = scene.table_values["brick_offset"]
+    blocks = scene.graph.range(scene.graph.constant(np.int32(scene.tables.bricks.index.size)))
+    return offset - blocks * (1 << VOXEL_OFFSET_BITS)
+
+
+def _tetrahedron_corners(
+    graph: GraphBuilder,
+    base: GraphValue,
+    fraction: VectorValue,
+    largest: GraphValue,
+    smallest: GraphValue,
+) -> list[GraphValue]:
+    """The corners of the tetrahedron: the axis of the largest fraction is taken first.
+
+    Where two fractions are the same, the corner between them has no share.
+    """
+    x, y, _ = fraction
+    sx, sy, sz = VOXEL_STRIDES
+
+    def chosen(here: GraphValue, yes: GraphValue | int, no: GraphValue | int) -> GraphValue:
+        sides = [graph.value(side, np.int32) for side in (yes, no)]
+        return graph.where(here, *sides)
+
+    first = chosen(x.equal(largest), sx, chosen(y.equal(largest), sy, sz))
+    last_two = chosen(x.equal(smallest), sy + sz, chosen(y.equal(smallest), sx + sz, sx + sy))
+    return [base, base + first, base + last_two, base + (sx + sy + sz)]
+
+
+def interpolate_density(scene: GraphContext, cell: BrickTetrahedra) -> GraphValue:
+    """Density in 1/m: its logarithm is linear in a tetrahedron; below half a code is nothing."""
+    table = scene.table_values["voxel_density"]
+    codes = [table.gather(corner).cast(np.float32) for corner in cell.corners]
+    code = codes[0]
+    for i, fraction in enumerate(cell.fractions):
+        code = code + fraction * (codes[i + 1] - codes[i])
+    low, high = LOG_DENSITY_RANGE
+    density = (code * ((high - low) / 255.0) + low).exp()
+    return scene.graph.where(code > 0.5, density, 0.0)
+
+
+def interpolate_color(scene: GraphContext, cell: BrickTetrahedra) -> VectorValue:
+    """Red, green and blue in [0, 1]."""
+    parts = [(part * float(COLOR_WEIGHT_SCALE) + 0.5).cast(np.int32) for part in cell.fractions]
+    a, b, c = parts
+    red_blue = green = None
+    for corner, weight in zip(cell.corners, (COLOR_WEIGHT_SCALE - a, a - b, b - c, c), strict=True):
+        code = scene.table_values["voxel_color"].gather(corner)
+        pair, other = code.bitwise_and(0xFF00FF) * weight, code.bitwise_and(0xFF00) * weight
+        red_blue = pair if red_blue is None else red_blue + pair
+        green = other if green is None else green + other
+    assert red_blue is not None
+    assert green is not None
+    scale = 1.0 / (255.0 * COLOR_WEIGHT_SCALE)
+    blue = red_blue.shift_right(16)
+    red = red_blue - blue.cast(np.int32) * (1 << 16)
+    return [
+        red.cast(np.float32) * scale,
+        green.cast(np.float32) * (scale / 256.0),
+        blue.cast(np.float32) * scale,
+    ]
+
+
+MIN_REMAINING_M = 1e-5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SegmentValues:
+    """Pieces of rays: values of the graph, one entry a ray.
+
+    Attributes:
+        ray: Directions in the camera's frame, of length 1.
+        begin, end: Along the ray, metres.
+        canonical: Where the beginning lies in canonical space.
+        direction: Canonical metres a metre of the ray, at the beginning.
+    """
+
+    direction_camera: VectorValue
+    begin: GraphValue
+    end: GraphValue
+    start_canonical: VectorValue
+    direction_canonical: VectorValue
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlockValues:
+    """What a block of samples leaves behind: values of the graph, one entry a ray.
+
+    Attributes:
+        place: Where it ends along the ray, metres.
+        canonical: The same in canonical space.
+        light: What is let through.
+        color: What it adds, premultiplied.
+    """
+
+    end: GraphValue
+    end_canonical: VectorValue
+    transmittance: GraphValue
+    color: VectorValue
+
+
+def march_segments(
+    scene: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+) -> tuple[VectorValue, GraphValue]:
+    """Front-to-back compositing, a block of samples at a time.
+
+    After each block the rays that have ended are put aside, and the others are led back to where
+    the skin says that they are: a step of Newton's method, which also turns them. The last block
+    takes all that is left of a ray.
+
+    Args:
+        scene: What is drawn.
+        posed: The skin's nodes in the camera's frame.
+        segment: The rays.
+
+    Returns:
+        Premultiplied colour, and the light that is left, in [0, 1].
+    """
+    graph, rules = scene.graph, scene.settings
+    usual = rules.sample_span_m / scene.samples.cast(np.float32)
+    shortened = compression_scale(scene, segment.direction_canonical)
+    scale = (scene.samples + (rules.samples - 1)) // rules.samples  # more samples, more blocks
+    blocks, steady = (scale * count for count in (rules.max_blocks, rules.uniform_blocks))
+    block = composite_samples(
+        scene, segment, segment.begin * 0.0 + 1.0, rules.block_samples, usual * shortened
+    )
+    number = graph.range(graph.size(segment.begin).cast(np.int32))
+    start = [block.transmittance, *block.color, *_unfinished_rays(scene, number, segment, block)]
+
+    def once(turn: GraphValue, state: list[GraphValue]) -> tuple[GraphValue, list[GraphValue]]:
+        (light, *color), number, before, values = state[:4], state[4], state[5], state[6:]
+        segment = _newton_step(scene, posed, _unpack_segment(values))
+        doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
+        last = turn > blocks - 3
+        shortened = compression_scale(scene, segment.direction_canonical)
+        longest = graph.where(last, rules.max_segment_m, usual * doublings.exp2() * shortened)
+        block = composite_samples(scene, segment, before, rules.block_samples, longest)
+        light = light.scatter(number, block.transmittance)
+        color = [
+            c.scatter(number, added, reduction="add")
+            for c, added in zip(color, block.color, strict=True)
+        ]
+        left = _unfinished_rays(scene, number, segment, block)
+        return graph.size(left[0]) > 0, [light, *color, *left]
+
+    light, *color = graph.loop_while(blocks - 1, start, once)[:4]
+    return color, light
+
+
+def compression_scale(scene: GraphContext, direction: VectorValue) -> GraphValue:
+    """Factor by which lengths along rays shrink where the pose compresses canonical space."""
+    return (scene.settings.max_compression / dot(direction, direction).sqrt()).minimum(1.0)
+
+
+def _unfinished_rays(
+    scene: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
+) -> list[GraphValue]:
+    """Which rays go on: their numbers, the light that is left, and `_pack_segment` of their rest."""
+    graph = scene.graph
+    on = (block.transmittance > scene.settings.min_transmittance) & (
+        block.end < segment.end - MIN_REMAINING_M
+    )
+    chosen = graph.range(graph.size(on).cast(np.int32)).compress(on)
+    rest = SegmentValues(
+        direction_camera=segment.direction_camera,
+        begin=block.end,
+        end=segment.end,
+        start_canonical=block.end_canonical,
+        direction_canonical=segment.direction_canonical,
+    )
+    return gather_vector([number, block.transmittance, *_pack_segment(rest)], chosen)
+
+
+def _unpack_segment(values: list[GraphValue]) -> SegmentValues:
+    return SegmentValues(
+        direction_camera=values[:3],
+        begin=values[3],
+        end=values[4],
+        start_canonical=values[5:8],
+        direction_canonical=values[8:],
+    )
+
+
+def _pack_segment(segment: SegmentValues) -> list[GraphValue]:
+    return [
+        *segment.direction_camera, segment.begin, segment.end, *segment.start_canonical, *segment.direction_canonical
+    ]  # fmt: skip
+
+
+def composite_samples(
+    scene: GraphContext,
+    segment: SegmentValues,
+    light: GraphValue,
+    num_samples: int,
+    max_spacing: GraphValue | float,
+) -> BlockValues:
+    """A block of so many samples: density at each, colour once, at their mean."""
+    graph, bricks = scene.graph, scene.tables.bricks
+    step = ((segment.end - segment.begin) * (1.0 / num_samples)).minimum(max_spacing)
+    scale = 1.0 / bricks.voxel_m
+    start = [
+        p * scale - float(low) * scale
+        for p, low in zip(segment.start_canonical, bricks.low, strict=True)
+    ]
+    along_step = step * scale
+    slope = [d * along_step for d in segment.direction_canonical]
+    middles = graph.constant((np.arange(num_samples, dtype=np.float32) + 0.5)[:, None])
+    lattice = [
+        (middles * b.reshape(1, -1) + a.reshape(1, -1)).reshape(-1)
+        for a, b in zip(start, slope, strict=True)
+    ]
+    density = interpolate_density(scene, locate_tetrahedra(scene, lattice)).reshape(num_samples, -1)
+    passed = graph.split((density * -step.reshape(1, -1)).exp(), num_samples)
+    weight = mean = None
+    before = light
+    for turn, share in enumerate(passed):
+        light = before * share
+        seen = before - light
+        part = seen * (turn + 0.5)
+        weight = seen if weight is None else weight + seen
+        mean = part if mean is None else mean + part
+        before = light
+    assert weight is not None
+    assert mean is not None
+    middle = mean / weight.maximum(1e-9)
+    seen = interpolate_color(
+        scene, locate_tetrahedra(scene, [a + middle * b for a, b in zip(start, slope, strict=True)])
+    )
+    way = step * float(num_samples)
+    return BlockValues(
+        end=segment.begin + way,
+        end_canonical=[
+            p + d * way
+            for p, d in zip(segment.start_canonical, segment.direction_canonical, strict=True)
+        ],
+        transmittance=light,
+        color=[c * weight for c in seen],
+    )
+
+
+def _newton_step(
+    scene: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+) -> SegmentValues:
+    """Corrects canonical points and directions where the derivative can be inverted."""
+    graph, rules = scene.graph, scene.settings
+    camera, derivative = skin_points(
+        scene, posed, locate_skinning_cell(scene, segment.start_canonical)
+    )
+    inverse = invert_jacobian(scene, derivative, adjugate(derivative))
+    off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
+    shift = inverse.apply(off)
+    length = (dot(shift, shift) + 1e-20).sqrt()
+    share = (rules.max_correction_m / length).minimum(1.0)
+    turned = inverse.apply(segment.direction_camera)
+    return SegmentValues(
+        direction_camera=segment.direction_camera,
+        begin=segment.begin,
+        end=segment.end,
+        start_canonical=[
+            p + s * share for p, s in zip(segment.start_canonical, shift, strict=True)
+        ],
+        direction_canonical=[
+            graph.where(inverse.trusted, a, b)
+            for a, b in zip(turned, segment.direction_canonical, strict=True)
+        ],
+    )

@@ -1,0 +1,198 @@
+"""Nodes that say where each pixel's ray enters the hull, and what it sees from there on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from export.graph.graph_context import (
+    CameraValues,
+    GraphContext,
+    VectorValue,
+    adjugate,
+    dot,
+    gather_vector,
+)
+from export.graph.graph_ray_march import (
+    SegmentValues,
+    composite_samples,
+    compression_scale,
+    march_segments,
+)
+from export.graph.graph_skinning import (
+    PosedNodeValues,
+    PosedSurfels,
+    SkinningCell,
+    invert_jacobian,
+    skin_points,
+)
+from export.graph.graph_zbuffer import SplatWindow
+from export.graph.onnx_builder import GraphValue
+from export.package.player_tables import SURFEL_BITS
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthLayer:
+    """One depth layer: values of the graph, one entry a ray.
+
+    Attributes:
+        ray: Directions in the camera's frame, of length 1.
+        surfel: What each ray sees, and
+        canonical, camera: where that is.
+        color: Premultiplied.
+        light: What is let through, in [0, 1].
+        enter, end: Where the ray enters the hull and where it ends, metres along it.
+    """
+
+    ray: VectorValue
+    surfel: GraphValue
+    canonical_position: VectorValue
+    camera_position: VectorValue
+    color: VectorValue
+    transmittance: GraphValue
+    enter: GraphValue
+    end: GraphValue
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedProxySurface:
+    """What rays meet: the surfels, and the skin's nodes in the camera's frame."""
+
+    surfels: PosedSurfels
+    posed: PosedNodeValues
+
+
+def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> VectorValue:
+    """Unit directions in the camera's frame through the centres of the window's pixels (int32)."""
+    width = window.width.cast(np.int32)
+    row = pixel // width
+    column = pixel - row * width
+    x = column.cast(np.float32) + (window.left.cast(np.float32) + 0.5 - view.center[0])
+    y = row.cast(np.float32) + (window.top.cast(np.float32) + 0.5 - view.center[1])
+    x, y = x / view.focal[0], y / view.focal[1]
+    scale = (x * x + y * y + 1.0).sqrt().reciprocal()
+    return [x * scale, y * scale, scale]
+
+
+def trace_depth_layer(
+    scene: GraphContext,
+    hull: PosedProxySurface,
+    keys: GraphValue,
+    ray: VectorValue,
+    front_layer: DepthLayer | None,
+) -> DepthLayer:
+    """Color and light behind of rays.
+
+    The map from canonical space to the camera's is taken as linear about the surfel that a ray
+    sees: its inverse carries the ray to where it enters the hull.
+
+    Args:
+        scene: What is drawn.
+        hull: In its pose.
+        keys: What each ray sees.
+        ray: Directions.
+        before: What the same rays saw in the first layer, if this is the second.
+    """
+    graph, surfel = scene.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
+    place = hull.surfels.cell
+    place = SkinningCell(
+        rows=gather_vector(place.rows, surfel), fraction=gather_vector(place.fraction, surfel)
+    )
+    camera, derivative = skin_points(scene, hull.posed, place)
+    inverse = invert_jacobian(scene, derivative, adjugate(derivative))
+    normal = gather_vector([scene.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
+    # where the skin is folded, the hull is looked at from straight above
+    above = [-n for n in normal]
+    seen_along = zip(inverse.apply(ray), above, strict=True)
+    direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
+    along = dot(camera, ray)
+    beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
+    thickness = scene.table_values["thickness"].gather(surfel)
+    enter, begin, end = _segment_bounds(scene, normal, thickness, direction, beside, along)
+    canonical = gather_vector(
+        [scene.table_values[f"position_{letter}"] for letter in "xyz"], surfel
+    )
+    if front_layer is not None:
+        begin = _begin_behind_front_layer(scene, front_layer, canonical, camera, begin, end)
+    way = begin - along
+    start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
+    segment = SegmentValues(
+        direction_camera=ray,
+        begin=begin,
+        end=end,
+        start_canonical=start,
+        direction_canonical=direction,
+    )
+    if front_layer is None:
+        color, light = march_segments(scene, hull.posed, segment)
+    else:
+        rules = scene.settings
+        block = composite_samples(
+            scene, segment, begin * 0.0 + 1.0, rules.further_layer_samples, rules.max_segment_m
+        )
+        color, light = block.color, block.transmittance
+    return DepthLayer(
+        ray=ray,
+        surfel=surfel,
+        canonical_position=canonical,
+        camera_position=camera,
+        color=color,
+        transmittance=light,
+        enter=enter,
+        end=end,
+    )
+
+
+def _segment_bounds(
+    scene: GraphContext,
+    normal: VectorValue,
+    thickness: GraphValue,
+    direction: VectorValue,
+    beside: VectorValue,
+    along: GraphValue,
+) -> tuple[GraphValue, GraphValue, GraphValue]:
+    """Where rays enter the hull's tangent plane, and from where to where they are followed.
+
+    `beside` is where each ray comes closest to its surfel, seen from that in canonical space,
+    `along` how far that is along the ray.
+    """
+    graph, rules = scene.graph, scene.settings
+    falling = dot(normal, direction)
+    shallow = -0.5 * rules.min_cosine
+    hit = -dot(normal, beside) / falling.minimum(shallow)
+    hit = graph.where(falling < shallow, hit, 0.0).clip(
+        -rules.max_entry_shift_m, rules.max_entry_shift_m
+    )
+    enter = along + hit
+    cosine = (-falling).maximum(rules.min_cosine)
+    lead = (rules.entry_margin_m / cosine).minimum(
+        compression_scale(scene, direction) * rules.max_entry_margin_m
+    )
+    sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
+    bent = cosine.minimum(rules.max_compression)  # compression at the surfel seldom lasts
+    times = ((sine * rules.grazing_factor + 1.0) / bent).minimum(rules.max_lengthening)
+    length = (thickness * times + lead).minimum(rules.max_segment_m)
+    begin = enter - lead
+    return enter, begin, begin + length
+
+
+def _begin_behind_front_layer(
+    scene: GraphContext,
+    before: DepthLayer,
+    canonical: VectorValue,
+    camera: VectorValue,
+    begin: GraphValue,
+    end: GraphValue,
+) -> GraphValue:
+    """Where rays begin that must not see a second time what they have passed already."""
+    rules = scene.settings
+
+    def apart(here: VectorValue, first: VectorValue) -> GraphValue:
+        between = [a - b for a, b in zip(here, first, strict=True)]
+        return dot(between, between).sqrt()
+
+    one_sheet = (
+        apart(canonical, before.canonical_position)
+        < apart(camera, before.camera_position) * rules.same_sheet_ratio + rules.same_sheet_m
+    )
+    later = begin.maximum(before.end).minimum(end)
+    return scene.graph.where(one_sheet, later, begin)

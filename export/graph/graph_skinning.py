@@ -1,0 +1,254 @@
+"""Nodes that carry canonical points to the camera's frame, with the derivative.
+
+Nodes that carry the hull's surfels into the camera's frame, cheaply: most are never seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from export.graph.graph_context import (
+    GraphContext,
+    MatrixValue,
+    VectorValue,
+    cross,
+    dot,
+    gather_vector,
+)
+from export.graph.onnx_builder import GraphValue
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedNodeValues:
+    """The skin's nodes in the camera's frame: values of the graph, one entry a node."""
+
+    camera_positions: VectorValue
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinningCell:
+    """Where points lie among the skin's nodes: values of the graph, one entry a point.
+
+    Attributes:
+        rows: Rows of the four lower nodes along z of the cell about the point, in C order; the
+            upper ones follow them.
+        fraction: How far the point is between the nodes along x, y, z.
+    """
+
+    rows: list[GraphValue]
+    fraction: VectorValue
+
+
+def pose_nodes(scene: GraphContext) -> PosedNodeValues:
+    """Linear blend skinning of every node, straight into the camera's frame."""
+    graph, columns = scene.graph, scene.table_values
+    blended = scene.camera.bones.transpose(1, 0).matmul(columns["node_weights"])
+    positions = [columns[f"node_{letter}"] for letter in "xyz"]
+    ones = positions[0] * 0.0 + 1.0
+    homogeneous = graph.concatenate([p.reshape(1, -1) for p in [*positions, ones]])
+    matrix = blended.reshape(3, 4, -1)
+    return PosedNodeValues(camera_positions=graph.split((matrix * homogeneous).reduce_sum(1), 3))
+
+
+def skinning_nodes_per_m(scene: GraphContext) -> list[float]:
+    """Along x, y, z."""
+    return [
+        scene.settings.skinning_subdivision / float(step) for step in scene.tables.skinning.step_m
+    ]
+
+
+def locate_skinning_cell(scene: GraphContext, canonical: VectorValue) -> SkinningCell:
+    """Where canonical points lie among the nodes."""
+    skin = scene.tables.skinning
+    counts = [scene.settings.skinning_subdivision * (count - 1) + 1 for count in skin.index.shape]
+    number, fraction = None, []
+    for axis, (point, per_m) in enumerate(zip(canonical, skinning_nodes_per_m(scene), strict=True)):
+        place = point * per_m - float(skin.low[axis]) * per_m
+        place = place.clip(0.0, counts[axis] - 1 - 1e-3)
+        below = place.cast(np.int32)
+        fraction.append(place - below.cast(np.float32))
+        number = below if number is None else number * counts[axis] + below
+    assert number is not None
+    steps = (0, counts[2], counts[1] * counts[2], (counts[1] + 1) * counts[2])
+    table = scene.table_values["node"]
+    return SkinningCell(rows=[table.gather(number + step) for step in steps], fraction=fraction)
+
+
+def skin_points(
+    scene: GraphContext, posed: PosedNodeValues, place: SkinningCell
+) -> tuple[VectorValue, MatrixValue]:
+    """Where points are in the camera's frame, and how that changes with them.
+
+    Trilinear between the eight nodes about each.
+
+    Returns:
+        The points, and the derivative's rows, metres a step between nodes.
+    """
+    rows = [row for lower in place.rows for row in (lower, lower + 1)]
+    point, derivative = [], []
+    for table in posed.camera_positions:
+        value, slopes = _trilinear([table.gather(row) for row in rows], place.fraction)
+        point.append(value)
+        derivative.append(slopes)
+    return point, derivative
+
+
+def _trilinear(corners: list[GraphValue], fraction: VectorValue) -> tuple[GraphValue, VectorValue]:
+    """The value between eight corners, and its slopes along x, y, z, per cell."""
+    x, y, z = fraction
+    along_z = [corners[i + 1] - corners[i] for i in range(0, 8, 2)]
+    on_z = [corners[2 * i] + z * slope for i, slope in enumerate(along_z)]
+    along_y = [on_z[i + 1] - on_z[i] for i in (0, 2)]
+    on_y = [on_z[2 * i] + y * slope for i, slope in enumerate(along_y)]
+    z_on_y = [_lerp(along_z[i], along_z[i + 1], y) for i in (0, 2)]
+    along_x = on_y[1] - on_y[0]
+    slopes = [
+        along_x,
+        _lerp(along_y[0], along_y[1], x),
+        _lerp(z_on_y[0], z_on_y[1], x),
+    ]
+    return on_y[0] + x * along_x, slopes
+
+
+def _lerp(low: GraphValue, high: GraphValue, share: GraphValue) -> GraphValue:
+    return low + share * (high - low)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InverseJacobian:
+    """The inverse of derivatives: values of the graph, one entry a point.
+
+    Attributes:
+        cofactors: Of the derivative per step between nodes.
+        scale: For each row of the cofactors, what makes it the inverse's, per metre; 0 where the
+            derivative cannot be inverted.
+        trusted: Where it can: the skin is neither folded over nor torn apart.
+    """
+
+    cofactors: MatrixValue
+    scale: VectorValue
+    trusted: GraphValue
+
+    def apply(self, vector: VectorValue) -> VectorValue:
+        """The inverse times a vector."""
+        return [
+            dot(row, vector) * scale for row, scale in zip(self.cofactors, self.scale, strict=True)
+        ]
+
+
+def invert_jacobian(
+    scene: GraphContext, jacobian: MatrixValue, cofactors: MatrixValue
+) -> InverseJacobian:
+    """Inverts derivatives (metres a step between nodes), given their adjugates."""
+    per_m = skinning_nodes_per_m(scene)
+    volume = dot(jacobian[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
+    stretch = scene.settings.max_volume_ratio
+    trusted = (volume > 1.0 / stretch) & (volume < stretch)
+    one = scene.graph.where(trusted, volume, 1e30).reciprocal()
+    scale = [one * float(np.prod(per_m) / step) for step in per_m]
+    return InverseJacobian(cofactors=cofactors, scale=scale, trusted=trusted)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedSurfels:
+    """The hull: values of the graph, one entry a surfel.
+
+    Attributes:
+        place: Where they lie among the skin's nodes, the same in all poses.
+        rows: Of the four nodes about each, and
+        normal: its normal per step along the edges between these, also the same in all poses.
+        camera: Positions in the camera's frame, linear in tetrahedra.
+        folded: Whether the posed tetrahedron has less than `fold_volume_ratio` of its canonical volume;
+            inside out counts as negative.
+    """
+
+    cell: SkinningCell
+    rows: list[GraphValue]
+    normal: VectorValue
+    camera_positions: VectorValue
+    folded: GraphValue
+
+
+def pose_surfels(scene: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
+    """Positions as sums over four nodes each.
+
+    All but the nodes' posed places is the same in every pose: onnxruntime computes it once.
+    """
+    columns = scene.table_values
+    place = locate_skinning_cell(scene, [columns[f"position_{letter}"] for letter in "xyz"])
+    rows, shares, normal, handed = _surfel_tetrahedra(scene, place)
+    corners = [gather_vector(posed.camera_positions, row) for row in rows]
+    camera = []
+    for axis in range(3):
+        parts = [corner[axis] * share for corner, share in zip(corners, shares, strict=True)]
+        camera.append(parts[0] + parts[1] + parts[2] + parts[3])
+    edges = _tetrahedron_edges(corners)
+    volume = dot(edges[0], cross(edges[1], edges[2])) * handed
+    least = scene.settings.fold_volume_ratio / float(np.prod(skinning_nodes_per_m(scene)))
+    return PosedSurfels(
+        cell=place, rows=rows, normal=normal, camera_positions=camera, folded=volume < least
+    )
+
+
+def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
+    """The three edges from each corner to the next."""
+    return [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
+
+
+def faces_camera(
+    scene: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue
+) -> GraphValue:
+    """Which of some surfels face the camera: n · J⁻¹ c, J the derivative in the tetrahedron.
+
+    J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
+    """
+    rules, rows = scene.settings, gather_vector(surfels.rows, number)
+    edges = _tetrahedron_edges([gather_vector(posed.camera_positions, row) for row in rows])
+    across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
+    volume = dot(edges[0], across[0])
+    camera = gather_vector(surfels.camera_positions, number)
+    facing = dot(gather_vector(surfels.normal, number), [dot(vector, camera) for vector in across])
+    # the way along the edges turns left or right, so the volume may have either sign
+    return facing * volume < camera[2] * volume * volume * -rules.min_facing_cosine
+
+
+def _surfel_tetrahedra(
+    scene: GraphContext, place: SkinningCell
+) -> tuple[list[GraphValue], list[GraphValue], VectorValue, GraphValue]:
+    """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
+
+    The last value is 1 where these edges are right-handed in canonical space, and -1 elsewhere.
+
+    The way from the lower to the upper corner of a cell takes the axis of the largest fraction
+    first (as `lookup.Cell`).
+    """
+    graph, (x, y, z) = scene.graph, place.fraction
+    low, along_y, along_x, along_both = place.rows
+    x_over_y, x_over_z, y_over_z = x > y, x > z, y > z
+    first = graph.where(
+        x_over_y, graph.where(x_over_z, along_x, low + 1), graph.where(y_over_z, along_y, low + 1)
+    )
+    second = graph.where(
+        x_over_y,
+        graph.where(y_over_z, along_both, along_x + 1),
+        graph.where(x_over_z, along_both, along_y + 1),
+    )
+    largest, smallest = x.maximum(y, z), x.minimum(y, z)
+    middle = (x + y + z) - largest - smallest
+    shares = [1.0 - largest, largest - middle, middle - smallest, smallest]
+    nx, ny, nz = (
+        scene.table_values[f"normal_{letter}"] * (1.0 / per_m)
+        for letter, per_m in zip("xyz", skinning_nodes_per_m(scene), strict=True)
+    )
+    one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
+    three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))
+    normal = [one, (nx + ny + nz) - one - three, three]
+    right, left = (graph.constant(np.float32(sign)) for sign in (1.0, -1.0))
+    handed = graph.where(
+        x_over_y,
+        graph.where(x_over_z, graph.where(y_over_z, right, left), right),
+        graph.where(y_over_z, graph.where(x_over_z, left, right), left),
+    )
+    return [low, first, second, along_both + 1], shares, normal, handed

@@ -1,0 +1,375 @@
+"""A small writer of ONNX graphs: Python's operators become nodes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, final
+
+import numpy as np
+import onnx
+from jaxtyping import Shaped
+from onnx import TensorProto, helper, numpy_helper
+
+ONNX_OPSET = 18
+ONNX_IR_VERSION = 9
+ONNX_TYPES = {
+    np.dtype(np.float32): TensorProto.FLOAT,
+    np.dtype(np.int32): TensorProto.INT32,
+    np.dtype(np.int64): TensorProto.INT64,
+    np.dtype(np.uint32): TensorProto.UINT32,
+    np.dtype(np.uint8): TensorProto.UINT8,
+    np.dtype(np.int8): TensorProto.INT8,
+    np.dtype(np.bool_): TensorProto.BOOL,
+}
+"""ONNX's name of each element type that a graph here may hold."""
+
+
+@final
+class GraphValue:
+    """A tensor of the graph: known by its name and element type, computed when the graph runs.
+
+    Arithmetic between values, or between a value and a number, adds a node. A plain number takes
+    the element type of the value beside it.
+    """
+
+    def __init__(self, graph: "GraphBuilder", name: str, dtype: np.dtype) -> None:
+        """Called by `GraphBuilder`; a value always belongs to one graph."""
+        self.graph, self.name, self.dtype = graph, name, np.dtype(dtype)
+
+    def _with(self, kind: str, *others: "Operand", dtype: Any = None) -> "GraphValue":
+        operands = [self.graph.value(other, self.dtype) for other in others]
+        return self.graph.node(kind, self, *operands, dtype=dtype or self.dtype)
+
+    def __add__(self, other: "Operand") -> "GraphValue":
+        """Sum."""
+        return self._with("Add", other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: "Operand") -> "GraphValue":
+        """Difference."""
+        return self._with("Sub", other)
+
+    def __rsub__(self, other: "Operand") -> "GraphValue":
+        """Difference."""
+        return self.graph.value(other, self.dtype) - self
+
+    def __mul__(self, other: "Operand") -> "GraphValue":
+        """Product."""
+        return self._with("Mul", other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: "Operand") -> "GraphValue":
+        """Quotient of floats."""
+        return self._with("Div", other)
+
+    def __rtruediv__(self, other: "Operand") -> "GraphValue":
+        """Quotient of floats."""
+        return self.graph.value(other, self.dtype) / self
+
+    def __floordiv__(self, other: "Operand") -> "GraphValue":
+        """Quotient of integers that are not negative (ONNX rounds towards zero)."""
+        assert self.dtype.kind in "iu"
+        return self._with("Div", other)
+
+    def __neg__(self) -> "GraphValue":
+        """Negative."""
+        return self._with("Neg")
+
+    def __lt__(self, other: "Operand") -> "GraphValue":
+        """Less."""
+        return self._with("Less", other, dtype=np.bool_)
+
+    def __gt__(self, other: "Operand") -> "GraphValue":
+        """Greater."""
+        return self._with("Greater", other, dtype=np.bool_)
+
+    def equal(self, other: "Operand") -> "GraphValue":
+        """Where both are the same number."""
+        return self._with("Equal", other, dtype=np.bool_)
+
+    def __and__(self, other: "GraphValue") -> "GraphValue":
+        """Both, of truth values."""
+        return self._with("And", other)
+
+    def bitwise_and(self, mask: int) -> "GraphValue":
+        """Bitwise and with a constant."""
+        return self._with("BitwiseAnd", mask)
+
+    def shift_right(self, bits: int) -> "GraphValue":
+        """Bits shifted right, zeros shifted in (ONNX shifts unsigned integers only)."""
+        unsigned = self.cast(np.uint32)
+        by = self.graph.value(bits, unsigned.dtype)
+        return self.graph.node("BitShift", unsigned, by, direction="RIGHT")
+
+    def cast(self, dtype: Any) -> "GraphValue":
+        """The same numbers in another element type (floats are cut towards zero)."""
+        return self.graph.node("Cast", self, dtype=dtype, to=ONNX_TYPES[np.dtype(dtype)])
+
+    def floor(self) -> "GraphValue":
+        """Next integer below, as a float."""
+        return self._with("FloorPlane")
+
+    def exp(self) -> "GraphValue":
+        """Exponential."""
+        return self._with("Exp")
+
+    def exp2(self) -> "GraphValue":
+        """Two to the power of it."""
+        return self.graph.node("Pow", self.graph.value(2.0, self.dtype), self)
+
+    def sqrt(self) -> "GraphValue":
+        """Square root."""
+        return self._with("Sqrt")
+
+    def reciprocal(self) -> "GraphValue":
+        """One over it."""
+        return self._with("Reciprocal")
+
+    def minimum(self, *others: "Operand") -> "GraphValue":
+        """Elementwise minimum."""
+        return self._with("Min", *others)
+
+    def maximum(self, *others: "Operand") -> "GraphValue":
+        """Elementwise maximum."""
+        return self._with("Max", *others)
+
+    def reduce_min(self) -> "GraphValue":
+        """The smallest element, as a scalar."""
+        return self._with_attributes("ReduceMin", keepdims=0)
+
+    def reduce_max(self) -> "GraphValue":
+        """The largest element, as a scalar."""
+        return self._with_attributes("ReduceMax", keepdims=0)
+
+    def reduce_sum(self, axis: int) -> "GraphValue":
+        """The sum along one axis, which goes away."""
+        along = self.graph.constant(np.array([axis], dtype=np.int64))
+        return self.graph.node("ReduceSum", self, along, keepdims=0)
+
+    def clip(self, low: "Operand", high: "Operand") -> "GraphValue":
+        """Clamped to [low, high]."""
+        return self._with("Clip", low, high)
+
+    def gather(self, places: "GraphValue") -> "GraphValue":
+        """`self[places]` for one-dimensional tensors: five times faster than ONNX's Gather."""
+        return self.graph.node("GatherElements", self, places, dtype=self.dtype, axis=0)
+
+    def gather_rows(self, rows: "GraphValue") -> "GraphValue":
+        """`self[rows]` for tensors of more than one dimension."""
+        return self.graph.node("Gather", self, rows, dtype=self.dtype, axis=0)
+
+    def compress(self, condition: "GraphValue") -> "GraphValue":
+        """`self[condition]` for one-dimensional tensors."""
+        return self.graph.node("Compress", self, condition, axis=0)
+
+    def row(self, index: int) -> "GraphValue":
+        """`self[index]`."""
+        return self.gather_rows(self.graph.constant(np.int64(index)))
+
+    def matmul(self, other: "GraphValue") -> "GraphValue":
+        """Matrix product."""
+        return self._with("MatMul", other)
+
+    def transpose(self, *order: int) -> "GraphValue":
+        """Axes in another order."""
+        return self._with_attributes("Transpose", perm=list(order))
+
+    def reshape(self, *shape: "Operand") -> "GraphValue":
+        """Another shape; sizes may be values, and one may be -1."""
+        return self.graph.node("Reshape", self, self.graph.shape(*shape), dtype=self.dtype)
+
+    def slice_axes(self, starts: "Sequence[Operand]", ends: "Sequence[Operand]") -> "GraphValue":
+        """`self[starts[0]:ends[0], …]` over the leading axes."""
+        bounds = self.graph.shape(*starts), self.graph.shape(*ends)
+        axes = self.graph.constant(np.arange(len(starts), dtype=np.int64))
+        return self.graph.node("Slice", self, *bounds, axes, dtype=self.dtype)
+
+    def scatter(
+        self, places: "GraphValue", updates: "GraphValue", reduction: str = "none"
+    ) -> "GraphValue":
+        """A copy with `updates` written (or reduced) into one-dimensional `places`."""
+        operands = (self, places, updates)
+        return self.graph.node(
+            "ScatterElements", *operands, dtype=self.dtype, axis=0, reduction=reduction
+        )
+
+    def _with_attributes(self, kind: str, **attributes: Any) -> "GraphValue":
+        return self.graph.node(kind, self, dtype=self.dtype, **attributes)
+
+
+@final
+class GraphBuilder:
+    """An ONNX graph being written."""
+
+    def __init__(self) -> None:
+        """An empty graph."""
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], GraphValue] = {}
+        self._initialisers: list[onnx.TensorProto] = []
+        self._inputs: list[onnx.ValueInfoProto] = []
+        self._outputs: list[onnx.ValueInfoProto] = []
+        self._count = 0
+
+    def input(self, name: str, dtype: Any, shape: Sequence[int]) -> GraphValue:
+        """An input of the graph."""
+        kind = ONNX_TYPES[np.dtype(dtype)]
+        self._inputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
+        return GraphValue(self, name, np.dtype(dtype))
+
+    def output(self, value: GraphValue, name: str, shape: Sequence[int | str]) -> None:
+        """An output of the graph; named sizes are known only when it runs."""
+        self._nodes.append(helper.make_node("Identity", [value.name], [name]))
+        kind = ONNX_TYPES[value.dtype]
+        self._outputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
+
+    def table(self, name: str, array: Shaped[np.ndarray, "..."]) -> GraphValue:
+        """A named initialiser kept outside of the model, as a "file" of its own name."""
+        tensor = TensorProto(name=name, data_type=ONNX_TYPES[array.dtype], dims=array.shape)
+        tensor.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", name), ("offset", 0), ("length", array.nbytes)):
+            tensor.external_data.add(key=key, value=str(value))
+        self._initialisers.append(tensor)
+        return GraphValue(self, name, array.dtype)
+
+    def constant(self, array: Any) -> GraphValue:
+        """A small initialiser inside of the graph; equal ones are stored once."""
+        array = np.asarray(array)
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._constants:
+            name = f"constant_{len(self._constants)}"
+            self._initialisers.append(numpy_helper.from_array(array, name))
+            self._constants[key] = GraphValue(self, name, array.dtype)
+        return self._constants[key]
+
+    def value(self, operand: "Operand", dtype: Any) -> GraphValue:
+        """The operand itself if it is a value, else a constant of that element type."""
+        if isinstance(operand, GraphValue):
+            return operand
+        return self.constant(np.asarray(operand, dtype=dtype))
+
+    def shape(self, *sizes: "Operand") -> GraphValue:
+        """A list of sizes, some of them known only when the graph runs (int64 scalars)."""
+        if not any(isinstance(size, GraphValue) for size in sizes):
+            return self.constant(np.array(sizes, dtype=np.int64))
+        whole = self.constant(np.array([1], dtype=np.int64))
+        lists = [self.node("Reshape", self.value(size, np.int64), whole) for size in sizes]
+        return self.concatenate(lists)
+
+    def node(
+        self, kind: str, *operands: GraphValue, dtype: Any = None, **attributes: Any
+    ) -> GraphValue:
+        """One node with one output, of the first operand's element type unless said otherwise."""
+        self._count += 1
+        name = f"{kind.lower()}_{self._count}"
+        inputs = [operand.name for operand in operands]
+        self._nodes.append(helper.make_node(kind, inputs, [name], name=name, **attributes))
+        return GraphValue(self, name, np.dtype(dtype or operands[0].dtype))
+
+    def where(self, condition: GraphValue, yes: "Operand", no: "Operand") -> GraphValue:
+        """`yes` where the condition holds, else `no`; at least one of them is a value."""
+        known = yes if isinstance(yes, GraphValue) else no
+        assert isinstance(known, GraphValue)
+        yes, no = self.value(yes, known.dtype), self.value(no, known.dtype)
+        return self.node("Where", condition, yes, no, dtype=known.dtype)
+
+    def range(self, count: GraphValue) -> GraphValue:
+        """0, 1, … count − 1, of the count's type; the count is a scalar."""
+        limits = [self.value(limit, count.dtype) for limit in (0, 1)]
+        return self.node("Range", limits[0], count, limits[1])
+
+    def size(self, value: GraphValue) -> GraphValue:
+        """How many elements a value has, int64 scalar."""
+        return self.node("Size", value, dtype=np.int64)
+
+    def concatenate(self, values: Sequence[GraphValue], axis: int = 0) -> GraphValue:
+        """Values one after the other."""
+        return self.node("Concat", *values, axis=axis)
+
+    def full(self, shape: GraphValue, number: Any) -> GraphValue:
+        """A tensor that holds one number (numpy scalar) everywhere."""
+        number = np.asarray(number).reshape(1)
+        fill = numpy_helper.from_array(number)
+        return self.node("ConstantOfShape", shape, dtype=number.dtype, value=fill)
+
+    def loop(
+        self,
+        count: GraphValue,
+        states: Sequence[GraphValue],
+        body: Callable[[GraphValue, list[GraphValue]], Sequence[GraphValue]],
+    ) -> list[GraphValue]:
+        """`for i in range(count): states = body(i, states)`; the body may use any outer value."""
+
+        def turned(turn: GraphValue, held: list[GraphValue]) -> tuple[None, list[GraphValue]]:
+            return None, list(body(turn, held))
+
+        return self._loop(count, states, turned)
+
+    def loop_while(
+        self,
+        max_turns: GraphValue,
+        states: Sequence[GraphValue],
+        body: Callable[[GraphValue, list[GraphValue]], tuple[GraphValue | None, list[GraphValue]]],
+    ) -> list[GraphValue]:
+        """`for i in range(most): go, states = body(i, states)` until it is told not to go on.
+
+        The states' lengths may change from turn to turn.
+        """
+        return self._loop(max_turns, states, body)
+
+    def split(self, value: GraphValue, parts: int, axis: int = 0) -> list[GraphValue]:
+        """Equal pieces along an axis, which is as long as there are pieces and goes away."""
+        self._count += 1
+        names = [f"split_{self._count}_{i}" for i in range(parts)]
+        self._nodes.append(
+            helper.make_node("Split", [value.name], names, axis=axis, num_outputs=parts)
+        )
+        return [GraphValue(self, name, value.dtype).reshape(-1) for name in names]
+
+    def _loop(
+        self,
+        count: GraphValue,
+        states: Sequence[GraphValue],
+        body: Callable[[GraphValue, list[GraphValue]], tuple[GraphValue | None, list[GraphValue]]],
+    ) -> list[GraphValue]:
+        self._count += 1
+        prefix = f"loop_{self._count}"
+        before, self._nodes = self._nodes, []
+        go = GraphValue(self, f"{prefix}_go", np.dtype(np.bool_))
+        turn = GraphValue(self, f"{prefix}_turn", np.dtype(np.int64))
+        held = [GraphValue(self, f"{prefix}_state_{i}", s.dtype) for i, s in enumerate(states)]
+        more, after = body(turn, held)
+        results = [self.node("Identity", go if more is None else more), *after]
+        inner = helper.make_graph(
+            self._nodes,
+            prefix,
+            [_scalar_info(turn), _scalar_info(go), *(_vector_info(value) for value in held)],
+            [_scalar_info(results[0]), *(_vector_info(value) for value in results[1:])],
+        )
+        self._nodes = before
+        outputs = [GraphValue(self, f"{prefix}_result_{i}", s.dtype) for i, s in enumerate(states)]
+        inputs = [count.name, self.constant(np.array(True)).name, *(s.name for s in states)]
+        names = [output.name for output in outputs]
+        self._nodes.append(helper.make_node("Loop", inputs, names, name=prefix, body=inner))
+        return outputs
+
+    def model(self) -> onnx.ModelProto:
+        """The graph as a model; its tables are handed to the runtime beside it."""
+        return helper.make_model(
+            helper.make_graph(
+                self._nodes, "avatar", self._inputs, self._outputs, self._initialisers
+            ),
+            opset_imports=[helper.make_opsetid("", ONNX_OPSET)],
+            ir_version=ONNX_IR_VERSION,
+        )
+
+
+def _scalar_info(value: GraphValue) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], [])
+
+
+def _vector_info(value: GraphValue) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], [None])
+
+
+Operand = GraphValue | float | int | np.generic | np.ndarray
+"""What may stand beside a value: another one, or a number."""

@@ -1,0 +1,157 @@
+"""The player's graph: bones and camera in, a picture with alpha out. The only door out of numpy."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+
+from export.graph.graph_context import CameraValues, GraphContext, gather_vector
+from export.graph.graph_ray_setup import (
+    DepthLayer,
+    PosedProxySurface,
+    pixel_rays,
+    trace_depth_layer,
+)
+from export.graph.graph_skinning import pose_nodes, pose_surfels
+from export.graph.graph_zbuffer import (
+    EMPTY_KEY,
+    SplatWindow,
+    SurfelSplats,
+    depth_limits,
+    hidden_splats,
+    keys_behind_limits,
+    nearest_keys,
+    project_surfels,
+)
+from export.graph.onnx_builder import GraphBuilder, GraphValue
+from export.package.graph_tables import graph_initializers
+from export.package.player_tables import PlayerTables
+from export.package.render_settings import RenderSettings
+
+
+def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
+    """The graph that draws `tables`.
+
+    Inputs: `bones` (24, 12), camera-from-canonical 3×4 matrices in metres; `camera` (4), focal
+    lengths and centre in pixels; `height`, `width`, `samples`, int64 scalars. Output: `rgba`
+    (height × width), int32: red, green, blue and straight alpha, one byte each, red the lowest.
+    Its tables stay outside (`initialisers`).
+    """
+    graph = GraphBuilder()
+    scene = GraphContext(
+        graph=graph,
+        tables=tables,
+        table_values={
+            name: graph.table(name, array)
+            for name, array in graph_initializers(tables, settings).items()
+        },
+        settings=settings,
+        camera=_camera_inputs(graph),
+        samples=graph.input("samples", np.int64, []),
+    )
+    graph.output(_draw_picture(scene), "rgba", ["pixels"])
+    return graph.model()
+
+
+def _draw_picture(scene: GraphContext) -> GraphValue:
+    graph = scene.graph
+    posed = pose_nodes(scene)
+    hull = PosedProxySurface(surfels=pose_surfels(scene, posed), posed=posed)
+    splats = project_surfels(scene, hull.surfels)
+    window = splats.window
+    keys = nearest_keys(scene, splats)
+    covered = keys < EMPTY_KEY
+    pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
+    ray = pixel_rays(scene.camera, window, pixel)
+    first = trace_depth_layer(scene, hull, keys.gather(pixel), ray, None)
+    channels = [*first.color, first.transmittance]
+    if scene.settings.layers > 1:
+        channels = _add_further_layers(scene, hull, splats, pixel, first)
+    return _pack_rgba(scene, window, pixel, channels)
+
+
+def _camera_inputs(graph: GraphBuilder) -> CameraValues:
+    bones = graph.input("bones", np.float32, [24, 12])
+    camera = graph.input("camera", np.float32, [4])
+    return CameraValues(
+        bones=bones,
+        focal=(camera.row(0), camera.row(1)),
+        center=(camera.row(2), camera.row(3)),
+        height=graph.input("height", np.int64, []),
+        width=graph.input("width", np.int64, []),
+    )
+
+
+def _add_further_layers(
+    scene: GraphContext,
+    hull: PosedProxySurface,
+    splats: SurfelSplats,
+    pixel: GraphValue,
+    first: DepthLayer,
+) -> list[GraphValue]:
+    """Color and light after all layers, one entry a ray of the first."""
+    graph, window, hidden = scene.graph, splats.window, None
+    color, light, before = first.color, first.transmittance, first
+    number = graph.range(graph.size(pixel).cast(np.int32))
+    for _ in range(1, scene.settings.layers):
+        wanted = before.transmittance > scene.settings.layer_min_transmittance
+        kept = graph.range(graph.size(number).cast(np.int32)).compress(wanted)
+        cell = _window_cells(window, pixel.gather(number.gather(kept)))
+        depth = (before.enter * before.ray[2]).gather(kept) + scene.settings.layer_gap_m
+        limits = depth_limits(scene, window, cell, depth)
+        hidden = hidden or hidden_splats(scene, hull.posed, hull.surfels, splats, limits)
+        keys = keys_behind_limits(
+            scene, hull.surfels, hidden, limits, cell, before.surfel.gather(kept)
+        )
+        there = keys < EMPTY_KEY
+        keys, kept = keys.compress(there), kept.compress(there)
+        number = number.gather(kept)
+        seen_from = DepthLayer(
+            ray=gather_vector(before.ray, kept),
+            surfel=before.surfel.gather(kept),
+            canonical_position=gather_vector(before.canonical_position, kept),
+            camera_position=gather_vector(before.camera_position, kept),
+            color=before.color,
+            transmittance=before.transmittance.gather(kept),
+            enter=before.enter,
+            end=before.end.gather(kept),
+        )
+        layer = trace_depth_layer(scene, hull, keys, seen_from.ray, seen_from)
+        color = [
+            c.scatter(number, behind * seen_from.transmittance, reduction="add")
+            for c, behind in zip(color, layer.color, strict=True)
+        ]
+        before = replace(layer, transmittance=seen_from.transmittance * layer.transmittance)
+        light = light.scatter(number, before.transmittance)
+    return [*color, light]
+
+
+def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
+    """Cells of the buffer in which pixels of the window lie."""
+    width, stride = window.width.cast(np.int32), window.stride.cast(np.int32)
+    row = pixel // width
+    border = window.border.cast(np.int32)
+    return (row + border) * stride + (pixel - row * width + border)
+
+
+def _pack_rgba(
+    scene: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]
+) -> GraphValue:
+    """The whole picture, eight bits a channel, straight alpha: colour is divided by alpha."""
+    graph, view = scene.graph, scene.camera
+    *color, light = channels
+    alpha = 1.0 - light
+    inverse = 255.0 / alpha.maximum(1e-6)
+    bytes_ = [
+        (value + 0.5).clip(0.0, 255.0).cast(np.int32)
+        for value in [*(channel * inverse for channel in color), alpha * 255.0]
+    ]
+    red, green, blue, alpha = bytes_
+    alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte holds the sign
+    packed = red + green * (1 << 8) + blue * (1 << 16) + alpha * (1 << 24)
+    width = window.width.cast(np.int32)
+    row = pixel // width
+    column = pixel - row * width + window.left.cast(np.int32)
+    place = (row + window.top.cast(np.int32)) * view.width.cast(np.int32) + column
+    empty = graph.full(graph.shape(view.num_pixels), np.int32(0))
+    return empty.scatter(place, packed)

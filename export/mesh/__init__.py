@@ -1,0 +1,1 @@
+"""Meshes: isosurface, skin and glTF."""

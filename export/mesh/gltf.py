@@ -1,0 +1,246 @@
+"""A skinned mesh with its skeleton and a motion, as glTF 2.0 in one binary file (.glb)."""
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float, Float32, Shaped, UInt16
+from scipy.spatial.transform import Rotation
+
+from export.mesh.skinned_mesh import SkinnedMesh
+from export.package.manifest import JOINT_NAMES, Manifest
+from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import body_from_rest
+
+COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+"""glTF's numbers of the element types."""
+ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkeletonAnimation:
+    """A motion as the skeleton's nodes take it.
+
+    Attributes:
+        times_s: Rising from 0.
+        translations: Of the pelvis, metres.
+        rotations: Of every joint, as quaternions x, y, z, w whose signs do not jump.
+    """
+
+    times_s: Float32[np.ndarray, "poses"]
+    translations: Float32[np.ndarray, "poses 3"]
+    rotations: Float32[np.ndarray, "24 poses 4"]
+
+    @classmethod
+    def of(
+        cls, motion: Motion, rows: tuple[int, ...], fps: float, pelvis: Float[np.ndarray, "3"]
+    ) -> "SkeletonAnimation":
+        """The valid poses of a motion, turned and shifted so that the first one stands in place.
+
+        glTF's axes are the body's own (y up, the front towards z); a tracker's world may lie
+        anyhow, so the first pose's root gives up, forward and the origin.
+
+        Args:
+            motion: In the tracker's world.
+            rows: Which of its poses.
+            fps: Poses a second.
+            pelvis: Rest pelvis, metres.
+        """
+        chosen = list(rows)
+        roots = Rotation.from_rotvec(motion.root_rotations[chosen])
+        upright = roots[0].inv()
+        shifts = motion.root_translations[chosen]
+        bends = motion.joint_rotations[chosen].reshape(-1, 3)
+        joints = Rotation.from_rotvec(bends).as_quat().reshape(-1, 23, 4)
+        turned = (upright * roots).as_quat()[:, None]
+        rotations = np.concatenate([turned, joints], axis=1).transpose(1, 0, 2)
+        return cls(
+            times_s=(np.arange(len(chosen)) / fps).astype(np.float32),
+            translations=(pelvis + upright.apply(shifts - shifts[0])).astype(np.float32),
+            rotations=_continuous_quaternions(rotations).astype(np.float32),
+        )
+
+
+def _continuous_quaternions(
+    quaternions: Float[np.ndarray, "24 poses 4"],
+) -> Float[np.ndarray, "24 poses 4"]:
+    """q and -q are the same rotation; the nearer one to its predecessor is taken."""
+    steps = np.sum(quaternions[:, 1:] * quaternions[:, :-1], axis=-1)
+    signs = np.cumprod(np.where(steps < 0.0, -1.0, 1.0), axis=1)
+    return np.concatenate([quaternions[:, :1], quaternions[:, 1:] * signs[..., None]], axis=1)
+
+
+def encode_glb(
+    mesh: SkinnedMesh, manifest: Manifest, animation: SkeletonAnimation, *, name: str
+) -> bytes:
+    """The file's bytes.
+
+    Colors hold the light of the recording, so the material asks for no light of its own
+    (KHR_materials_unlit); importers that do not know that see a matt one. The canonical pose is
+    the bind pose, and the skeleton rests in it.
+
+    Args:
+        mesh: In the canonical pose.
+        manifest: Its skeleton.
+        animation: What it does.
+        name: Of the avatar.
+    """
+    draft = _GltfBuffer()
+    skin, nodes = _skeleton(draft, mesh, manifest)
+    content = {
+        "asset": {
+            "version": "2.0",
+            "generator": "instant-avatar-stream",
+            "copyright": manifest.licence,
+        },
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"name": name, "mesh": 0, "skin": 0}, *nodes],
+        "meshes": [{"name": name, "primitives": [_primitive(draft, mesh)]}],
+        "materials": [
+            {
+                "name": "as recorded",
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "skins": [skin],
+        "animations": [_animation(draft, animation)],
+        **draft.describe(),
+    }
+    return _pack_glb(content, bytes(draft.binary))
+
+
+FIRST_JOINT = 2
+"""Nodes: 0 is the mesh, then what stands on the floor, then the joints."""
+
+
+def _skeleton(
+    draft: "_GltfBuffer", mesh: SkinnedMesh, manifest: Manifest
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The skin, and the nodes of the joints below one that puts the feet on the floor."""
+    rest, parents = manifest.rest_joints, manifest.parents
+    canonical = body_from_rest(rest, parents, manifest.canonical_rotations)
+    canonical_from_joint = canonical.copy()
+    canonical_from_joint[:, :3, 3] += np.einsum("jab,jb->ja", canonical[:, :3, :3], rest)
+    inverse = np.linalg.inv(canonical_from_joint)
+    inverse[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    bent = np.concatenate([np.zeros((1, 3)), manifest.canonical_rotations])
+    bends = Rotation.from_rotvec(bent).as_quat()
+    nodes: list[dict[str, Any]] = []
+    for joint, parent in enumerate(parents):
+        offset = rest[joint] - (rest[parent] if parent >= 0 else 0.0)
+        children = [FIRST_JOINT + int(child) for child in np.flatnonzero(parents == joint)]
+        node = {"name": JOINT_NAMES[joint], "translation": offset.tolist()}
+        nodes.append({**node, "rotation": bends[joint].tolist(), "children": children})
+        if not children:
+            del nodes[-1]["children"]
+    floor = {"translation": [0.0, -float(mesh.positions[:, 1].min()), 0.0]}
+    skin = {
+        # column-major, as glTF has it
+        "inverseBindMatrices": draft.add(inverse.transpose(0, 2, 1).astype(np.float32)),
+        "joints": [FIRST_JOINT + joint for joint in range(len(parents))],
+        "skeleton": FIRST_JOINT,
+    }
+    return skin, [{"name": "floor", **floor, "children": [FIRST_JOINT]}, *nodes]
+
+
+def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
+    def vertices(array: Shaped[np.ndarray, "vertices _"], **more: Any) -> int:
+        return draft.add(array, target=ARRAY_BUFFER, **more)
+
+    return {
+        "attributes": {
+            "POSITION": vertices(mesh.positions, bounds=True),
+            "NORMAL": vertices(mesh.normals),
+            "COLOR_0": vertices(_srgb_to_linear(mesh.colors), normalized=True),
+            "JOINTS_0": vertices(mesh.joints),
+            "WEIGHTS_0": vertices(mesh.weights, normalized=True),
+        },
+        "indices": draft.add(mesh.faces.astype(np.uint32).ravel(), target=ELEMENT_ARRAY_BUFFER),
+        "material": 0,
+    }
+
+
+def _srgb_to_linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
+    """sRGB to linear light, which glTF's vertex colours are, and opaque; 16 bits keep the darks."""
+    srgb = colors.astype(np.float64) / 255.0
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    opaque = np.concatenate([light, np.ones((len(light), 1))], axis=1)
+    return np.round(opaque * 65535.0).astype(np.uint16)
+
+
+def _animation(draft: "_GltfBuffer", animation: SkeletonAnimation) -> dict[str, Any]:
+    times = draft.add(animation.times_s, bounds=True)
+    moves = [("translation", 0, animation.translations)]
+    moves += [("rotation", joint, turns) for joint, turns in enumerate(animation.rotations)]
+    return {
+        "name": "motion",
+        "samplers": [
+            {"input": times, "output": draft.add(values), "interpolation": "LINEAR"}
+            for _, _, values in moves
+        ],
+        "channels": [
+            {"sampler": number, "target": {"node": FIRST_JOINT + joint, "path": path}}
+            for number, (path, joint, _) in enumerate(moves)
+        ],
+    }
+
+
+@final
+class _GltfBuffer:
+    """The binary part while it grows, and what describes it."""
+
+    def __init__(self) -> None:
+        self.binary = bytearray()
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+
+    def add(
+        self,
+        array: Shaped[np.ndarray, "..."],
+        *,
+        target: int | None = None,
+        normalized: bool = False,
+        bounds: bool = False,
+    ) -> int:
+        """Adds an array of scalars, vectors or matrices; returns its accessor's number."""
+        content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content)}
+        self._views.append(view if target is None else {**view, "target": target})
+        self.binary += content + bytes(-len(content) % 4)
+        accessor: dict[str, Any] = {
+            "bufferView": len(self._views) - 1,
+            "componentType": COMPONENT_TYPES[array.dtype.name],
+            "count": len(array),
+            "type": ACCESSOR_TYPES[array.shape[1:]],
+        }
+        if normalized:
+            accessor["normalized"] = True
+        if bounds:
+            rows = array.reshape(len(array), -1)
+            accessor["min"] = rows.min(axis=0).tolist()
+            accessor["max"] = rows.max(axis=0).tolist()
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def describe(self) -> dict[str, Any]:
+        """What the JSON part says about the binary one."""
+        return {
+            "buffers": [{"byteLength": len(self.binary)}],
+            "bufferViews": self._views,
+            "accessors": self._accessors,
+        }
+
+
+def _pack_glb(content: dict[str, Any], binary: bytes) -> bytes:
+    """glTF's container: a header and two chunks, each padded to four bytes."""
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -1,0 +1,96 @@
+"""The zero set of a lattice of numbers as a mesh: one vertex a cell (naive surface nets)."""
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64
+
+CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+AXES = np.eye(3, dtype=np.int64)
+
+
+def extract_isosurface(
+    values: Float32[np.ndarray, "x y z"],
+) -> tuple[Float32[np.ndarray, "vertices 3"], Int32[np.ndarray, "faces 3"]]:
+    """Vertices in nodes of the lattice, and triangles that face from positive to negative.
+
+    Every cell that the zero set crosses has one vertex, the mean of where it crosses the cell's
+    edges; every lattice edge that it crosses has a quad between its four cells (Gibson 1998,
+    "Constrained elastic surface nets", without the relaxation). Closed if the border is negative.
+
+    Args:
+        values: Positive inside.
+    """
+    inside = values > 0.0
+    cells = _crossed_cells(inside)
+    vertices = _mean_crossings(values, inside, cells)
+    number = np.full(np.array(values.shape) - 1, -1, dtype=np.int32)
+    number[tuple(cells.T)] = np.arange(len(cells), dtype=np.int32)
+    quads = [_quads(inside, number, axis) for axis in range(3)]
+    return vertices, _triangles(vertices, np.concatenate(quads))
+
+
+def resample_grid(
+    values: Float32[np.ndarray, "x y z"], step: float
+) -> Float32[np.ndarray, "x2 y2 z2"]:
+    """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
+    for axis in range(3):
+        places = np.arange(0.0, values.shape[axis] - 1, step)
+        below = np.minimum(places.astype(int), values.shape[axis] - 2)  # a last place by rounding
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        part = (places - below).astype(np.float32).reshape(shape)
+        lower = np.take(values, below, axis=axis)
+        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
+    return values
+
+
+def _crossed_cells(inside: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "cells 3"]:
+    """Lowest corners of the cells whose corners do not agree."""
+    x, y, z = (size - 1 for size in inside.shape)
+    count = np.zeros((x, y, z), dtype=np.uint8)
+    for i, j, k in CORNERS:
+        count += inside[i : i + x, j : j + y, k : k + z]
+    return np.argwhere((count > 0) & (count < len(CORNERS)))
+
+
+def _mean_crossings(
+    values: Float32[np.ndarray, "x y z"],
+    inside: Bool[np.ndarray, "x y z"],
+    cells: Int64[np.ndarray, "cells 3"],
+) -> Float32[np.ndarray, "cells 3"]:
+    total = np.zeros((len(cells), 3), dtype=np.float64)
+    count = np.zeros(len(cells), dtype=np.int64)
+    for axis in range(3):
+        for corner in CORNERS[CORNERS[:, axis] == 0]:
+            start, end = tuple((cells + corner).T), tuple((cells + corner + AXES[axis]).T)
+            crossed = np.flatnonzero(inside[start] != inside[end])
+            a, b = values[start][crossed], values[end][crossed]
+            share = (a / (a - b)).astype(np.float64)
+            total[crossed] += corner + share[:, None] * AXES[axis]
+            count[crossed] += 1
+    return (cells + total / count[:, None]).astype(np.float32)
+
+
+def _quads(
+    inside: Bool[np.ndarray, "x y z"], number: Int32[np.ndarray, "cx cy cz"], axis: int
+) -> Int32[np.ndarray, "quads 4"]:
+    """The four cells round every crossed edge along an axis, anticlockwise seen from outside."""
+    here = [slice(1, -1)] * 3
+    there = list(here)
+    here[axis], there[axis] = slice(0, -1), slice(1, None)
+    leaves, enters = inside[tuple(here)], inside[tuple(there)]
+    offset = 1 - AXES[axis]
+    nodes = np.argwhere(leaves != enters) + offset
+    u, v = AXES[(axis + 1) % 3], AXES[(axis + 2) % 3]
+    quads = np.stack([number[tuple((nodes - c).T)] for c in (u + v, v, 0 * u, u)], axis=1)
+    outward = leaves[tuple((nodes - offset).T)]
+    return np.where(outward[:, None], quads, quads[:, ::-1])
+
+
+def _triangles(
+    vertices: Float32[np.ndarray, "vertices 3"], quads: Int32[np.ndarray, "quads 4"]
+) -> Int32[np.ndarray, "faces 3"]:
+    """Each quad along its shorter diagonal."""
+    a, b, c, d = (vertices[corner] for corner in quads.T)
+    shorter = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
+    along = np.where(shorter[:, None], quads, np.roll(quads, -1, axis=1))
+    return np.concatenate([along[:, [0, 1, 2]], along[:, [0, 2, 3]]])

@@ -1,0 +1,1 @@
+"""The package: tables, manifest and file."""

@@ -1,0 +1,155 @@
+"""The skin's nodes, at its own step or half of it: posed positions are linear between them.
+
+The tables as the graph reads them: one-dimensional columns.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int32, Shaped
+
+from capture.input_error import InputError
+from export.package.player_tables import BRICK_NODES, PlayerTables, SkinningGrid
+from export.package.render_settings import RenderSettings
+
+UNSTORED_M = 1e6
+"""Canonical coordinates of nodes that are not stored, metres. They make the derivative so
+large that it is never inverted: beyond the stored skin a ray keeps its direction."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinningNodes:
+    """Nodes of a grid whose cells are as long as the skin's, or half as long.
+
+    Linear blend skinning, Σ w_j(x) B_j x, carries each node to its posed place. Trilinear between
+    eight of these, at half the skin's step, it is at most some tenths of a millimetre from what the
+    skin itself says.
+
+    Attributes:
+        low: Corner of the grid, canonical metres.
+        step_m: Distance between nodes along x, y, z.
+        index: Which row belongs to each node, 0 where it or the next one along z is not stored.
+            Rows are numbered in C order: the row of the next node along z is the next one. There is
+            one row more than nodes, so that there always is a next one.
+        positions: Canonical metres; those of the first and the last row, which are no nodes, are
+            `UNSTORED_M`.
+        weights: Of the joints.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    step_m: Float32[np.ndarray, "3"]
+    index: Int32[np.ndarray, "x y z"]
+    positions: Float32[np.ndarray, "rows 3"]
+    weights: Float32[np.ndarray, "24 rows"]
+
+
+def skinning_nodes(skin: SkinningGrid, subdivision: int) -> SkinningNodes:
+    """The skin's nodes, its steps cut into so many parts.
+
+    Raises:
+        InputError: If that is neither 1 nor 2.
+    """
+    if subdivision not in (1, 2):
+        raise InputError(
+            f"The package cuts the skin's steps into {subdivision} parts; 1 or 2 can be. "
+            "The file is damaged or none of ours."
+        )
+    return subdivided_skinning_nodes(skin) if subdivision == 2 else stored_skinning_nodes(skin)
+
+
+@lru_cache(maxsize=1)
+def stored_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
+    """Every node that is stored."""
+    place = np.argwhere(skin.index > 0)
+    weights = np.zeros((24, len(place) + 2), dtype=np.float32)
+    weights[:, :-1] = skin.weights.T
+    weights[0, -1] = 1.0
+    return SkinningNodes(
+        low=skin.low,
+        step_m=skin.step_m,
+        index=_rows_with_next_in_z(skin.index),
+        positions=_padded_positions(place, skin.low, skin.step_m),
+        weights=weights,
+    )
+
+
+@lru_cache(maxsize=1)
+def subdivided_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
+    """Every node of the halved grid that a cell with eight stored corners holds."""
+    inside = _nodes_of_complete_cells(skin.index > 0)
+    place = np.argwhere(inside)
+    index = np.zeros(inside.shape, dtype=np.int32)
+    index[inside] = np.arange(1, len(place) + 1)
+    coarse, odd = place >> 1, place & 1
+    codes = np.ascontiguousarray(skin.weight_codes.T)
+    weights = np.zeros((24, len(place) + 2), dtype=np.float32)
+    weights[0, [0, -1]] = 1.0
+    for parity in np.ndindex(2, 2, 2):  # a node between others has the mean of its neighbours
+        chosen = np.flatnonzero((odd == parity).all(axis=1))
+        corners = [c for c in np.ndindex(2, 2, 2) if all(np.less_equal(c, parity))]
+        total = np.zeros((len(chosen), 24), dtype=np.uint32)
+        for corner in corners:
+            total += codes[skin.index[tuple((coarse[chosen] + corner).T)]]
+        sums = total.sum(axis=1, keepdims=True, dtype=np.float32)
+        weights[:, chosen + 1] = (total / np.maximum(sums, np.float32(1.0))).T
+    step_m = skin.step_m * np.float32(0.5)
+    return SkinningNodes(
+        low=skin.low,
+        step_m=step_m,
+        index=_rows_with_next_in_z(index),
+        positions=_padded_positions(place, skin.low, step_m),
+        weights=weights,
+    )
+
+
+def _rows_with_next_in_z(index: Int32[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
+    """The rows of those nodes alone whose next one along z is there."""
+    kept = np.zeros_like(index)
+    kept[..., :-1] = np.where(index[..., 1:] > 0, index[..., :-1], 0)
+    return kept
+
+
+def _padded_positions(
+    place: Int[np.ndarray, "nodes 3"],
+    low: Float32[np.ndarray, "3"],
+    step_m: Float32[np.ndarray, "3"],
+) -> Float32[np.ndarray, "rows 3"]:
+    """Positions of nodes, and of a row before and behind them that are nowhere."""
+    positions = (place * step_m + low).astype(np.float32)
+    return np.pad(positions, [(1, 1), (0, 0)], constant_values=UNSTORED_M)
+
+
+def _nodes_of_complete_cells(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:
+    """Nodes of the halved grid that belong to a cell whose corners are all stored."""
+    nx, ny, nz = stored.shape
+    whole = np.ones((nx - 1, ny - 1, nz - 1), dtype=bool)
+    for i, j, k in np.ndindex(2, 2, 2):
+        whole &= stored[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k]
+    inside = np.zeros((2 * nx - 1, 2 * ny - 1, 2 * nz - 1), dtype=bool)
+    for i, j, k in np.ndindex(3, 3, 3):
+        inside[i : i + 2 * nx - 2 : 2, j : j + 2 * ny - 2 : 2, k : k + 2 * nz - 2 : 2] |= whole
+    return inside
+
+
+def graph_initializers(
+    tables: PlayerTables, rules: RenderSettings
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Every table of the graph that draws by these rules, by its name."""
+    surfels, bricks = tables.surfels, tables.bricks
+    nodes = skinning_nodes(tables.skinning, rules.skinning_subdivision)
+    voxels = bricks.voxels.reshape(-1, 4)
+    red, green, blue = (voxels[:, channel].astype(np.int32) for channel in range(3))
+    columns = {
+        "voxel_color": red | green << 8 | blue << 16,
+        "voxel_density": np.ascontiguousarray(voxels[:, 3]),
+        "brick_offset": bricks.index.ravel() * np.int32(BRICK_NODES**3),
+        "node": nodes.index.ravel(),
+        "node_weights": nodes.weights,
+        "thickness": surfels.thickness,
+    }
+    for axis, letter in enumerate("xyz"):
+        columns[f"node_{letter}"] = np.ascontiguousarray(nodes.positions[:, axis])
+        columns[f"position_{letter}"] = np.ascontiguousarray(surfels.positions[:, axis])
+        columns[f"normal_{letter}"] = np.ascontiguousarray(surfels.normals[:, axis])
+    return columns

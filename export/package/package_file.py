@@ -1,0 +1,293 @@
+"""The `.iavatar` file: manifest, graph and compact streams in a zip, whole or not at all."""
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.atomic_files import AtomicFile
+from capture.input_error import InputError
+from export.package.manifest import Manifest
+from export.package.player_tables import PlayerTables
+from export.package.table_codec import TableLayout, decode_tables, encode_tables
+
+MANIFEST_ENTRY, PREVIEW_ENTRY = "manifest.json", "preview.png"
+MAX_ENTRIES = 64
+MAX_TEXT_BYTES = 4 << 20
+"""Bytes of a manifest, a graph or a preview."""
+MAX_FILE_BYTES = 256 << 20
+MAX_DIRECTORY_BYTES = 1 << 17
+"""Bytes of the zip's list of entries, which would be read before they can be counted."""
+ALLOWED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
+"""Time stamp of every entry: the same avatar is always the same bytes."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AvatarPackage:
+    """An avatar that plays without torch.
+
+    Attributes:
+        manifest: What it says about itself.
+        graphs: ONNX model of each tier; its tables are external.
+        tables: What each tier draws: the same, in its own way.
+        golden: Pictures of `manifest.golden`, straight alpha.
+        preview: A PNG.
+    """
+
+    manifest: Manifest
+    graphs: Mapping[str, bytes]
+    tables: Mapping[str, PlayerTables]
+    golden: tuple[UInt8[np.ndarray, "_ _ 4"], ...]
+    preview: bytes
+
+
+def graph_entry(tier: str) -> str:
+    """Where a tier's graph lies: player.onnx is the "hq" one."""
+    return "player.onnx" if tier == "hq" else f"{tier}/player.onnx"
+
+
+def stream_entry(stream: str) -> str:
+    """Where a stream lies; all tiers draw the same."""
+    return f"hq/{stream}.bin"
+
+
+def golden_entry(number: int) -> str:
+    """Where a golden frame lies: raw RGBA bytes."""
+    return f"golden/{number}.rgba"
+
+
+def write_package(package: AvatarPackage, path: Path) -> int:
+    """Writes the package under a temporary name, flushes it to the disk and renames it.
+
+    Returns:
+        Its size in bytes.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    with PackageWriter(path) as draft:
+        draft.add_tables(package.tables["hq"])
+        return draft.finish(package)
+
+
+@final
+class PackageWriter:
+    """A package under a temporary name, which it loses unless it is finished.
+
+    The tables can go in, and be compressed, while what is drawn of them is still being checked.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            path: Where the package will stand; an older one is replaced when this one is finished.
+        """
+        self._path = path
+        self._sums: dict[str, str] = {}
+
+    def __enter__(self) -> "PackageWriter":
+        """Opens the temporary file.
+
+        Raises:
+            OSError: If the folder cannot be written.
+        """
+        self._draft = AtomicFile(self._path)
+        self._file = self._draft.part.open("wb")
+        self._archive = zipfile.ZipFile(self._file, "w")
+        return self
+
+    def add_tables(self, tables: PlayerTables) -> None:
+        """Adds what all tiers draw."""
+        for name, stream in encode_tables(tables).items():
+            self._add(stream_entry(name), stream)
+
+    def finish(self, package: AvatarPackage) -> int:
+        """Adds graphs, golden frames, preview and manifest, and gives the package its name.
+
+        Args:
+            package: Its tables are in already.
+
+        Returns:
+            Its size in bytes.
+        """
+        for tier, graph in package.graphs.items():
+            self._add(graph_entry(tier), graph)
+        self._add(PREVIEW_ENTRY, package.preview)
+        for number, frame in enumerate(package.golden):
+            self._add(golden_entry(number), frame.tobytes())
+        manifest = replace(package.manifest, sha256=dict(self._sums))
+        self._add(MANIFEST_ENTRY, manifest.to_json().encode())
+        self._archive.close()
+        size = self._file.tell()
+        self._file.close()
+        self._draft.commit()
+        return size
+
+    def __exit__(self, *_: object) -> None:
+        """Removes what was not finished."""
+        with suppress(OSError, ValueError):  # a full disk fails again when the rest is flushed
+            self._archive.close()
+        with suppress(OSError):
+            self._file.close()
+        self._draft.discard()
+
+    def _add(self, name: str, content: bytes) -> None:
+        self._sums[name] = hashlib.sha256(content).hexdigest()
+        info = zipfile.ZipInfo(name, ENTRY_TIMESTAMP)
+        self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
+
+
+def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
+    """Reads a package, checking each entry's size before and its sum after reading.
+
+    Args:
+        path: The `.iavatar` file.
+        tier: The one that is wanted; all if None.
+
+    Raises:
+        InputError: If the file is missing, truncated, altered, or no package, or has no such tier.
+    """
+    try:
+        if path.exists() and not path.is_file():  # a folder; a pipe would never end
+            raise InputError(_not_a_file_message(path))
+        with path.open("rb") as file:
+            if (size := path.stat().st_size) > MAX_FILE_BYTES:
+                raise InputError(f"{path} has {size >> 20} MB; no package has. Refused.")
+            bounded = _BoundedFile(file, MAX_DIRECTORY_BYTES)
+            with zipfile.ZipFile(bounded) as archive:  # type: ignore[arg-type] - reads and seeks
+                bounded.max_read_bytes = None
+                return _read_archive(_UntrustedArchive(archive, path), tier)
+    except FileNotFoundError:
+        raise InputError(f"There is no package {path}. Make one with ia-ingest.") from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as error:
+        raise InputError(
+            f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
+        ) from error
+
+
+def _not_a_file_message(path: Path) -> str:
+    found = sorted(path.glob("*.iavatar")) if path.is_dir() else []
+    if found:
+        return f"{path} is a folder; the package in it is {found[0]}. Give that."
+    what = "a folder" if path.is_dir() else "no file"
+    return f"{path} is {what}; the .iavatar file that ia-ingest or ia-export wrote was expected."
+
+
+@final
+class _BoundedFile:
+    """A file of which no more than so many bytes are read at a time."""
+
+    def __init__(self, file: BinaryIO, most: int | None) -> None:
+        self._file, self.max_read_bytes = file, most
+
+    def read(self, size: int = -1) -> bytes:
+        """As of a file.
+
+        Raises:
+            zipfile.BadZipFile: If more is asked for.
+        """
+        if self.max_read_bytes is not None and not 0 <= size <= self.max_read_bytes:
+            content = self._file.read(self.max_read_bytes + 1)
+            if len(content) > self.max_read_bytes:
+                raise zipfile.BadZipFile("its list of entries is longer than any package's")
+            return content
+        return self._file.read(size)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+class _UntrustedArchive:
+    """A zip that is not trusted."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
+        infos = archive.infolist()
+        names = [info.filename for info in infos]
+        if len(names) > MAX_ENTRIES or len(set(names)) < len(names) or MANIFEST_ENTRY not in names:
+            raise InputError(
+                f"{path} is no avatar package: it must hold {MANIFEST_ENTRY} and at most "
+                f"{MAX_ENTRIES} entries, none of them twice. It holds {len(names)}."
+            )
+        for name in names:
+            parts = PurePosixPath(name).parts
+            if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
+                raise InputError(f"{path} holds {name!r}, a path outside of the package. Refused.")
+        for info in infos:
+            if info.flag_bits & 1 or info.compress_type not in ALLOWED_COMPRESSION:
+                raise InputError(
+                    f"{path}: {info.filename} is encrypted or compressed in a way that packages "
+                    "are not. Refused."
+                )
+        self._archive, self.path = archive, path
+        self._sizes = {info.filename: info.file_size for info in infos}
+
+    def read(self, name: str, *, max_bytes: int, exact_bytes: int | None = None) -> bytes:
+        """One entry; its size is known to be right before a byte of it is unpacked."""
+        size = self._sizes.get(name)
+        if size is None:
+            raise InputError(f"{self.path} is incomplete: {name} is missing. Export it again.")
+        if size > max_bytes or (exact_bytes is not None and size != exact_bytes):
+            wanted = (
+                f"{exact_bytes} bytes" if exact_bytes is not None else f"at most {max_bytes} bytes"
+            )
+            raise InputError(
+                f"{self.path}: {name} claims {size} bytes, expected {wanted}. Refused."
+            )
+        with self._archive.open(name) as file:
+            content = file.read(size + 1)
+        if len(content) != size:
+            raise InputError(f"{self.path}: {name} does not hold the {size} bytes that it claims.")
+        return content
+
+
+def _read_archive(archive: _UntrustedArchive, tier: str | None) -> AvatarPackage:
+    try:
+        manifest = Manifest.from_json(archive.read(MANIFEST_ENTRY, max_bytes=MAX_TEXT_BYTES))
+    except InputError as error:
+        raise InputError(f"{archive.path}: {error}") from error
+    if tier is not None and tier not in manifest.tiers:
+        known = ", ".join(sorted(manifest.tiers))
+        raise InputError(f"{archive.path} has no tier {tier!r}; it has: {known}.")
+
+    def checked(name: str, exactly: int | None = None) -> bytes:
+        content = archive.read(
+            name, max_bytes=MAX_TEXT_BYTES if exactly is None else exactly, exact_bytes=exactly
+        )
+        if hashlib.sha256(content).hexdigest() != manifest.sha256.get(name):
+            raise InputError(
+                f"{archive.path} was altered: {name} is not what was written. Export it again."
+            )
+        return content
+
+    layout = manifest.tiers["hq"].layout
+    tables = decode_tables(_read_streams(checked, layout), layout)
+    tiers = {name: n for name, n in manifest.tiers.items() if tier in (None, name)}
+    golden = []
+    for number, frame in enumerate(manifest.golden):
+        width, height = frame.camera.size_px
+        content = checked(golden_entry(number), height * width * 4)
+        golden.append(np.frombuffer(content, dtype=np.uint8).reshape(height, width, 4))
+    return AvatarPackage(
+        manifest=manifest,
+        graphs={name: checked(graph_entry(name)) for name in tiers},
+        tables=dict.fromkeys(tiers, tables),
+        golden=tuple(golden),
+        preview=checked(PREVIEW_ENTRY),
+    )
+
+
+def _read_streams(checked: Callable[[str, int], bytes], layout: TableLayout) -> dict[str, bytes]:
+    streams = {}
+    for name, (dtype, shape) in layout.stream_types().items():
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        streams[name] = checked(stream_entry(name), size)
+    return streams

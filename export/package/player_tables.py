@@ -1,0 +1,141 @@
+"""What a bake leaves: hull surfels, sparse bricks and a skin, as the small integers stored."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int8, Int32, UInt, UInt8, UInt16
+
+BRICK_SIZE = 8
+"""Voxels along a brick's edge; each brick also holds the first layer of its next neighbours."""
+BRICK_NODES = BRICK_SIZE + 1
+LOG_DENSITY_RANGE = (float(np.log(0.5)), float(np.log(3000.0)))
+"""Range of the 8-bit log-density, density in 1/m; code 0 means empty."""
+WEIGHT_SCALE = 65535
+"""Code of the skinning weight 1."""
+THICKNESS_STEP_M = 0.0005
+COLOR_CODE_STEP, DENSITY_CODE_STEP = 8, 16
+"""Voxels' codes are rounded to multiples of these: nobody sees it, and bytes halve. A step of
+density is 54 %."""
+SURFEL_BITS = 17
+"""A z-buffer key is 14 bits of depth over 17 bits of surfel number."""
+DEPTH_CODES = 1 << (31 - SURFEL_BITS)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfelTable:
+    """Points of the hull, just outside of what can be seen, in canonical space.
+
+    Attributes:
+        low: Corner of the position codes' cube, metres.
+        extent_m: Edge of that cube; position = low + code / 65535 · extent.
+        spacing_m: About how far neighbours lie apart.
+        position_codes: Sorted along a Morton curve.
+        normal_codes: Outward unit normals × 127.
+        thickness_codes: How deep one sees into the hull along the normal, in half millimetres.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    extent_m: float
+    spacing_m: float
+    position_codes: UInt16[np.ndarray, "surfels 3"]
+    normal_codes: Int8[np.ndarray, "surfels 3"]
+    thickness_codes: UInt8[np.ndarray, "surfels"]
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.position_codes)
+
+    @property
+    def positions(self) -> Float32[np.ndarray, "surfels 3"]:
+        """Canonical positions, metres."""
+        step = np.float32(self.extent_m / 65535.0)
+        return self.low + self.position_codes.astype(np.float32) * step
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "surfels 3"]:
+        """Outward canonical normals, of length 1 within 5 %."""
+        return self.normal_codes.astype(np.float32) / np.float32(127.0)
+
+    @property
+    def thickness(self) -> Float32[np.ndarray, "surfels"]:
+        """Metres along the normal."""
+        return self.thickness_codes.astype(np.float32) * np.float32(THICKNESS_STEP_M)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrickTable:
+    """Color and log-density on a voxel lattice, stored only near the surface.
+
+    Lattice node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
+
+    Attributes:
+        low: Corner of the lattice, canonical metres.
+        voxel_m: Distance between nodes.
+        index: Which brick covers each 8×8×8 block of nodes; 0 is the empty one.
+        voxels: RGB and log-density codes of each brick's 9×9×9 nodes.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    voxel_m: float
+    index: Int32[np.ndarray, "bx by bz"]
+    voxels: UInt8[np.ndarray, "bricks 9 9 9 4"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinningGrid:
+    """Skinning weights on the nodes of a grid, stored only where something can be seen.
+
+    Node (i, j, k) lies at `low + step_m · (i, j, k)`; between nodes weights are trilinear.
+
+    Attributes:
+        low: Corner of the grid, canonical metres.
+        step_m: Distance between nodes along x, y, z.
+        index: Which column of the codes belongs to each node, numbered in C order; 0 for none.
+        weight_codes: Weights × `WEIGHT_SCALE`. Column 0 is the root's alone.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    step_m: Float32[np.ndarray, "3"]
+    index: Int32[np.ndarray, "x y z"]
+    weight_codes: UInt16[np.ndarray, "24 columns"]
+
+    @property
+    def weights(self) -> Float32[np.ndarray, "columns 24"]:
+        """Skinning weights; rows sum to 1 within 0.01 %."""
+        return self.weight_codes.T.astype(np.float32) / np.float32(WEIGHT_SCALE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlayerTables:
+    """Everything that a tier of the player draws.
+
+    Attributes:
+        surfels: The hull.
+        bricks: What is inside.
+        skin: What moves it.
+        pelvis: Rest pelvis in canonical space, metres: the middle of the depth window.
+        reach_m: No surfel gets farther from the pelvis than this in any pose.
+    """
+
+    surfels: SurfelTable
+    bricks: BrickTable
+    skinning: SkinningGrid
+    pelvis: Float32[np.ndarray, "3"]
+    reach_m: float
+
+
+def encode_density(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
+    """8-bit log-density; densities below the range become 0, which is empty."""
+    low, high = LOG_DENSITY_RANGE
+    logs = np.log(np.maximum(density, 1e-9))
+    return np.clip(np.round((logs - low) / (high - low) * 255.0), 0, 255).astype(np.uint8)
+
+
+def round_codes(
+    codes: UInt[np.ndarray, "*batch"], step: int, largest: int
+) -> UInt[np.ndarray, "*batch"]:
+    """The next multiples of a step that are not above the largest code."""
+    most = largest // step
+    return (np.minimum((codes.astype(np.uint32) + step // 2) // step, most) * step).astype(
+        codes.dtype
+    )

@@ -1,0 +1,190 @@
+"""What the player can draw, checked before it is asked of the graph.
+
+Close-ups that surfels cannot cover: drawn as coarsely as they can, and enlarged.
+"""
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from capture.camera import Camera
+from capture.input_error import InputError
+from export.package.graph_tables import stored_skinning_nodes
+from export.package.player_tables import PlayerTables
+from export.package.render_settings import RenderSettings
+from preprocess.body.body_pose import BodyPose
+from preprocess.poses.plausibility import MAX_JOINT_ANGLE_RAD, exceeds_joint_limits
+
+MAX_SAMPLES = 256
+MAX_PICTURE_PX = 8192
+MAX_MAGNITUDE = 1e8
+"""Pixels, metres, radians: whatever is larger, or NaN, is a mistake."""
+
+
+def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | None) -> Camera:
+    """The same camera for a picture of another size.
+
+    Args:
+        camera: With a size of its own.
+        size: Longer side, or width and height, pixels; None for the camera's own.
+
+    Raises:
+        InputError: If there would be no pixels.
+    """
+    if size is None:
+        return camera
+    sides: Any = np.asarray(size)
+    if sides.shape not in ((), (2,)) or sides.dtype.kind not in "iu" or sides.min() < 1:
+        raise InputError(
+            f"A picture of size {size} was asked for; expected the longer side, or width and "
+            "height, in whole pixels from 1 on."
+        )
+    return (
+        camera.resize_longer_side(int(sides))
+        if sides.ndim == 0
+        else camera.resize((*sides.tolist(),))
+    )
+
+
+def check_render_inputs(pose: BodyPose, camera: Camera, samples: int) -> None:
+    """Whether all of it can be drawn.
+
+    Raises:
+        InputError: If it cannot.
+    """
+    if not 1 <= samples <= MAX_SAMPLES:
+        raise InputError(f"{samples} samples were asked for; 1 to {MAX_SAMPLES} can be drawn.")
+    _check_array("root_rotation", pose.root_rotation, (3,))
+    _check_array("root_translation", pose.root_translation, (3,))
+    _check_array("joint_rotations", pose.joint_rotations, (23, 3))
+    if exceeds_joint_limits(pose.joint_rotations):
+        raise InputError(
+            f"joint_rotations turn a joint by more than {np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°; "
+            "axis-angles in radians were expected. Of degrees give numpy.deg2rad(degrees)."
+        )
+    _check_array("camera_from_world", camera.camera_from_world, (4, 4))
+    if camera.distortion:
+        raise InputError(
+            "The camera has lens distortion, but the player draws pinhole pictures. "
+            "Leave the distortion out of the camera."
+        )
+    width, height = camera.size_px
+    if not (0 < width <= MAX_PICTURE_PX and 0 < height <= MAX_PICTURE_PX):
+        raise InputError(
+            f"Pictures of {width}x{height} px cannot be drawn; 1 to {MAX_PICTURE_PX} a side can."
+        )
+    lens = np.array([*camera.focal_px, *camera.center_px])
+    if not (np.abs(lens) < MAX_MAGNITUDE).all() or min(camera.focal_px) <= 0.0:
+        raise InputError(
+            f"The camera's focal lengths are {camera.focal_px} and its centre {camera.center_px}; "
+            "finite numbers of pixels were expected, focal lengths above 0."
+        )
+
+
+def _check_array(name: str, array: Any, shape: tuple[int, ...]) -> None:
+    if np.shape(array) != shape:
+        raise InputError(f"{name} has the shape {np.shape(array)}; {shape} was expected.")
+    if not (np.abs(array) < MAX_MAGNITUDE).all():
+        raise InputError(f"{name} holds NaN, infinity or a number out of all bounds.")
+
+
+NODE_RADIUS_M = 0.05
+"""A surfel has a node of the skin no farther away."""
+BAND_ROWS = 64
+"""Rows that are enlarged at a time."""
+
+
+@final
+class ResolutionLimit:
+    """How much of a picture's fineness an avatar's surfels can cover.
+
+    A surfel covers at most `RenderSettings.largest_footprint_px`; nearer by, one would look between
+    them. There a voxel is dozens of pixels wide: a coarser picture, enlarged, shows as much.
+    """
+
+    def __init__(self, tables: PlayerTables, rules: RenderSettings) -> None:
+        """Of what is drawn, and how; nothing is computed before it is needed."""
+        self._skin, self._pelvis, self._reach_m = tables.skinning, tables.pelvis, tables.reach_m
+        self._nearest_m, self._largest_px = rules.near_plane_m, rules.max_footprint_px
+        self._footprint_m = tables.surfels.spacing_m * rules.footprint_spacings
+
+    def downscale_factor(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
+        """How many times coarser a picture has to be drawn; 1 if surfels cover it as it is.
+
+        Args:
+            bones: Camera-from-canonical matrices.
+            camera: Its lens and size.
+        """
+        most = max(self._largest_px - 1, 1)
+        footprint = max(camera.focal_px) * self._footprint_m  # pixels at a depth of 1 m
+        depth = float(bones[0, 2, :3] @ self._pelvis + bones[0, 2, 3])
+        if footprint <= most * (depth - self._reach_m):
+            return 1.0
+        return max(1.0, footprint / most / self._nearest_depth_m(bones, camera))
+
+    def _nearest_depth_m(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
+        """Least depth of what may be seen, metres; the nodes of the skin stand for it."""
+        matrices = (self._node_weights.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
+        there = (
+            np.einsum("nij,nj->ni", matrices[:, :, :3], self._node_positions) + matrices[:, :, 3]
+        )
+        there = there[there[:, 2] > self._nearest_m - NODE_RADIUS_M]
+        depth = np.maximum(there[:, 2], np.float32(self._nearest_m))
+        focal, size = np.array(camera.focal_px), np.array(camera.size_px)
+        place = there[:, :2] / depth[:, None] * focal + camera.center_px
+        beside = self._largest_px / 2.0 + focal * NODE_RADIUS_M / depth[:, None]
+        seen = ((place > -beside) & (place < size + beside)).all(axis=1)
+        return float(depth[seen].min()) if seen.any() else np.inf
+
+    @cached_property
+    def _node_weights(self) -> Float32[np.ndarray, "24 rows"]:
+        return stored_skinning_nodes(self._skin).weights[:, 1:-1]
+
+    @cached_property
+    def _node_positions(self) -> Float32[np.ndarray, "rows 3"]:
+        return stored_skinning_nodes(self._skin).positions[1:-1]
+
+
+def downscale_camera(camera: Camera, factor: float) -> Camera:
+    """The camera of a picture whose pixels are so many times as wide, with the same corner."""
+    (fx, fy), (x, y), (width, height) = camera.focal_px, camera.center_px, camera.size_px
+    return replace(
+        camera,
+        focal_px=(fx / factor, fy / factor),
+        center_px=(x / factor, y / factor),
+        size_px=(int(np.ceil(width / factor)), int(np.ceil(height / factor))),
+    )
+
+
+def upscale_picture(
+    picture: UInt8[np.ndarray, "rows columns 4"], size_px: tuple[int, int], factor: float
+) -> UInt8[np.ndarray, "height width 4"]:
+    """The inverse of `coarse` for a picture with straight alpha: bilinear, premultiplied."""
+    width, height = size_px
+    source = picture.astype(np.float32)
+    source[..., :3] *= source[..., 3:] / np.float32(255.0)
+    left, right, across = _bilinear_taps(width, source.shape[1], factor)
+    upper, lower, along = _bilinear_taps(height, source.shape[0], factor)
+    wide = source[:, left] * (1.0 - across[:, None]) + source[:, right] * across[:, None]
+    whole = np.empty((height, width, 4), dtype=np.uint8)
+    for start in range(0, height, BAND_ROWS):
+        rows = slice(start, start + BAND_ROWS)
+        share = along[rows, None, None]
+        band = wide[upper[rows]] * (1.0 - share) + wide[lower[rows]] * share
+        band[..., :3] *= np.float32(255.0) / np.maximum(band[..., 3:], np.float32(1e-3))
+        whole[rows] = np.clip(np.rint(band), 0.0, 255.0)
+    whole[whole[..., 3] == 0] = 0
+    return whole
+
+
+def _bilinear_taps(
+    length: int, coarse_length: int, times: float
+) -> tuple[np.ndarray, np.ndarray, Float32[np.ndarray, "length"]]:
+    """For each pixel along a side the two coarse ones that it lies between, and how far."""
+    place = np.clip((np.arange(length) + 0.5) / times - 0.5, 0.0, coarse_length - 1.0)
+    before = np.floor(place).astype(np.intp)
+    after = np.minimum(before + 1, coarse_length - 1)
+    return before, after, (place - before).astype(np.float32)

@@ -1,0 +1,1 @@
+"""The player written plainly: what the ONNX graph must agree with."""

@@ -1,0 +1,1 @@
+"""Alignment of body, poses and cameras to masks and images."""

@@ -1,0 +1,164 @@
+"""Where a camera that nobody described must have stood, found from masks alone."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy.spatial.transform import Rotation
+
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.corrections import Correction, shift_principal_point
+from preprocess.alignment.silhouette_objective import SilhouetteObjective
+from preprocess.body.silhouette import soft_iou, splat_silhouette
+
+CAMERA_SAMPLES = 6
+MAX_CENTER_OFFSET = 0.45
+"""Share of a picture's sides by which its principal point may be off."""
+YAW_STARTS = 24
+LEVEL_CAMERAS = {
+    "y": np.diag([1.0, -1.0, -1.0]),
+    "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+"""Level OpenCV cameras in worlds with y or z up."""
+REFINED_STARTS = 2
+CAMERA_EVALUATIONS = 200
+FIRST_TURN_RAD, FIRST_SHIFT_M = 0.15, 0.15
+"""Size of the first steps of the search."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _CameraProblem:
+    """Posed bodies in the world, and their masks, for one camera that stands still."""
+
+    claim: CaptureGeometry
+    evidence: SilhouetteObjective
+
+    @cached_property
+    def camera_rows(self) -> list[int]:
+        """The camera of each of the bodies."""
+        witnesses = self.evidence.samples
+        return [w.camera_row for w in witnesses if self.claim.row_for_frame(w.index) is not None]
+
+    @cached_property
+    def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "_ _"]]]:
+        found = []
+        for witness in self.evidence.samples:
+            row = self.claim.row_for_frame(witness.index)
+            if row is not None:
+                points = self.evidence.posed_points(self.claim.motion, row)
+                found.append((points, witness.alpha))
+        return found
+
+    def mean_iou(self, extrinsic: Float[np.ndarray, "4 4"]) -> float:
+        """Mean agreement if the camera stood there."""
+        claim = replace(self.claim, extrinsics=extrinsic[None])
+        camera = claim.camera_at(0, self.evidence.size_px)
+        return float(np.mean([soft_iou(splat_silhouette(p, camera), a) for p, a in self.bodies]))
+
+    def extrinsic_for(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
+        """The camera of a given direction from which the bodies are where the masks are."""
+        extrinsic = np.eye(4)
+        extrinsic[:3, :3] = rotation
+        extrinsic[:3, 3] = -rotation @ np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
+        extrinsic[2, 3] += 4.0
+        for _ in range(4):
+            camera = replace(self.claim, extrinsics=extrinsic[None]).camera_at(
+                0, self.evidence.size_px
+            )
+            drawn = np.median(
+                [_point_bounds(camera.project(p[::8])) for p, _ in self.bodies], axis=0
+            )
+            wanted = np.median([_mask_bounds(a) for _, a in self.bodies], axis=0)
+            depth = float(np.mean([(p @ rotation[2]).mean() for p, _ in self.bodies]))
+            far = (depth + extrinsic[2, 3]) * (drawn[3] - drawn[1]) / (wanted[3] - wanted[1])
+            off = 0.5 * (wanted[:2] + wanted[2:] - drawn[:2] - drawn[2:])
+            extrinsic[:2, 3] += off * far / np.array(camera.focal_px)
+            extrinsic[2, 3] = far - depth
+        return extrinsic
+
+
+def fit_principal_point(
+    geometry: CaptureGeometry, objective: SilhouetteObjective
+) -> Correction | None:
+    """The principal point with which bodies are where the masks are.
+
+    None if no mask has a pose, or they are so far apart that no cropping explains it.
+    """
+    scene = _CameraProblem(claim=geometry, evidence=objective.subset(CAMERA_SAMPLES))
+    if not scene.bodies:
+        return None
+    small = np.array(objective.size_px) / np.array(geometry.size_px)
+    wanted = np.stack([_mask_bounds(alpha) for _, alpha in scene.bodies])
+    drawn = np.stack(
+        [
+            _point_bounds(geometry.camera_at(row, objective.size_px).project(points[::8]))
+            for (points, _), row in zip(scene.bodies, scene.camera_rows, strict=True)
+        ]
+    )
+    away = np.median(wanted - drawn, axis=0)
+    right, down = 0.5 * (away[:2] + away[2:]) / small
+    near = bool((np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)).all())
+    return shift_principal_point(float(right), float(down)) if near else None
+
+
+def fit_extrinsics(geometry: CaptureGeometry, objective: SilhouetteObjective) -> Correction | None:
+    """The camera that fits best, if there is one camera and any masks have poses.
+
+    Level cameras from all sides, in worlds with y or z up; the best are moved and turned freely.
+    """
+    scene = _CameraProblem(claim=geometry, evidence=objective.subset(CAMERA_SAMPLES))
+    if len(geometry.extrinsics) > 1 or not scene.bodies:
+        return None
+    starts = [
+        scene.extrinsic_for(up @ _yaw_rotation(up, 2.0 * np.pi * k / YAW_STARTS)) for up in LEVEL_CAMERAS.values()
+        for k in range(YAW_STARTS)
+    ]  # fmt: skip
+    starts.sort(key=scene.mean_iou, reverse=True)
+    extrinsic = max(
+        (_refine_extrinsics(scene, start) for start in starts[:REFINED_STARTS]), key=scene.mean_iou
+    )
+    return Correction(
+        cause="world_frame",
+        description="the poses are in world coordinates and no file gives the camera's position; "
+        "one that fits was found from the masks",
+        apply=lambda c: replace(c, extrinsics=extrinsic[None]),
+    )
+
+
+def _yaw_rotation(up: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """A turn of the world about the axis that is up in it."""
+    return Rotation.from_rotvec(-angle * up[1]).as_matrix()
+
+
+def _refine_extrinsics(
+    scene: _CameraProblem, start: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Moved and turned about the bodies' middle until masks agree best (Nelder and Mead)."""
+    from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
+
+    middle = np.mean([p.mean(axis=0) for p, _ in scene.bodies], axis=0) @ start[:3, :3].T
+
+    def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+        turn = Rotation.from_rotvec(x[:3]).as_matrix()
+        extrinsic = np.eye(4)
+        extrinsic[:3, :3] = turn @ start[:3, :3]
+        extrinsic[:3, 3] = start[:3, 3] + middle - turn @ middle + x[3:]
+        return extrinsic
+
+    size = np.diag([FIRST_TURN_RAD] * 3 + [FIRST_SHIFT_M] * 3)
+    found = minimize(
+        lambda x: -scene.mean_iou(moved(x)), np.zeros(6), method="Nelder-Mead",
+        options={"maxfev": CAMERA_EVALUATIONS, "initial_simplex": np.vstack([np.zeros(6), size])},
+    )  # fmt: skip
+    return moved(found.x)
+
+
+def _point_bounds(pixels: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "4"]:
+    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+
+
+def _mask_bounds(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "4"]:
+    rows, columns = np.nonzero(alpha > 0.5)
+    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
+    return np.array([*low, *high], dtype=np.float64)

@@ -1,0 +1,262 @@
+"""A few frames' masks, small, against which every guess is held."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from capture.frame import Frame
+from capture.image_folder import list_images, read_image
+from capture.input_error import InputError
+from capture.source import FrameSource
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.body.body_pose import Motion
+from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints, soft_iou, splat_silhouette
+from preprocess.masks.mask_files import Masks
+from preprocess.observe import alpha_channel_mask
+
+SAMPLED_FRAMES = 16
+"""How many frames are looked at."""
+COARSE_MASK_PX = 256.0
+"""Longer side of the masks in which the person's height is measured."""
+MIN_BOX_FILL = 0.95
+"""Share of its bounding box that no person's outline fills."""
+MIN_COVERED_FRACTION = 0.1
+"""Fraction of a mask's connected part that the body must cover to be of the same person."""
+MAX_CACHED_POSES = 256
+"""Posed skins that are kept: 25 MB."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MaskSample:
+    """One frame's mask.
+
+    Attributes:
+        index: The frame's number.
+        camera_row: Which camera is its.
+        alpha: How far each pixel is person, small.
+    """
+
+    index: int
+    camera_row: int
+    alpha: Float32[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SilhouetteObjective:
+    """The masks of a few frames, spread over the capture.
+
+    Attributes:
+        witnesses: In the frames' order; all masks are of one size.
+        skin: The person whose silhouette is held against them.
+        refused: Why masks that were looked at cannot be used.
+    """
+
+    samples: tuple[MaskSample, ...]
+    skin: SkinPoints
+    rejections: tuple[str, ...] = ()
+    _posed_cache: dict[tuple[Motion, int], Float32[np.ndarray, "points 3"]] = field(
+        default_factory=dict
+    )
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the small masks."""
+        height, width = self.samples[0].alpha.shape
+        return int(width), int(height)
+
+    @property
+    def are_boxes(self) -> bool:
+        """Whether the masks are boxes around the person, which say nothing of its size."""
+        return float(np.median([_box_fill(w.alpha > 0.5) for w in self.samples])) > MIN_BOX_FILL
+
+    def subset(self, count: int) -> "SilhouetteObjective":
+        """Every so many-th of the frames."""
+        rows = spaced_indices(len(self.samples), count)
+        return replace(self, samples=tuple(self.samples[r] for r in rows))
+
+    def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "samples"]:
+        """Agreement of each frame in [0, 1]; NaN where the claim has no pose for it."""
+        return np.array([self.frame_score(geometry, witness) for witness in self.samples])
+
+    def frame_score(self, geometry: CaptureGeometry, sample: MaskSample) -> float:
+        """Agreement of one frame."""
+        row = geometry.row_for_frame(sample.index)
+        if row is None:
+            return float("nan")
+        camera = geometry.camera_at(sample.camera_row, self.size_px)
+        alpha = np.float32(1.0) - sample.alpha if geometry.masks_inverted else sample.alpha
+        drawn = splat_silhouette(self.posed_points(geometry.motion, row), camera)
+        return soft_iou(
+            drawn, components_touching(alpha, drawn) if geometry.keeps_person_only else alpha
+        )
+
+    def keep_person(
+        self, geometry: CaptureGeometry, frame: int, alpha: Float32[np.ndarray, "height width"]
+    ) -> Float32[np.ndarray, "height width"]:
+        """Those parts of a frame's mask, of any size, that the posed body touches.
+
+        Unchanged where the claim has no pose for the frame.
+        """
+        row = geometry.row_for_frame(frame)
+        if row is None:
+            return alpha
+        camera = geometry.camera_at(int(geometry.camera_rows()[row]), self.size_px)
+        drawn = splat_silhouette(self.posed_points(geometry.motion, row), camera).astype(np.uint8)
+        large = cv2.resize(drawn, alpha.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        return components_touching(alpha, large > 0)
+
+    def area_ratios(self, geometry: CaptureGeometry) -> Float[np.ndarray, "samples"]:
+        """Area of each mask over that of the posed body; NaN where there is no body."""
+        found = []
+        for witness in self.samples:
+            row = geometry.row_for_frame(witness.index)
+            alpha = np.float32(1.0) - witness.alpha if geometry.masks_inverted else witness.alpha
+            if row is None:
+                found.append(np.nan)
+                continue
+            camera = geometry.camera_at(witness.camera_row, self.size_px)
+            drawn = int(splat_silhouette(self.posed_points(geometry.motion, row), camera).sum())
+            found.append(float(alpha.sum()) / drawn if drawn else np.nan)
+        return np.array(found)
+
+    def posed_points(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
+        """The skin in one of a motion's poses; the last ones are kept, as guesses share them."""
+        if (motion, row) not in self._posed_cache:
+            if len(self._posed_cache) >= MAX_CACHED_POSES:
+                self._posed_cache.clear()
+            self._posed_cache[motion, row] = self.skin.posed(motion[row])
+        return self._posed_cache[motion, row]
+
+
+def components_touching(
+    alpha: Float32[np.ndarray, "height width"], body: Bool[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width"]:
+    """The connected parts of a mask that a body covers in part; the others become 0.
+
+    Unchanged where the body touches none.
+    """
+    count, labels = cv2.connectedComponents((alpha > 0.1).astype(np.uint8), connectivity=8)
+    covered = np.bincount(labels[body], minlength=count)
+    areas = np.bincount(labels.ravel(), minlength=count)
+    own = covered > MIN_COVERED_FRACTION * areas
+    own[0] = False
+    if not own.any():
+        return alpha
+    return np.where(np.isin(labels, np.flatnonzero(own)), alpha, np.float32(0.0))
+
+
+def _box_fill(alpha: Bool[np.ndarray, "height width"]) -> float:
+    """Share of its bounding box that a mask covers."""
+    rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
+    if not len(rows):
+        return 0.0
+    return float(alpha[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean())
+
+
+def spaced_indices(total: int, count: int) -> list[int]:
+    """At most `count` numbers below `total`, evenly spread, the ends left out."""
+    places = (np.arange(min(count, total)) + 0.5) / min(count, total) * total
+    return [int(place) for place in places]
+
+
+def sample_masks(
+    source: FrameSource,
+    masks: Masks | None,
+    mask_row: Callable[[int], int],
+    camera_row: Callable[[int], int],
+    skin: SkinPoints,
+    *,
+    count: int = SAMPLED_FRAMES,
+    excluded_frames: frozenset[int] = frozenset(),
+) -> SilhouetteObjective:
+    """Reads a few masks; pictures are decoded only where the masks are in them.
+
+    Args:
+        source: Says which frames there are.
+        masks: The masks; None if the pictures have an alpha channel.
+        mask_row: From a frame's number to its mask.
+        camera_row: From a frame's number to its camera.
+        skin: The person.
+        count: How many frames are looked at.
+        without: Frames that cannot be used.
+
+    Raises:
+        InputError: If no mask shows anybody.
+    """
+    start, step = source.selection.start, source.selection.step
+    usable = [start + step * n for n in range(source.frame_count or 1)]
+    usable = [frame for frame in usable if frame not in excluded_frames] or usable
+    frames = [usable[n] for n in spaced_indices(len(usable), count)]
+    full = source.size_px
+    size_px = _scaled_size(full, COARSE_MASK_PX)
+    if masks is None:
+        found, refused = _sample_alpha_channels(source, frames, size_px), []
+    else:
+        found, refused = _sample_mask_files(masks, frames, mask_row, size_px)
+    found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
+    if not found:
+        raise InputError(
+            f"None of the masks of {len(frames)} frames of {source.path} shows anybody."
+        )
+    heights = [_mask_height(alpha) for _, alpha in found]
+    longer = max(size_px) * SILHOUETTE_PERSON_PX / max(float(np.median(heights)), 1.0)
+    small = _scaled_size(full, min(longer, 4.0 * SILHOUETTE_PERSON_PX))
+    return SilhouetteObjective(
+        samples=tuple(
+            MaskSample(index=index, camera_row=camera_row(index), alpha=_resize_alpha(alpha, small))
+            for index, alpha in found
+        ),
+        skin=skin,
+        rejections=tuple(refused),
+    )
+
+
+def _sample_mask_files(
+    masks: Masks, frames: Sequence[int], row: Callable[[int], int], size_px: tuple[int, int]
+) -> tuple[list[tuple[int, Float32[np.ndarray, "_ _"]]], list[str]]:
+    """Those of the masks that can be used, and why others cannot."""
+    found, refused = [], []
+    for index in frames:
+        try:
+            found.append((index, masks.alpha(row(index), size_px)))
+        except InputError as cause:
+            refused.append(str(cause))
+    return found, refused
+
+
+def _sample_alpha_channels(
+    source: FrameSource, frames: Sequence[int], size_px: tuple[int, int]
+) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
+    found, pictures = [], list_images(source.path)  # only pictures have alpha channels
+    for index in frames:
+        try:
+            rgb, alpha = read_image(pictures[index])
+            if rgb.shape[1::-1] == source.size_px:
+                frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
+                found.append((index, alpha_channel_mask(frame, size_px)))
+        except (InputError, OSError):  # one of many; that it is damaged is said elsewhere
+            continue
+    return found
+
+
+def _scaled_size(size_px: tuple[int, int], longer: float) -> tuple[int, int]:
+    scale = min(1.0, longer / max(size_px))
+    return max(8, round(size_px[0] * scale)), max(8, round(size_px[1] * scale))
+
+
+def _mask_height(alpha: Float32[np.ndarray, "height width"]) -> int:
+    rows = np.flatnonzero((alpha > 0.5).any(axis=1))
+    return int(rows[-1] - rows[0] + 1)
+
+
+def _resize_alpha(
+    alpha: Float32[np.ndarray, "_ _"], size_px: tuple[int, int]
+) -> Float32[np.ndarray, "height width"]:
+    shrinks = alpha.shape[1] >= size_px[0]
+    return np.asarray(
+        cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
+        dtype=np.float32,
+    )

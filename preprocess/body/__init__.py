@@ -1,0 +1,1 @@
+"""The parametric body: model, shape, pose, kinematics, silhouette."""

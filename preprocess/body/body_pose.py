@@ -1,0 +1,139 @@
+"""What a body does: one pose of the 24-joint tree, and poses over time."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyPose:
+    """One pose of the SMPL tree (Loper et al. 2015): axis-angles in world-aligned rest frames.
+
+    The root turns about the rest pelvis J0 of the shaped body:
+    `world = R(root_rotation) (x - J0) + J0 + root_translation`.
+
+    Attributes:
+        root_rotation: Axis-angle of the pelvis, radians (SMPL's global_orient).
+        root_translation: Metres (SMPL's transl).
+        joint_rotations: Axis-angle of joints 1 … 23 relative to their parents, radians.
+    """
+
+    root_rotation: Float[np.ndarray, "3"]
+    root_translation: Float[np.ndarray, "3"]
+    joint_rotations: Float[np.ndarray, "23 3"]
+
+    @classmethod
+    def rest(cls) -> "BodyPose":
+        """The T-pose at the origin."""
+        return cls(
+            root_rotation=np.zeros(3),
+            root_translation=np.zeros(3),
+            joint_rotations=np.zeros((23, 3)),
+        )
+
+
+RootAnchor = Literal["pelvis", "origin", "hips"]
+PoseSpace = Literal["camera", "world"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelativeFocalLength:
+    """A focal length that is known only as a share of the picture, looking at its middle.
+
+    Attributes:
+        share: The focal length in units of `of`.
+        of: The picture's longer side, or its diagonal.
+    """
+
+    ratio: float
+    reference: Literal["longer side", "diagonal"] = "longer side"
+
+    def intrinsic_matrix(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+        """The camera matrix K for pictures of a size (width, height)."""
+        width, height = size_px
+        unit = max(size_px) if self.reference == "longer side" else float(np.hypot(width, height))
+        focal = self.ratio * unit
+        return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether a camera may have it; trackers that cut out the person assume far longer ones."""
+        return 0.4 <= self.ratio <= 2.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Motion:
+    """Poses over time, as one pose file holds them.
+
+    Attributes:
+        root_rotations, root_translations, joint_rotations: As in `BodyPose`, one row a pose.
+        valid: Which rows may be used (finite, and not marked as lost by the tracker).
+        betas: Shape coefficients; they mean something only to the body family named in `model`.
+        model: Body family whose tracker made the poses: "smpl" or "body24".
+        model_is_stated: Whether the file names that family; if not, it is a guess.
+        frames: Index of the video frame that each row belongs to, if the file says so.
+        times_s: Time of each row in seconds, if the file says so.
+        intrinsic: The tracker's own camera matrix K, if the file holds one.
+        lens: What the tracker took for the focal length, where the file holds no K.
+        anchor: Which point of the resting body `root_translations` speak of. "pelvis": the root
+            turns about it, and they are SMPL's. "origin" and "hips" (the middle between both):
+            that point is carried to `root_translations` (EasyMocap; BEV). `preprocess.poses.root_placement`
+            makes them SMPL's, once the body is known.
+        space: "world", or "camera": each row in the camera of its frame.
+        camera_from_world: The camera of each row, if the file holds them.
+        bridged: Which rows the tracker had lost, filled in between their neighbours.
+        note: What a user should know about how the file was read.
+    """
+
+    root_rotations: Float[np.ndarray, "poses 3"]
+    root_translations: Float[np.ndarray, "poses 3"]
+    joint_rotations: Float[np.ndarray, "poses 23 3"]
+    valid: Bool[np.ndarray, "poses"]
+    betas: Float[np.ndarray, "betas"]
+    body_model: str
+    model_is_stated: bool = True
+    frames: Int[np.ndarray, "poses"] | None = None
+    times_s: Float[np.ndarray, "poses"] | None = None
+    intrinsic: Float[np.ndarray, "3 3"] | None = None
+    assumed_focal: RelativeFocalLength | None = None
+    anchor: RootAnchor = "pelvis"
+    space: PoseSpace = "world"
+    camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
+    interpolated: Bool[np.ndarray, "poses"] | None = None
+    note: str | None = None
+
+    def __len__(self) -> int:
+        """How many rows there are, valid or not."""
+        return len(self.root_rotations)
+
+    def __getitem__(self, row: int) -> BodyPose:
+        """The pose in one row."""
+        return BodyPose(
+            root_rotation=self.root_rotations[row],
+            root_translation=self.root_translations[row],
+            joint_rotations=self.joint_rotations[row],
+        )
+
+    def select_rows(
+        self, rows: Int[np.ndarray, "some"], frames: Int[np.ndarray, "some"] | None = None
+    ) -> "Motion":
+        """Some of its rows, for frames of other numbers.
+
+        Args:
+            rows: Which ones, in their new order.
+            frames: The frame that each belongs to; None if nobody says so.
+        """
+        cameras, bridged = self.camera_from_world, self.interpolated
+        return replace(
+            self,
+            root_rotations=self.root_rotations[rows],
+            root_translations=self.root_translations[rows],
+            joint_rotations=self.joint_rotations[rows],
+            valid=self.valid[rows],
+            frames=frames,
+            times_s=None,
+            camera_from_world=None if cameras is None else cameras[rows],
+            interpolated=None if bridged is None else bridged[rows],
+        )

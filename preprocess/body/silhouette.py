@@ -1,0 +1,178 @@
+"""Where a posed body lands in a small picture, and how well that agrees with a mask.
+
+The outline of a posed body in a picture, and how far pixels are from one.
+"""
+
+from dataclasses import dataclass
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.parametric_body import ShapedBody
+
+SKIN_POINTS = 8000
+"""On the skin: about three on each pixel of a person who is `PERSON_PX` high."""
+SILHOUETTE_PERSON_PX = 96
+"""Height of a person in the small pictures, in pixels: one is about 2 cm."""
+NEAR_PLANE_M = 0.05
+"""Points nearer to the camera than this are not drawn."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinPoints:
+    """Points all over one person's skin, evenly spread: enough to draw a silhouette from.
+
+    Attributes:
+        shaped: The person.
+        rest: Where they lie at rest, metres.
+        weights: Their skinning weights.
+    """
+
+    shaped: ShapedBody
+    rest: Float32[np.ndarray, "points 3"]
+    weights: Float32[np.ndarray, "points 24"]
+
+    @classmethod
+    def of(cls, shaped: ShapedBody, count: int = SKIN_POINTS) -> "SkinPoints":
+        """Systematic samples of the surface: every `count`-th part of the area has its point.
+
+        Within a triangle they follow the R2 sequence (the plane's golden ratio).
+        """
+        corners = shaped.vertices[shaped.body.faces]
+        sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.cumsum(np.linalg.norm(sides, axis=1))
+        places = (np.arange(count) + 0.5) / count * area[-1]
+        face = np.minimum(np.searchsorted(area, places), len(area) - 1)
+        u, v = np.modf(np.arange(1, count + 1)[:, None] * (0.7548776662, 0.5698402910))[0].T
+        beyond = u + v > 1.0
+        u, v = np.where(beyond, 1.0 - u, u), np.where(beyond, 1.0 - v, v)
+        shares = np.stack([1.0 - u - v, u, v], axis=1)
+        chosen = shaped.body.faces[face]
+        return cls(
+            shaped=shaped,
+            rest=np.einsum("pc,pca->pa", shares, shaped.vertices[chosen]).astype(np.float32),
+            weights=np.einsum("pc,pcj->pj", shares, shaped.body.weights[chosen]).astype(np.float32),
+        )
+
+    def posed(self, pose: BodyPose) -> Float32[np.ndarray, "points 3"]:
+        """Where they are in the world, by linear blend skinning (without pose blend shapes)."""
+        transforms = self.shaped.with_pose(pose).world_from_rest()[:, :3]
+        blended = (self.weights @ transforms.reshape(24, 12).astype(np.float32)).reshape(-1, 3, 4)
+        return np.einsum("pab,pb->pa", blended[:, :, :3], self.rest) + blended[:, :, 3]
+
+
+def splat_silhouette(
+    points_world: Float[np.ndarray, "points 3"], camera: Camera
+) -> Bool[np.ndarray, "height width"]:
+    """The pixels that dense points of a surface cover; nothing of what is behind the camera.
+
+    Holes of a pixel or two between the points are closed.
+    """
+    width, height = camera.size_px
+    drawn = np.zeros((height, width), dtype=np.uint8)
+    x, y, depth = _project(points_world, camera)
+    inside = (depth > NEAR_PLANE_M) & (x >= 0.0) & (x < width) & (y >= 0.0) & (y < height)
+    drawn[y[inside].astype(np.int64), x[inside].astype(np.int64)] = 1
+    return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
+
+
+def _project(
+    points_world: Float[np.ndarray, "points 3"], camera: Camera
+) -> Float32[np.ndarray, "3 points"]:
+    """x and y in pixels, and the depth; as `Camera.project`, but twice as fast without a lens.
+
+    A hundredth of a pixel, which is what single precision costs, is enough here.
+    """
+    matrix = (camera.intrinsic @ camera.camera_from_world[:3]).astype(np.float32)
+    projected = matrix[:, :3] @ points_world.T.astype(np.float32) + matrix[:, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        projected[:2] /= projected[2]
+    if camera.distortion:
+        before = projected[2] > NEAR_PLANE_M
+        projected[:2, before] = camera.project(points_world[before].astype(np.float64)).T
+    return projected
+
+
+def soft_iou(
+    body: Bool[np.ndarray, "height width"], alpha: Float32[np.ndarray, "height width"]
+) -> float:
+    """Intersection over union of a silhouette and a soft mask, in [0, 1].
+
+    The soft kind: the sum of the smaller over the sum of the larger of each pixel's two.
+    """
+    both, either = float(alpha[body].sum()), float(alpha.sum() + body.sum())
+    union = either - both
+    return both / union if union > 0.0 else 0.0
+
+
+SUBPIXEL_BITS = 4
+"""Corners are drawn to a sixteenth of a pixel."""
+
+
+@final
+class MeshSilhouette:
+    """Draws one person's body, or what has its triangles, as a filled shape.
+
+    OpenCV fills many polygons at once by the even-odd rule; so each call gets the triangles of one
+    limb that look towards the camera, or away from it: these do not lie over each other.
+    """
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Sorts the triangles by limbs."""
+        self._shaped = shaped
+        faces = shaped.body.faces
+        limb = shaped.body.weights[faces].sum(axis=1).argmax(axis=1)
+        limbs = [faces[limb == joint] for joint in range(24) if (limb == joint).any()]
+        self._limbs = [(each, np.unique(each)) for each in limbs]
+
+    def draw_pose(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
+        """The pixels that the body covers; none if it comes too near or behind the camera."""
+        return self.draw_vertices(self._shaped.with_pose(pose).vertices(), camera) > 0
+
+    def draw_vertices(
+        self, vertices: Float[np.ndarray, "vertices 3"], camera: Camera
+    ) -> UInt8[np.ndarray, "height width"]:
+        """The pixels that the body's triangles cover, their corners elsewhere: 1, else 0.
+
+        Args:
+            vertices: In the world, metres.
+            camera: If any of them is too near to it or behind it, nothing is drawn.
+        """
+        width, height = camera.size_px
+        picture = np.zeros((height, width), dtype=np.uint8)
+        depth = vertices @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        if depth.min() < NEAR_PLANE_M:
+            return picture
+        pixels = (camera.project(vertices) - 0.5) * (1 << SUBPIXEL_BITS)
+        corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
+        for faces, used in self._limbs:
+            triangles = corners[faces].astype(np.int64)
+            a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+            towards = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
+            points = corners[used]
+            low = np.clip((points.min(axis=0) >> SUBPIXEL_BITS) - 1, 0, (width, height))
+            high = np.clip((points.max(axis=0) >> SUBPIXEL_BITS) + 3, 0, (width, height))
+            part = picture[low[1] : high[1], low[0] : high[0]]
+            triangles -= low << SUBPIXEL_BITS
+            for side in (towards, ~towards):
+                filled = np.zeros(part.shape, dtype=np.uint8)
+                polygons = list(triangles[side].astype(np.int32))
+                if polygons and part.size:
+                    cv2.fillPoly(filled, polygons, 1, cv2.LINE_8, SUBPIXEL_BITS)
+                part |= filled
+        closed = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        return np.asarray(closed, dtype=np.uint8)
+
+
+def signed_distance_px(
+    mask: Bool[np.ndarray, "height width"],
+) -> Float32[np.ndarray, "height width"]:
+    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
+    hard = mask.astype(np.uint8)
+    outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
+    inside = cv2.distanceTransform(hard, cv2.DIST_L2, 5)
+    return np.asarray(outside - inside + np.where(mask, 0.5, -0.5), dtype=np.float32)

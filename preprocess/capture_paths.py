@@ -1,0 +1,147 @@
+"""Where the parts of a capture lie: what was named, what lies in its folder, what lies beside."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from capture.input_error import InputError
+
+POSE_FILE_NAMES = [
+    "poses.npz",
+    "poses.pkl",
+    "hmr4d_results.pt",
+    "wham_output.pkl",
+    "vibe_output.pkl",
+]
+"""Names under which poses lie in a capture folder."""
+
+MASK_NAMES = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
+"""Names under which masks lie in a capture folder."""
+
+
+CAMERA_NAMES = ["cameras.npz", "transforms.json", "sparse"]
+"""Where cameras are looked for, in this order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CapturePaths:
+    """The parts of a capture.
+
+    Attributes:
+        video: Video file, folder of pictures, or native capture folder.
+        poses: The pose file.
+        masks: Folder or file of masks; None where there are none.
+        cameras: The camera file; None for a static camera that nobody described.
+    """
+
+    video: Path
+    poses: Path
+    masks: Path | None
+    cameras: Path | None
+
+
+def find_parts(folders: Iterable[Path]) -> list[Path]:
+    """What lies in some folders under the names of a capture's parts."""
+    names = [*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES, "images"]
+    return [path for folder in folders for name in names if (path := folder / name).exists()]
+
+
+def resolve_pose_path(path: Path) -> Path:
+    """The pose file of a capture folder, where the folder was named; else what was named."""
+    return _first_existing([path], POSE_FILE_NAMES) or path
+
+
+def find_capture_paths(
+    video: Path,
+    poses: Path | None = None,
+    masks: Path | None = None,
+    cameras: Path | str | None = None,
+) -> CapturePaths:
+    """Finds what was not named.
+
+    For a folder, everything defaults to what lies in it. For a file (and a folder that is named
+    `images`), masks and cameras are looked for beside it, then beside the poses.
+
+    Args:
+        video: Video file, folder of pictures, or native capture folder.
+        poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
+        masks: Folder or file of masks.
+        cameras: Camera file; "static" for a static camera that nobody described; "solve" for a
+            moving one, for which no file is looked for either.
+
+    Raises:
+        InputError: If something that was named, or the poses, is not there.
+    """
+    if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
+        cameras = "static"
+    named = [Path(p) for p in (video, poses, masks) if p is not None]
+    if cameras is not None and str(cameras) != "static":
+        named.append(Path(cameras))
+    for path in named:
+        if not path.exists():
+            raise InputError(f"{path} does not exist; check the path.")
+    if poses is None:
+        poses = _first_existing([video], POSE_FILE_NAMES)
+    if poses is None:
+        beside = _first_existing([video.parent], POSE_FILE_NAMES)
+        there = "" if beside is None else f" {beside} lies beside it: is it meant?"
+        raise InputError(
+            f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
+            f"tracker wrote: docs/formats.md).{there} Finding poses in the video is a tracker's "
+            "work."
+        )
+    inside = video.is_dir() and video.name != "images"
+    places = [video if inside else video.parent, poses.parent]
+    if cameras is None:
+        cameras = _first_existing(places, CAMERA_NAMES)
+    return CapturePaths(
+        video=video,
+        poses=poses,
+        masks=masks or _first_existing(places, MASK_NAMES),
+        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
+    )
+
+
+def find_live_capture_paths(
+    video: Path,
+    poses: Path | None = None,
+    masks: Path | None = None,
+    cameras: Path | str | None = None,
+) -> CapturePaths:
+    """Where the parts of a live source lie or will lie; poses and masks need not be there yet.
+
+    Args:
+        video: `camera:…`, or a folder that grows.
+        poses: Pose file; needed unless `video` is a folder, which will hold poses.npz.
+        masks: Folder of masks.
+        cameras: Camera file, or "static".
+
+    Raises:
+        InputError: If nobody says where the poses will be, or a camera file is not there.
+    """
+    inside = video.parent if video.name == "images" else video
+    is_folder = video.is_dir()
+    if poses is None and is_folder:
+        poses = _first_existing([inside], ["poses.npz", "poses.jsonl"]) or inside / "poses.npz"
+    if poses is None:
+        raise InputError(
+            f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "
+            "written anew again and again, or a .jsonl, a frame a line)."
+        )
+    if masks is None:
+        masks = (inside if is_folder else poses.parent) / "masks"
+    if cameras is None:
+        cameras = _first_existing([inside, poses.parent], ["cameras.npz"])
+    elif str(cameras) != "static" and not Path(cameras).exists():
+        raise InputError(f"{cameras} does not exist; check the path.")
+    return CapturePaths(
+        video=video,
+        poses=poses,
+        masks=masks,
+        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
+    )
+
+
+def _first_existing(places: list[Path], names: list[str]) -> Path | None:
+    candidates = (place / name for place in places if place.is_dir() for name in names)
+    return next((path for path in candidates if path.exists()), None)

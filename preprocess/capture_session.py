@@ -1,0 +1,197 @@
+"""What a user names of a recording.
+
+All that is known about a video before its first frame is read, checked together.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.camera import Camera
+from capture.frame import Frame
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import RealtimePlayback
+from capture.live.watched_image_folder import IDLE_TIMEOUT_S
+from capture.source import FrameSource
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.mask_alignment import BodyPlacement
+from preprocess.body.body_pose import Motion
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.cameras.camera_file import CameraTrack
+from preprocess.capture_paths import CapturePaths, find_parts
+from preprocess.live.live_alignment import LiveAlignment
+from preprocess.live.live_inputs import LiveInputs
+from preprocess.masks.mask_files import Masks
+from preprocess.masks.mask_origin import Segmenter, segmenter_name
+from preprocess.observation import Observation
+from preprocess.observe import DroppedFrame, observation_builder
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureInputs:
+    """What the user named; the rest is looked for (see `find_capture_paths`).
+
+    Attributes:
+        video: Video file, folder of pictures, or capture folder.
+        poses, masks: Files or folders, or None.
+        cameras: A file, "static", "solve" (poses are then in the camera of each frame, and so is
+            all the rest until cameras were solved), or None.
+        body: A body file; None for the embedded body.
+        frames: Which frames are wanted.
+        mask_invert: Whether the person is dark in the masks; None finds out.
+        live: Whether `video` is a folder that grows; a camera is live without it.
+        person: Whose poses, where the file holds several people's; None for the longest track.
+        idle_s: Of a live source: how long nothing new may come.
+        height_m: How tall the person is; None if only the poses tell.
+        transposed: Whether the film's width and height are exchanged before masks and cameras are
+            compared with it; only to find out whether it was rotated.
+    """
+
+    video: Path
+    poses: Path | None = None
+    masks: Path | None = None
+    cameras: str | None = None
+    body: Path | None = None
+    frames: slice | None = None
+    invert_masks: bool | None = None
+    live: bool = False
+    person: str | None = None
+    idle_s: float = IDLE_TIMEOUT_S
+    height_m: float | None = None
+    transposed: bool = False
+
+    def input_paths(self) -> list[Path]:
+        """What no output may touch: files and folders that were named, and that may be found."""
+        named = [self.poses, self.body]
+        if camera_address(self.video) is None:
+            named.append(self.video)
+        if segmenter_name(self.masks) is None:
+            named.append(self.masks)
+        if self.cameras not in (None, "static", "solve"):
+            named.append(Path(self.cameras))
+        given = [path for path in named if path is not None]
+        near = {path if path.is_dir() else path.parent for path in (self.video, self.poses) if path}
+        return [*given, *find_parts(sorted(near))]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capture:
+    """A video of one person, with everything that belongs to it.
+
+    Attributes:
+        paths: Where its parts lie.
+        source: The frames.
+        motion: The poses.
+        masks: The masks; None if the pictures' alpha channel is the mask, `segment` estimates them,
+            or they come with a live source.
+        cameras: The cameras, of the frames' size.
+        shaped: The person's body.
+        size_px: Longer side that training sees; None for the frames' own.
+        notes: What a user should know about how the parts were read.
+        live: Poses and masks of a live source, which come while it runs; `motion` is what had come
+            when it was opened.
+        segment: What estimates the masks, if nothing holds them.
+        solved: What the report says of cameras that were solved.
+        refit: How the poses were fitted to the masks, if they were made for another body.
+        growing_fit: The same of a live source, which goes on while its frames come.
+    """
+
+    paths: CapturePaths
+    source: FrameSource
+    motion: Motion
+    masks: Masks | None
+    cameras: CameraTrack
+    shaped: ShapedBody
+    size_px: int | None
+    notes: tuple[str, ...]
+    live: LiveInputs | None = None
+    segment: Segmenter | None = None
+    camera_report: dict[str, Any] | None = None
+    refit: BodyPlacement | None = None
+    live_fit: LiveAlignment | None = None
+
+    def check(self) -> None:
+        """Whether the parts fit together; no frame is read.
+
+        Raises:
+            InputError: If they do not.
+        """
+        self.observation_builder()
+        self.pixel_footprint_m()
+
+    def observations(self) -> Iterator[Observation | DroppedFrame]:
+        """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
+        return map(self.observation_builder(), self.source.frames())
+
+    def observation_builder(self) -> Callable[[Frame], Observation | DroppedFrame]:
+        """What joins a frame with its pose, mask and camera."""
+        if self.live is not None:
+            return self.live.observation_builder(
+                self.source, self.cameras, self.size_px, self.segment, self.live_fit
+            )
+        return observation_builder(
+            self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
+            segment=self.segment,
+        )  # fmt: skip
+
+    def mask_report(self) -> dict[str, str | float | None]:
+        """Where the masks come from, and how well estimated ones agree with the posed body."""
+        if self.segment is not None:
+            agreement = getattr(self.segment, "agreement", None)
+            name = getattr(self.segment, "name", type(self.segment).__name__)
+            return {"masks": f"estimated by {name}", "mask_agreement": agreement}
+        source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
+        return {"masks": source, "mask_agreement": None}
+
+    def final_notes(self) -> Iterator[str]:
+        """What could not be said before the frames came."""
+        growing = self.live_fit
+        if growing is not None and growing.placement is not None:
+            yield f"{growing.placement.describe()} (By the first {growing.frame_count} frames.)"
+
+    def body_fit_report(self) -> dict[str, float | bool] | None:
+        """How the poses were fitted to the body that is used; None if that was not needed."""
+        growing = self.live_fit
+        refit = self.refit if growing is None else growing.placement
+        if refit is None:
+            return None
+        told = refit.as_json()
+        return told if growing is None else {**told, "frames": growing.frame_count}
+
+    def camera_of_pose(self, row: int) -> Camera:
+        """The camera that sees one of the poses."""
+        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
+        return self.cameras[int(claim.camera_rows()[row])]
+
+    def in_real_time(self) -> "Capture":
+        """The same, its frames coming at their own times."""
+        return replace(self, source=RealtimePlayback(self.source, PacingClock()))
+
+    def pixel_footprint_m(self) -> float:
+        """What one pixel covers on the body: the dial of the field's resolution.
+
+        Raises:
+            InputError: If the person is behind the camera.
+        """
+        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
+        valid = self.motion.valid
+        pelves = self.shaped.joints[0] + self.motion.root_translations[valid]
+        forward = claim.extrinsics[claim.camera_rows()[valid], 2]  # of the camera that sees each
+        depth = float(np.median((pelves * forward[:, :3]).sum(axis=1) + forward[:, 3]))
+        camera = self.cameras[0]
+        if depth <= 0.0:
+            raise InputError(
+                f"The person is at the camera or behind it (depth {depth:.2f} m); poses were "
+                "expected in the camera's world, in metres, with OpenCV axes (x right, y down, "
+                "z forward). Do poses and cameras come from the same run? Poses in a world need "
+                "the cameras of that world; without them, and with --cameras solve, poses must be "
+                "in each frame's own camera."
+            )
+        longer = max(camera.size_px)
+        shrinking = min(1.0, (self.size_px or longer) / longer)
+        return depth / (max(camera.focal_px) * shrinking)

@@ -1,1 +1,0 @@
-"""The doctor: where poses, masks and cameras disagree, what the mistake is, and how to mend it."""

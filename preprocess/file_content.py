@@ -1,0 +1,228 @@
+"""Arrays out of .npz archives, with a message for everything that can be wrong with the file.
+
+What a file of any container holds, as dictionaries, lists, numbers, texts and numpy arrays.
+
+The container is told by the first bytes, not by the file's name: people rename.
+"""
+
+import io
+import json
+import lzma
+import zipfile
+import zlib
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.image_folder import natural_sort_key
+from capture.input_error import InputError
+from preprocess.pickles.pickle_records import product
+from preprocess.pickles.plain_pickle import (
+    MAX_BYTES,
+    explain_failures,
+    load_plain_pickle,
+    read_limited,
+)
+
+MAX_UNPACKED_BYTES = 4 << 30
+"""Archives that would unpack to more are refused."""
+
+
+def read_npz(
+    path: Path, keys: tuple[str, ...] | None = None
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """The arrays of an archive (only those of `keys` that it has, if given); never executes any.
+
+    Raises:
+        InputError: If the file is missing, damaged, too large, or holds pickled objects under a key
+            that is asked for.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > MAX_UNPACKED_BYTES:
+            raise InputError(
+                f"{path} unpacks to {size >> 20} MiB; more than {MAX_UNPACKED_BYTES >> 20} MiB are not read."
+            )
+        with np.load(path, allow_pickle=False) as archive:
+            wanted = [key for key in (keys or archive.files) if key in archive.files]
+            found = {key: archive[key] for key in wanted}
+    except InputError:
+        raise
+    except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
+        raise InputError(
+            f"{path} is no readable .npz of plain arrays ({cause}). "
+            "Is the file complete, and written without pickled objects?"
+        ) from cause
+    return {key: array for key, array in found.items() if isinstance(array, np.ndarray)}
+
+
+POSE_FILE_SUFFIXES = frozenset(
+    {".npz", ".npy", ".pkl", ".pickle", ".pt", ".pth", ".json", ".joblib", ".p"}
+)
+"""Endings of files that may hold poses; in a folder only these are read."""
+
+NON_POSE_SUFFIXES = frozenset(
+    {".txt", ".csv", ".md", ".bvh", ".fbx", ".glb", ".obj", ".mp4", ".mov", ".png"}
+)
+"""Endings of files that people name by mistake."""
+
+UNSUPPORTED_MAGIC = {
+    b"\x89HDF": "an HDF5 file; of PeopleSnapshot's: python -c \"import h5py, numpy; f = "
+    "h5py.File('reconstructed_poses.hdf5'); numpy.savez('poses.npz', **{k: f[k][()] for k in f})\"",
+    b"MATLAB": "a .mat of MATLAB; write global_orient, body_pose and transl to an .npz",
+    b"glTF": "a mesh; poses were expected",
+    b"Kaydara": "an .fbx; poses of SMPL were expected",
+}
+"""What files begin with that can be no poses, and what they are."""
+
+CHUNK_BYTES = 1 << 20
+"""Bytes that are unpacked at a time."""
+
+MAX_FOLDER_FILES = 100_000
+"""Of a folder: more files are no poses, a file a frame."""
+
+
+def read_untrusted_file(path: Path) -> Any:
+    """What a file holds; of a folder a dictionary of its files in natural order, by their names.
+
+    Raises:
+        InputError: If it is missing, damaged, too large, or asks to run something.
+    """
+    if path.is_dir():
+        return _folder(path)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist (or is no file); a file of poses was expected.")
+    if path.suffix.lower() in NON_POSE_SUFFIXES:
+        raise InputError(
+            f"{path} holds no poses that are read; expected a file ending in "
+            f"{', '.join(sorted(POSE_FILE_SUFFIXES))} or .jsonl (docs/formats.md)."
+        )
+    return explain_failures(path, lambda: _decode(read_limited(path), path), "file of poses")
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    files = sorted(
+        (file for file in path.iterdir() if file.suffix.lower() in POSE_FILE_SUFFIXES),
+        key=natural_sort_key,
+    )
+    if not files or len(files) > MAX_FOLDER_FILES:
+        raise InputError(
+            f"{path} is a folder with {len(files)} files ({', '.join(sorted(POSE_FILE_SUFFIXES))}); expected "
+            "a file of poses, or a folder with one for each frame or person."
+        )
+    return {file.name: read_untrusted_file(file) for file in files}
+
+
+def _decode(data: bytes, path: Path) -> Any:
+    """What the bytes hold, whatever they are packed in."""
+    if not data:
+        raise ValueError("it is empty")
+    if data.startswith(b"PK"):
+        return _zip(data)
+    if data.startswith(b"\x93NUMPY"):
+        return _npy(data)
+    if data[:1] == b"\x78" and (data[0] * 256 + data[1]) % 31 == 0:
+        return load_plain_pickle(_decompress(lambda: _inflated(data, zlib.MAX_WBITS)))
+    if data.startswith(b"\x1f\x8b"):
+        return load_plain_pickle(_decompress(lambda: _inflated(data, 16 + zlib.MAX_WBITS)))
+    if data.startswith(b"BZ"):
+        return load_plain_pickle(_decompress(lambda: _blocks(BZ2Decompressor(), data)))
+    if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
+        return load_plain_pickle(_decompress(lambda: _blocks(lzma.LZMADecompressor(), data)))
+    for magic, words in UNSUPPORTED_MAGIC.items():
+        if data.startswith(magic):
+            raise ValueError(words)
+    if data[:64].lstrip()[:1] in (b"{", b"["):
+        return _json(data, path)
+    return load_plain_pickle(data)
+
+
+def _json(data: bytes, path: Path) -> Any:
+    try:
+        return json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError):
+        if path.suffix.lower() == ".json":
+            raise
+        return load_plain_pickle(data)  # a pickle may begin with a bracket, too
+
+
+def _zip(data: bytes) -> Any:
+    """An .npz, or what torch.save writes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {entry.filename: entry for entry in archive.infolist()}
+        if sum(entry.file_size for entry in entries.values()) > 4 * MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {4 * MAX_BYTES >> 20} MiB")
+        program = next((name for name in entries if name.endswith("data.pkl")), None)
+        if program is None:
+            names = [name for name in entries if name.endswith(".npy")]
+            return {name.removesuffix(".npy"): _npy(archive.read(name)) for name in names}
+        root = program.removesuffix("data.pkl")
+        order = archive.read(root + "byteorder") if root + "byteorder" in entries else b"little"
+        if order != b"little":
+            raise ValueError("numbers of a big-endian machine")
+
+        def fetch(name: str, length: int) -> bytes:
+            raw = archive.read(f"{root}data/{name}")
+            if len(raw) < length:
+                raise ValueError("a storage that is cut off")
+            return raw or bytes(1)
+
+        return load_plain_pickle(archive.read(program), fetch)
+
+
+def _npy(data: bytes) -> Any:
+    """An array of numbers or texts; objects are unpickled."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, by_columns, kind = read(stream)
+    if kind.hasobject:
+        return load_plain_pickle(data[stream.tell() :])
+    if kind.names or kind.subdtype:
+        raise ValueError("an array of records")
+    numbers = np.frombuffer(data, kind, product(shape), stream.tell())
+    array = numbers.reshape(shape, order="F" if by_columns else "C")
+    if kind.kind in "US":
+        return array.item() if array.ndim == 0 else array.tolist()
+    return array
+
+
+def _decompress(pieces: Callable[[], Iterator[bytes]]) -> bytes:
+    """All pieces as one, once their sizes were counted: what is too large is not kept at all."""
+    size = 0
+    for piece in pieces():
+        size += len(piece)
+        if size > MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
+    return b"".join(pieces())
+
+
+def _inflated(data: bytes, bits: int) -> Iterator[bytes]:
+    """zlib's and gzip's content, piece after piece."""
+    inflater = zlib.decompressobj(bits)
+    for start in range(0, len(data), CHUNK_BYTES):
+        packed = data[start : start + CHUNK_BYTES]
+        while packed and not inflater.eof:
+            yield inflater.decompress(packed, CHUNK_BYTES)
+            packed = inflater.unconsumed_tail
+
+
+def _blocks(unpacker: BZ2Decompressor | lzma.LZMADecompressor, data: bytes) -> Iterator[bytes]:
+    """bzip2's and LZMA's content, piece after piece."""
+    for start in range(0, len(data), CHUNK_BYTES):
+        if unpacker.eof:
+            return
+        yield unpacker.decompress(data[start : start + CHUNK_BYTES], CHUNK_BYTES)
+        while not (unpacker.needs_input or unpacker.eof):
+            yield unpacker.decompress(b"", CHUNK_BYTES)

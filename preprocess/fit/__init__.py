@@ -1,1 +1,0 @@
-"""The body that is really used: poses brought to it, in size, place and stance."""

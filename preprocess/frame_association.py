@@ -1,0 +1,314 @@
+"""Which row of a file belongs to which frame, where nothing but the order tells.
+
+Which pose belongs to which frame, where times tell.
+
+Which frame each mask of a folder belongs to, where some frames have none: by their names.
+
+Frame numbers out of the names of files that hold a frame each.
+
+Which frame each camera belongs to: by the picture's name, by the number in it, or by order.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from capture.camera import Camera
+from capture.image_folder import list_images
+from capture.input_error import InputError
+from capture.source import FrameSource
+from preprocess.cameras.named_camera import NamedCamera
+
+NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `time`)"
+
+
+def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:
+    """From a frame's number to its row: one row a frame, of all frames or of the wanted ones.
+
+    The container's claim counts, so that a truncated video still fits its poses; where it does not
+    fit, the frames are counted by decoding them.
+
+    Args:
+        rows: How many rows the file has.
+        source: The frames.
+        things: What the rows are, for the message ("poses in poses.npz").
+
+    Raises:
+        InputError: If there are more or fewer rows than frames.
+    """
+    for total in (source.frames_in_file, None):
+        count = source.count_frames() if total is None else total
+        if rows == count:
+            return lambda index: index
+        if rows == source.selection.count(count):
+            return source.selection.position
+    raise InputError(
+        f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
+        f"frame, in order{NUMBERING_HINT if things.startswith('poses') else ''}.{_mismatch_hint(rows, count)}"
+    )
+
+
+def _mismatch_hint(rows: int, count: int) -> str:
+    """What may have happened, and what to do then."""
+    if rows > count:
+        return " Was the video cut, or written anew with fewer frames a second?"
+    step = round(count / rows)
+    if step > 1 and rows == -(-count // step):
+        return f" If they are those of one frame in {step}: --frames ::{step}."
+    return f" If they are those of the first {rows} frames: --frames 0:{rows}."
+
+
+MAX_TIME_OFFSET_S = 0.05
+"""A pose from farther away is no frame's own, however few poses there are."""
+MIN_MATCHED_FRACTION = 0.1
+"""Share of the frames, or of the poses, that must belong together by their times."""
+
+
+def associate_by_time(
+    times_s: Float[np.ndarray, "poses"], source: FrameSource
+) -> Callable[[float], int | None]:
+    """From a frame's time to the row nearest to it, or to None where none is near.
+
+    Args:
+        times_s: Of the poses, in any order; NaN where unknown.
+        source: The frames; what its container claims of their rate bounds how near a row must be.
+
+    Raises:
+        InputError: If hardly any frame has a pose at its time.
+    """
+    row_of = _nearest_row(times_s, _frame_interval_s(source))
+    _check_time_matches(times_s, source, row_of)
+    return row_of
+
+
+def _frame_interval_s(source: FrameSource) -> float | None:
+    """From one wanted frame to the next, as the container claims."""
+    if not source.duration_s or not source.frame_count:
+        return None
+    return source.duration_s / source.frame_count
+
+
+def _check_time_matches(
+    times_s: Float[np.ndarray, "poses"], source: FrameSource, row_of: Callable[[float], int | None]
+) -> None:
+    """Raises if hardly any frame has a pose at its time."""
+    step, count = _frame_interval_s(source), source.frame_count
+    if step is None or count is None:
+        return
+    start = source.selection.start * step / source.selection.step
+    found = {row_of(start + step * number) for number in range(count)} - {None}
+    most = min(count, len(times_s))
+    if len(found) < max(min(2, most), MIN_MATCHED_FRACTION * most):
+        known = times_s[np.isfinite(times_s)]
+        said = f"{known.min():.6g} to {known.max():.6g} s" if len(known) else "unknown times"
+        raise InputError(
+            f"The poses are those of {said}, the frames of {source.path} those of {start:.3g} to "
+            f"{start + step * count:.3g} s; `time` was expected in seconds since the video's first "
+            "frame. Is it in milliseconds, or by another clock?"
+        )
+
+
+def _nearest_row(
+    times_s: Float[np.ndarray, "poses"], frame_step_s: float | None
+) -> Callable[[float], int | None]:
+    """The row nearest to a time, if it is nearer than half the usual step, and near at all."""
+    finite = np.flatnonzero(np.isfinite(times_s))
+    rows = finite[np.argsort(times_s[finite], kind="stable")]
+    times = times_s[rows]
+    steps = np.diff(times)
+    reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
+    reach = min(reach, max(MAX_TIME_OFFSET_S, 0.5 * (frame_step_s or 0.0)))
+
+    def row(time_s: float) -> int | None:
+        place = int(np.searchsorted(times, time_s))
+        around = range(max(0, place - 1), min(len(times), place + 1))
+        nearest = min(around, key=lambda i: abs(times[i] - time_s), default=None)
+        if nearest is None or abs(times[nearest] - time_s) > reach + 1e-6:
+            return None
+        return int(rows[nearest])
+
+    return row
+
+
+def associate_by_name(names: Sequence[str], source: FrameSource) -> dict[int, int] | None:
+    """The masks' rows by their frames' numbers; None where names do not tell.
+
+    In a folder of pictures a mask belongs to the picture of its name, or of its number. In a video
+    numbers count the frames, from 0 if one is 0, from 1 if one is that of the last frame. Numbers
+    without a gap are the count of a few chosen frames, and say nothing. Where half of the frames or
+    more would have no mask, somebody has chosen, and should say so.
+
+    Args:
+        names: Of the masks' files, without their endings.
+        source: The frames.
+    """
+    if 2 * len(names) <= source.frames_in_file:
+        return None
+    if source.path.is_dir():
+        pictures = [file.stem for file in list_images(source.path)]
+        return _match_names(names, pictures) or _match_names(
+            _unique_numbers(names), _unique_numbers(pictures)
+        )
+    numbers, total = _unique_numbers(names), source.frames_in_file
+    if numbers is None:
+        return None
+    first = 0 if min(numbers) == 0 else 1 if max(numbers) == total else None
+    if first is None or max(numbers) - first >= total:
+        return None
+    if min(numbers) == first and max(numbers) - first + 1 == len(numbers):
+        return None
+    return {number - first: row for row, number in enumerate(numbers)}
+
+
+def _match_names(
+    masks: Sequence[str | int] | None, pictures: Sequence[str | int] | None
+) -> dict[int, int] | None:
+    """Rows by frames, if every mask has its own picture."""
+    if masks is None or pictures is None:
+        return None
+    frame_of = {picture: frame for frame, picture in enumerate(pictures)}
+    rows = {frame_of[mask]: row for row, mask in enumerate(masks) if mask in frame_of}
+    return rows if len(rows) == len(masks) else None
+
+
+def _unique_numbers(names: Sequence[str]) -> list[int] | None:
+    """The last number in each name; None unless all have one of their own."""
+    found = [re.findall(r"\d+", name) for name in names]
+    if not found or not all(found):
+        return None
+    numbers = [int(digits[-1]) for digits in found]
+    return numbers if len(set(numbers)) == len(numbers) else None
+
+
+def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
+    """The last number in each name; the place in order where a name has none, or two have one."""
+    listed = list(names)
+    found = [re.findall(r"\d+", name.rsplit(".", 1)[0].rsplit("/", 1)[-1]) for name in listed]
+    if not all(found) or len({int(numbers[-1]) for numbers in found}) < len(listed):
+        return list(range(len(listed)))
+    return [int(numbers[-1]) for numbers in found]
+
+
+MAX_INTERPOLATED_FRAMES = 12
+"""Frames without a camera between two that have one; longer gaps stay gaps."""
+MIN_NUMBERED_COVERAGE = 0.9
+"""Share of a video's frames that consecutive numbers must reach, to be its frames' own."""
+
+
+def cameras_by_frame(
+    found: Sequence[NamedCamera], source: FrameSource, path: Path
+) -> dict[int, Camera]:
+    """The cameras by their frames' numbers.
+
+    Args:
+        found: In the order of their pictures' names.
+        source: The frames.
+        path: Of the cameras, for messages.
+
+    Raises:
+        InputError: If it cannot be said which frames they belong to.
+    """
+    found = _select_image_folder(found, source, path)
+    names = [None if each.name is None else PurePosixPath(each.name).name for each in found]
+    if source.path.is_dir():
+        index = {file.stem: number for number, file in enumerate(list_images(source.path))}
+        matched = {
+            index[n]: each.camera for n, each in zip(names, found, strict=True) if n in index
+        }
+        if matched:
+            return matched
+    if len(found) == source.frames_in_file:
+        return {number: each.camera for number, each in enumerate(found)}
+    numbers = _frame_numbers(names, source.frames_in_file)
+    if numbers is not None:
+        return {n: each.camera for n, each in zip(numbers, found, strict=True)}
+    raise InputError(
+        f"{path} holds {len(found)} cameras, {source.path} {source.frames_in_file} frames, and "
+        "their names do not tell which belong together. Give as VIDEO the folder of pictures that "
+        "the cameras were made from, or a camera for every frame."
+    )
+
+
+def _select_image_folder(
+    found: Sequence[NamedCamera], source: FrameSource, path: Path
+) -> Sequence[NamedCamera]:
+    """The cameras of the video's own pictures, where several folders hold pictures of one name.
+
+    Raises:
+        InputError: If none of the folders is named like the video.
+    """
+    places = [PurePosixPath(each.name or str(row)) for row, each in enumerate(found)]
+    if len({place.name for place in places}) == len(found):
+        return found
+    own = {source.path.resolve().name, source.path.stem}
+    chosen = [e for place, e in zip(places, found, strict=True) if own & set(place.parent.parts)]
+    if not chosen or len({PurePosixPath(each.name or "").name for each in chosen}) < len(chosen):
+        folders = ", ".join(sorted({str(place.parent) for place in places})[:12])
+        raise InputError(
+            f"{path} holds several cameras for pictures of one name, in the folders {folders}; "
+            f"{source.path} is none of them. Give as VIDEO one of these folders of pictures."
+        )
+    return chosen
+
+
+def interpolate_missing_cameras(
+    cameras: dict[int, Camera], frames: int
+) -> tuple[tuple[Camera, ...], frozenset[int]]:
+    """A camera for every frame; short gaps are filled in, longer ones named.
+
+    Between two cameras rotations turn evenly (slerp) and centres move on a line.
+
+    Returns:
+        One camera a frame, and the frames whose camera is only a stand-in.
+    """
+    known = np.array(sorted(number for number in cameras if 0 <= number < frames))
+    if not len(known):
+        raise InputError("None of the cameras belongs to a frame of the video.")
+    filled, missing = [], set()
+    for frame in range(frames):
+        after = int(np.searchsorted(known, frame))
+        if after < len(known) and known[after] == frame:
+            filled.append(cameras[frame])
+            continue
+        inside = 0 < after < len(known)
+        if inside and known[after] - known[after - 1] <= MAX_INTERPOLATED_FRAMES + 1:
+            early, late = int(known[after - 1]), int(known[after])
+            share = (frame - early) / (late - early)
+            filled.append(_interpolate_camera(cameras[early], cameras[late], share))
+            continue
+        missing.add(frame)
+        filled.append(cameras[int(known[min(after, len(known) - 1)])])
+    return tuple(filled), frozenset(missing)
+
+
+def _interpolate_camera(a: Camera, b: Camera, share: float) -> Camera:
+    start = Rotation.from_matrix(a.camera_from_world[:3, :3])
+    turn = Rotation.from_matrix(b.camera_from_world[:3, :3]) * start.inv()
+    rotation = (Rotation.from_rotvec(share * turn.as_rotvec()) * start).as_matrix()
+    center = (1.0 - share) * a.center_world + share * b.center_world
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = rotation
+    camera_from_world[:3, 3] = -rotation @ center
+    return replace(a, camera_from_world=camera_from_world)
+
+
+def _frame_numbers(names: Sequence[str | None], frames: int) -> list[int] | None:
+    """Frame numbers in names such as frame_00042, counted from 0 or 1; None if there are none.
+
+    Numbers without a gap that end long before the video does are the count of a few chosen frames.
+    """
+    parsed = [re.findall(r"\d+", name or "") for name in names]
+    if not all(parsed):
+        return None
+    numbers = [int(digits[-1]) for digits in parsed]
+    first = 0 if min(numbers) == 0 else 1
+    numbers = [number - first for number in numbers]
+    if len(set(numbers)) < len(numbers) or max(numbers) >= frames:
+        return None
+    chosen = len(numbers) == max(numbers) + 1 and len(numbers) < MIN_NUMBERED_COVERAGE * frames
+    return None if chosen else numbers

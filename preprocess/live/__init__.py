@@ -1,0 +1,1 @@
+"""Poses, masks and alignment of a live source."""

@@ -1,0 +1,171 @@
+"""SMPL's poses on another body while they come: fitted to what was seen so far, ever again.
+
+The first picture says how far away the person is, turning says the rest. So what
+`preprocess.alignment.mask_alignment` does is done with the first frame, and whenever there are twice as many; or,
+where no masks will come, what `preprocess.alignment.image_alignment` does.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.camera import Camera
+from capture.frame import Frame
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.image_alignment import (
+    ImageSample,
+    place_body_on_images,
+    thumbnail_size_px,
+)
+from preprocess.alignment.mask_alignment import (
+    ALIGNMENT_SAMPLES,
+    BodyPlacement,
+    move_pelvis,
+    place_body_on_masks,
+)
+from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints
+from preprocess.observation import Observation
+from preprocess.observe import DroppedFrame
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _KeptFrame:
+    """A frame that is kept: the tracker's own pose, and the mask or the picture, small."""
+
+    pose: BodyPose
+    thumbnail: Shaped[np.ndarray, "height width *_"]
+
+
+@final
+class LiveAlignment:
+    """Fits the poses of one stream, seen by a camera that stands still, to one body.
+
+    Attributes:
+        refit: What was found last; None before the first frame.
+        frames: On how many frames it rests.
+        masked: Whether it looks at masks, or at pictures.
+    """
+
+    def __init__(self, shaped: ShapedBody, model: str, *, masked: bool = True) -> None:
+        """Nothing was seen yet.
+
+        Args:
+            shaped: The body that is used.
+            model: Whose poses they are.
+            masked: Whether masks come along; else pictures are looked at.
+        """
+        self.placement: BodyPlacement | None = None
+        self.frame_count = 0
+        self._skin, self._model, self.uses_masks = SkinPoints.of(shaped), model, masked
+        self._seen: list[_KeptFrame] = []
+        self._count, self._every = 0, 1
+
+    def align(self, observation: Observation) -> Observation:
+        """The observation with its pose as it fits the masks, this one among them."""
+        pose = self._align_pose(observation.pose, observation.camera, observation.alpha)
+        return observation if pose is observation.pose else replace(observation, pose=pose)
+
+    def align_observations(
+        self, observe: Callable[[Frame], Observation | DroppedFrame]
+    ) -> Callable[[Frame], Observation | DroppedFrame]:
+        """What makes observations of frames, their poses fitted to the masks in them."""
+
+        def fitted(frame: Frame) -> Observation | DroppedFrame:
+            seen = observe(frame)
+            return seen if isinstance(seen, DroppedFrame) else self.align(seen)
+
+        return fitted
+
+    def align_poses(
+        self, pose_of: Callable[[Frame], BodyPose | str], camera: Camera
+    ) -> Callable[[Frame], BodyPose | str]:
+        """What gives frames their poses, fitted to the pictures, before masks are estimated."""
+
+        def fitted(frame: Frame) -> BodyPose | str:
+            pose = pose_of(frame)
+            return pose if isinstance(pose, str) else self._align_pose(pose, camera, frame.rgb)
+
+        return fitted
+
+    def _align_pose(
+        self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
+    ) -> BodyPose:
+        """The pose of a new frame as it fits all masks, or pictures, that are kept."""
+        if self._count % self._every == 0:
+            self._keep(pose, camera, seen)
+        self._count += 1
+        if self._count >= 2 * self.frame_count:
+            self.frame_count = self._count
+            self.placement = self._solve(camera)
+        if self.placement is None or not self.placement.is_improvement:
+            return pose
+        return self._place(pose, camera, self.placement)
+
+    def _keep(
+        self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
+    ) -> None:
+        """Remembers a frame; of more than twice what a search takes, every other one goes."""
+        if self._seen:
+            height, width = self._seen[0].thumbnail.shape[:2]
+        elif self.uses_masks:
+            rows = np.flatnonzero((seen > 0.5).any(axis=1))
+            scale = min(1.0, SILHOUETTE_PERSON_PX / (rows[-1] + 1 - rows[0]))
+            height, width = (max(8, round(side * scale)) for side in seen.shape)
+        else:
+            width, height = thumbnail_size_px(self._skin, pose, camera)
+        small = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
+        self._seen.append(_KeptFrame(pose=pose, thumbnail=small))
+        if len(self._seen) >= 2 * ALIGNMENT_SAMPLES:
+            self._every *= 2
+            del self._seen[1::2]
+
+    def _solve(self, camera: Camera) -> BodyPlacement:
+        """What all that is remembered says."""
+        poses = [seen.pose for seen in self._seen]
+        count = len(poses)
+        motion = Motion(
+            root_rotations=np.stack([pose.root_rotation for pose in poses]),
+            root_translations=np.stack([pose.root_translation for pose in poses]),
+            joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
+            valid=np.ones(count, dtype=bool),
+            betas=np.zeros(10),
+            body_model=self._model,
+        )
+        claim = CaptureGeometry(
+            motion=motion,
+            row_frames=np.arange(count, dtype=np.float64),
+            intrinsics=camera.intrinsic[None],
+            extrinsics=camera.camera_from_world[None],
+            size_px=camera.size_px,
+            distortion=camera.distortion,
+        )
+        if not self.uses_masks:
+            pictures = [
+                ImageSample(index=index, camera_row=0, rgb=seen.thumbnail)
+                for index, seen in enumerate(self._seen)
+            ]
+            return place_body_on_images(claim, self._skin, pictures)
+        witnesses = tuple(
+            MaskSample(index=index, camera_row=0, alpha=seen.thumbnail.astype(np.float32))
+            for index, seen in enumerate(self._seen)
+        )
+        return place_body_on_masks(claim, SilhouetteObjective(samples=witnesses, skin=self._skin))
+
+    def _place(self, pose: BodyPose, camera: Camera, placement: BodyPlacement) -> BodyPose:
+        rest = self._skin.shaped.joints[0]
+        there = move_pelvis(
+            rest + pose.root_translation,
+            camera.center_world,
+            rotation_matrices(pose.root_rotation),
+            placement.distance_divisor,
+            placement.pelvis_shift_m,
+        )
+        return replace(pose, root_translation=there - rest)

@@ -1,0 +1,341 @@
+"""What a user should know about how the parts of a recording were read.
+
+Whose body a recording's poses move: its own, one of a stated height, or a finished avatar's.
+
+Finds, opens and checks the parts of a recording.
+"""
+
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from capture.live.pacing_clock import PacingClock
+from capture.source import FrameSource, TransposedSource
+from capture.source_opening import open_live_source, open_source
+from capture.video import VideoFile
+from preprocess.alignment.capture_alignment import (
+    BodyAlignment,
+    align_body,
+    align_to_person,
+    detect_body_model,
+    estimate_focal_length,
+    is_same_person,
+    needs_placement,
+)
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
+from preprocess.body.body_file import load_body_model, read_shaped_body
+from preprocess.body.body_pose import Motion
+from preprocess.body.parametric_body import ShapedBody, shape_for_motion
+from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
+from preprocess.cameras.camera_orientation import read_upright_cameras
+from preprocess.capture_paths import CapturePaths, find_capture_paths, find_live_capture_paths
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.live.live_alignment import LiveAlignment
+from preprocess.live.live_inputs import LiveInputs
+from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
+from preprocess.masks.mask_origin import (
+    MaskOrigin,
+    Segmenter,
+    choose_mask_origin,
+    make_segmenter,
+    segmenter_name,
+)
+from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.poses.plausibility import plausibility_warnings, require_plausible
+from preprocess.poses.root_placement import place_in_camera_world
+
+
+def describe_capture(
+    fit: BodyAlignment,
+    masks: Masks | None,
+    cameras: CameraTrack,
+    choice: MaskOrigin,
+    *,
+    unread_alpha_video: Path | None = None,
+    expected_masks: Path | None = None,
+) -> Iterator[str]:
+    """Sentences, one after the other.
+
+    Args:
+        fit: Poses and body.
+        masks: The masks, if a file holds them.
+        cameras: The cameras.
+        choice: Which masks are used.
+        unread: The video, if it has an alpha channel that is not read.
+        looked_for: Where a segmenter was expected to write the masks of a live source.
+    """
+    motion, family = fit.motion, fit.shaped.body.family
+    if motion.note is not None:
+        yield motion.note
+    if cameras.note is not None:
+        yield cameras.note
+    if choice.segmenter is not None:
+        yield (
+            f"Masks are estimated from the pictures and the poses (segmenter:{choice.segmenter}); "
+            "a segmenter's own masks (--masks) are sharper around hair and hands."
+        )
+    if choice.is_fallback and expected_masks is not None:
+        yield f"There was no folder of masks {expected_masks} when the first pose came."
+    if choice.is_fallback and unread_alpha_video is not None:
+        folder = unread_alpha_video.with_name(f"{unread_alpha_video.stem}_frames")
+        video, made, pictures = (
+            shlex.quote(str(path)) for path in (unread_alpha_video, folder, folder / "%06d.png")
+        )
+        yield (
+            f"{unread_alpha_video.name} has an alpha channel, which is not read from videos. If it cuts the "
+            "person out, write pictures, and learn from their folder: "
+            f"mkdir {made} && ffmpeg -i {video} {pictures}"
+        )
+    if choice.uses_alpha_channel:
+        yield "The pictures' own alpha channel is used as their masks."
+    if masks is not None and masks.inverted:
+        yield f"The masks in {masks.path} show the background (white); they were inverted."
+    if motion.body_model != family:
+        yield (
+            f"The poses were made for the body model {motion.body_model!r}, but {family!r} is used "
+            f"(--body), with joints where the mean shape has them. {fit.description}".strip()
+        )
+    elif fit.description:
+        yield fit.description
+    lost = len(motion) - int(motion.valid.sum())
+    if lost:
+        yield (
+            f"{lost} of {len(motion)} poses are NaN or marked as not valid; their frames are left "
+            "out."
+        )
+
+
+HEIGHT_TOLERANCE_CM = 1.5
+"""A stated height that is so near to the avatar's own says the same."""
+LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
+
+
+def fit_person(
+    motion: Motion,
+    shaped: ShapedBody,
+    cameras: CameraTrack,
+    source: FrameSource,
+    masks: Masks | None,
+    *,
+    avatar_body: Path | None,
+    height_m: float | None,
+) -> BodyAlignment:
+    """The body, and the poses for it.
+
+    Args:
+        motion: In the cameras' world, for the body `shaped`.
+        shaped: As the poses' tracker had it in mind.
+        cameras, source, masks: See `align_body`.
+        avatars: The person of a finished avatar, as a file, if these poses are added to one.
+        height_m: How tall the person is, if somebody knows.
+
+    Raises:
+        InputError: If a stated height cannot be had.
+    """
+    if avatar_body is not None:
+        person = read_shaped_body(avatar_body, shaped.body)
+        _check_height(person, height_m)
+        return align_to_person(motion, shaped, person, cameras, source, masks)
+    fit = align_body(motion, shaped, cameras, source, masks)
+    if height_m is None:
+        return fit
+    if cameras.is_moving:
+        raise InputError(
+            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
+            "size of its own. Leave one of them out."
+        )
+    taller = scale_to_height(fit.shaped, height_m)
+    moved = rescale_motion(CaptureGeometry.of(fit.motion, cameras, source), fit.shaped, taller)
+    return replace(fit, shaped=taller, motion=moved)
+
+
+def fit_live_person(
+    motion: Motion, shaped: ShapedBody, *, avatar_body: Path | None, has_masks: bool
+) -> tuple[BodyAlignment, LiveAlignment | None]:
+    """The same of a live source, whose masks are yet to come.
+
+    Args:
+        motion: What has come of the poses.
+        shaped: As their tracker had it in mind.
+        avatars: See `person_of`.
+        masked: Whether there will be masks that are not estimated.
+
+    Returns:
+        The body, and what fits the poses to it while they come, if that is needed.
+    """
+    person = shaped if avatar_body is None else read_shaped_body(avatar_body, shaped.body)
+    foreign = needs_placement(motion, shaped)
+    if not foreign and is_same_person(person, shaped):
+        return BodyAlignment(shaped=person, motion=motion), None
+    words = LIVE_FIT_NOTE.format("masks" if has_masks else "pictures")
+    fit = BodyAlignment(shaped=person, motion=motion, description=words)
+    return fit, LiveAlignment(person, motion.body_model, masked=has_masks)
+
+
+def _check_height(person: ShapedBody, height_m: float | None) -> None:
+    """Raises if a stated height is not the avatar's."""
+    height_cm = 100.0 * body_height_m(person)
+    if height_m is not None and abs(100.0 * height_m - height_cm) > HEIGHT_TOLERANCE_CM:
+        raise InputError(
+            f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is {height_cm:.0f} cm "
+            "tall, which was settled by its first video. Leave it out, or learn the avatar anew "
+            "(--overwrite)."
+        )
+
+
+def open_capture(
+    inputs: CaptureInputs,
+    *,
+    size_px: int | None = None,
+    skip_checks: bool = False,
+    avatar_body: Path | None = None,
+) -> Capture:
+    """A recording, or a live source whose first picture and first pose are waited for.
+
+    Args:
+        wanted: What the user named.
+        size_px: Longer side that training will see.
+        doubtful: Leaves out whether the parts fit together, for somebody who wants to find out.
+        avatars: The person of a finished avatar, as a file, to whom the poses are to belong.
+
+    Raises:
+        InputError: If a part is missing or unreadable, or they do not fit together.
+    """
+    camera = camera_address(inputs.video)
+    if inputs.live or camera is not None:
+        return _open_live(inputs, camera, size_px, avatar_body)
+    recording = _open_recorded(inputs, size_px, avatar_body, doubtful=skip_checks)
+    if not skip_checks:
+        recording.check()
+    return recording
+
+
+def _open_recorded(
+    wanted: CaptureInputs, size_px: int | None, avatars: Path | None, *, doubtful: bool
+) -> Capture:
+    paths = find_capture_paths(wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras)
+    source, body = open_source(paths.video, frames=wanted.frames), load_body_model(wanted.body)
+    source = TransposedSource(source) if wanted.transposed else source
+    motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
+    doubts: tuple[str, ...] = ()
+    if not doubtful:  # ia-check wants the numbers as they are, and says what is odd by itself
+        doubts, motion = (
+            tuple(plausibility_warnings(motion)),
+            require_plausible(motion, paths.poses),
+        )
+    choice, masks = _open_masks(paths, source, wanted)
+    paths = replace(paths, masks=choice.path)
+    cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
+    motion = detect_body_model(motion, body, cameras, source, masks, cameras_given=given)
+    shaped = shape_for_motion(body, motion)
+    motion = place_in_camera_world(motion, shaped, cameras, cameras_given=given)
+    if not given and motion.intrinsic is None and motion.assumed_focal is None:
+        cameras = estimate_focal_length(cameras, motion, shaped, source, masks)
+    fit = fit_person(
+        motion, shaped, cameras, source, masks, avatar_body=avatars, height_m=wanted.height_m
+    )
+    return Capture(
+        paths=paths,
+        source=source,
+        motion=fit.motion,
+        masks=masks,
+        cameras=cameras,
+        shaped=fit.shaped,
+        size_px=size_px,
+        notes=(
+            *describe_capture(
+                fit, masks, cameras, choice, unread_alpha_video=_unread_alpha(source)
+            ),
+            *doubts,
+        ),
+        segment=_make_segmenter(choice, fit.shaped),
+        refit=fit.placement,
+    )
+
+
+def _open_live(
+    wanted: CaptureInputs, camera: str | None, size_px: int | None, avatars: Path | None
+) -> Capture:
+    if wanted.cameras == "solve" or wanted.height_m is not None:
+        raise InputError(
+            "--cameras solve and --height-cm need a recording; of a live source the camera "
+            "stands still (--cameras static), and nobody knows its poses yet."
+        )
+    paths = find_live_capture_paths(
+        wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras
+    )
+    body, pace = load_body_model(wanted.body), PacingClock()
+    source = open_live_source(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
+    live = LiveInputs.open(
+        paths, source, pace, family=body.family, invert=wanted.invert_masks,
+        first_within_s=wanted.idle_s, given_masks=wanted.masks,
+    )  # fmt: skip
+    choice, looked_for = live.choice, paths.masks
+    paths = replace(paths, masks=choice.path)
+    source.has_alpha = choice.uses_alpha_channel
+    motion = live.poses.motion
+    doubts = tuple(plausibility_warnings(motion))
+    cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
+    shaped = shape_for_motion(body, motion)
+    live.poses.set_placement(
+        lambda read: place_in_camera_world(read, shaped, cameras, cameras_given=given)
+    )
+    fit, growing_fit = fit_live_person(
+        live.poses.motion, shaped, avatar_body=avatars, has_masks=choice.segmenter is None
+    )
+    recording = Capture(
+        paths=paths,
+        source=source,
+        motion=fit.motion,
+        masks=None,
+        cameras=cameras,
+        shaped=fit.shaped,
+        size_px=size_px,
+        notes=(*describe_capture(fit, None, cameras, choice, expected_masks=looked_for), *doubts),
+        live=live,
+        segment=_make_segmenter(choice, fit.shaped),
+        live_fit=growing_fit,
+    )
+    recording.check()
+    return recording
+
+
+def _mask_file(masks: Path | None) -> Path | None:
+    """What --masks names, unless it is a segmenter."""
+    return masks if segmenter_name(masks) is None else None
+
+
+def _make_segmenter(choice: MaskOrigin, shaped: ShapedBody) -> Segmenter | None:
+    return None if choice.segmenter is None else make_segmenter(choice.segmenter, shaped)
+
+
+def _unread_alpha(source: FrameSource) -> Path | None:
+    """The video, if it has an alpha channel, which is not read."""
+    return source.path if isinstance(source, VideoFile) and source.leaves_alpha else None
+
+
+def _open_masks(
+    paths: CapturePaths, source: FrameSource, wanted: CaptureInputs
+) -> tuple[MaskOrigin, Masks | None]:
+    """Which masks are used; and those, if a file holds them, which may be that of the poses."""
+    choice = choose_mask_origin(wanted.masks, paths.masks, has_alpha=source.has_alpha)
+    source.has_alpha = choice.uses_alpha_channel
+    if choice.is_fallback:
+        masks = open_tracker_masks(paths.poses, source, person=wanted.person)
+        return (choice, None) if masks is None else (MaskOrigin(path=masks.path), masks)
+    if choice.path is None:
+        return choice, None
+    return choice, open_masks(choice.path, invert=wanted.invert_masks, person=wanted.person)
+
+
+def _read_or_assume_cameras(
+    paths: CapturePaths, motion: Motion, source: FrameSource
+) -> CameraTrack:
+    """Cameras of their own file, or what the poses say."""
+    if paths.cameras is not None:
+        return read_upright_cameras(paths.cameras, source)
+    return assume_static_camera(motion, source.size_px)

@@ -1,0 +1,1 @@
+"""Adapters: one module per program whose pose files are read."""

@@ -1,0 +1,158 @@
+"""The keys of InstantAvatar, which its successors write too, in any container; and HumanData.
+
+Layout: global_orient, body_pose, transl; or thetas, transl; or poses, trans; with optional keys of
+ours (frame, time, valid, K, camera, model): see `preprocess.poses.pose_file`. mmhuman3d's HumanData holds
+the same under `smpl`, and so does EMDB. Other names of the same things are known, too (`KEY_ALIASES`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.input_error import InputError
+from preprocess.body.body_pose import RelativeFocalLength
+from preprocess.poses.motion_builder import MotionByPerson
+from preprocess.poses.pose_file import CAMERA_KEYS, POSE_KEY_LAYOUTS, motion_from_arrays
+
+KEY_ALIASES = {
+    "global_orient": ("root_orient", "root_pose", "poses_root"),
+    "body_pose": ("pose_body", "poses_body"),
+    "thetas": ("pose", "smpl_poses"),
+    "transl": ("trans", "global_t", "smpl_trans"),
+    "betas": ("shape", "smpl_betas"),
+    "valid": ("good_frames_mask",),
+    "K": ("cam_intrinsics", "intrinsics"),
+    "camera": ("cam_extrinsics", "extrinsics"),
+}
+"""What other programs call the same numbers: ExAvatar, ARAH, EMDB, CLIFF, HumanNeRF and more."""
+
+SMPLX_KEYS = frozenset(
+    {"left_hand_pose", "lhand_pose", "jaw_pose", "leye_pose", "expression", "expr"}
+)
+"""Keys of which one is enough to know the body."""
+MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
+"""Bodies by how many joints a pose has, hands and face included."""
+
+SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
+"""What may lie beside `smpl`."""
+RECOGNIZED_KEYS = (
+    *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame", "time",
+    "valid", "K", "model", "space", "scale",
+)  # fmt: skip
+"""What is taken of a file; whatever else is in it is left there."""
+CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
+"""The camera in which CLIFF's `global_t` is."""
+
+GENDERED_MODELS = {"f": "female", "m": "male"}
+"""Bodies of SMPL whose betas are not the neutral one's."""
+
+SCALE_TOLERANCE = 0.01
+"""A stated scale that is nearer to 1 says nothing."""
+
+
+def parse_people(content: Any, path: Path, default_model: str) -> MotionByPerson | None:
+    """The person of the file; None if it has other keys.
+
+    Raises:
+        InputError: If it has the keys, and what they hold is no motion.
+    """
+    if not isinstance(content, dict):
+        return None
+    held = content.get("smpl", content)
+    if not isinstance(held, dict):
+        return None
+    named = normalize_keys(held)
+    if held is not content:
+        beside = {key: value for key, value in content.items() if not isinstance(value, dict)}
+        if isinstance(content.get("camera"), dict):
+            beside |= content["camera"]
+        around = normalize_keys(beside)
+        named |= {key: around[key] for key in SIBLING_KEYS if key in around and key not in named}
+        named.setdefault("model", "smpl")
+    if not any(set(keys) <= named.keys() for keys in POSE_KEY_LAYOUTS):
+        return None
+    motion = motion_from_arrays(collect_arrays(named, path), path, default_model=default_model)
+    if "global_t" in held:
+        motion = replace(motion, assumed_focal=CLIFF_FOCAL, space="camera")
+    sex = str(_gender(held, content)).lower()[:1]
+    if default_model == "smpl" and motion.body_model == "smpl" and sex in GENDERED_MODELS:
+        motion = replace(
+            motion,
+            note=f"The shape in {path.name} is one of SMPL's {GENDERED_MODELS[sex]} body; another body "
+            "(--body) makes somebody else of it.",
+        )
+    return {"0": motion}
+
+
+def _gender(held: Mapping[Any, Any], content: Mapping[Any, Any]) -> Any:
+    """What the file says of the body's gender, if it does."""
+    said = held.get("gender", content.get("gender", ""))
+    return said.item() if isinstance(said, np.ndarray) and said.size == 1 else said
+
+
+def normalize_keys(held: Mapping[Any, Any]) -> dict[str, Any]:
+    """The same by the house's keys, where another name stands for what is missing.
+
+    The body is named where other keys tell: hands and face are SMPL-X's; whoever states a gender,
+    or uses other names, has fitted SMPL.
+    """
+    found = {str(key): value for key, value in held.items() if value is not None}
+    foreign, ours = False, any(set(keys) <= found.keys() for keys in POSE_KEY_LAYOUTS)
+    for key, others in KEY_ALIASES.items():
+        known = next((other for other in others if other in found), None)
+        if key not in found and known is not None and not isinstance(found[known], dict):
+            found[key] = found[known]
+            foreign = not ours
+    if "K" not in found and {"focal", "princpt"} <= found.keys():
+        found["K"] = _intrinsic_matrix(found["focal"], found["princpt"])
+    if "model" not in found:
+        kind = str(found.get("surface_model_type", "")).replace("-", "").lower()
+        if SMPLX_KEYS & found.keys() or "smplx" in kind:
+            found["model"] = "smplx"
+        elif "gender" in found or foreign:
+            found["model"] = "smpl"  # nobody else's programs know the embedded body
+    return found
+
+
+def _intrinsic_matrix(focal: Any, center: Any) -> Any:
+    """K of LHM's `focal` and `princpt`; NaN where they are none, which is refused."""
+    try:
+        (fx, fy), (cx, cy) = np.asarray(focal, float).ravel(), np.asarray(center, float).ravel()
+    except (TypeError, ValueError):
+        return np.full((3, 3), np.nan)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def collect_arrays(named: Mapping[str, Any], path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """The arrays that `motion_of` takes.
+
+    Raises:
+        InputError: If they are no arrays, or the world that they speak of is not metric.
+    """
+    try:
+        arrays = {key: np.asarray(named[key]) for key in RECOGNIZED_KEYS if key in named}
+    except ValueError as cause:
+        raise InputError(f"{path}: one of its arrays has rows of several lengths ({cause}).") from (
+            cause
+        )
+    whole = arrays.get("thetas", arrays.get("poses"))
+    if "model" not in arrays and whole is not None and whole.ndim >= 2 and whole[0].size:
+        joints = whole[0].size // (9 if whole.shape[-2:] == (3, 3) else 3)
+        if joints in MODEL_BY_JOINT_COUNT:
+            arrays["model"] = np.array(MODEL_BY_JOINT_COUNT[joints])
+    scale = arrays.get("scale")
+    if (
+        scale is not None
+        and scale.dtype.kind in "iuf"
+        and (abs(scale - 1.0) > SCALE_TOLERANCE).any()
+    ):
+        raise InputError(
+            f"{path} has a `scale` of {np.median(scale):.3g}: its world has a unit of its own "
+            "(NeuMan, HUGS), and metres were expected. Divide `transl`, and the shifts of the "
+            "cameras, by `scale`, and leave the key out."
+        )
+    return arrays

@@ -1,0 +1,154 @@
+"""Plausibility of poses: which numbers cannot be a body's pose, and which are only odd.
+
+Every command that reads poses judges them here, so that all of them know the same mistakes:
+
+    motion = read_poses(path)            # as the file has it; ia-check needs it so, to mend it
+    motion = plausible(motion, path)     # refuses degrees and millimetres, drops single bad rows
+    for sentence in oddities(motion): …  # what may be meant, as a warning
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from capture.input_error import InputError
+from preprocess.body.body_pose import Motion
+
+MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
+"""Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
+SUSPICIOUS_JOINT_ANGLE_RAD = 1.5 * np.pi
+"""Angle of a joint that is worth a warning."""
+MAX_STEP_M = 10.0
+"""Largest median distance between the places of consecutive frames, metres."""
+MAX_DISTANCE_M = 1000.0
+"""Largest median distance from the origin, metres."""
+SUSPICIOUS_DISTANCE_M = 50.0
+"""Median distance from the origin beyond which the unit is in doubt, metres."""
+FULL_TURN_RAD = 2.0 * np.pi
+"""Root angles beyond this are those of a spin that goes on counting, or degrees. A spin …"""
+MAX_SPIN_STEP_RAD = np.pi
+"""… counts on by less than this from pose to pose (the median), …"""
+MAX_SPIN_START_RAD = 8.0 * np.pi
+"""… and begins below this."""
+ASSUMED_FPS = 30.0
+"""Rate that is assumed where poses have times but no frame numbers."""
+
+
+def require_plausible(motion: Motion, path: Path | str) -> Motion:
+    """Return the motion with impossible rows marked as not valid.
+
+    Args:
+        motion: As it was read.
+        path: The file, for the message.
+
+    Raises:
+        InputError: If the numbers cannot be poses of a body in radians and metres.
+    """
+    reason = implausibility_reason(motion)
+    if reason is not None:
+        raise InputError(f"{path}: {reason}")
+    return invalidate_implausible_rows(motion)
+
+
+def invalidate_implausible_rows(motion: Motion) -> Motion:
+    """Return the motion with every row whose joints are bent too far marked as not valid."""
+    return replace(motion, valid=motion.valid & ~exceeds_joint_limits(motion.joint_rotations))
+
+
+def exceeds_joint_limits(
+    joint_rotations: Float[np.ndarray, "*poses 23 3"],
+) -> Bool[np.ndarray, "*poses"]:
+    """Find poses in which a joint is turned by more than `MAX_JOINT_ANGLE_RAD`."""
+    return np.asarray((np.linalg.norm(joint_rotations, axis=-1) > MAX_JOINT_ANGLE_RAD).any(axis=-1))
+
+
+def implausibility_reason(motion: Motion) -> str | None:
+    """Say why the numbers cannot be poses in radians and metres; None if they can."""
+    joints = motion.joint_rotations[motion.valid]
+    bad = int(exceeds_joint_limits(joints).sum())
+    if 2 * bad > len(joints):
+        largest = np.rad2deg(np.linalg.norm(joints, axis=-1).max())
+        return (
+            f"A joint is bent by {largest:.0f}°, and one by more than "
+            f"{np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}° in {bad} of {len(joints)} poses; were "
+            "axis-angles in radians expected, and degrees given? Multiply the rotations by "
+            "pi / 180 (numpy.deg2rad)."
+        )
+    if _has_assumed_focal(motion):
+        return None
+    step_m, distance_m = _median_step_m(motion), _median_distance_m(motion)
+    if step_m > MAX_STEP_M or distance_m > MAX_DISTANCE_M:
+        return (
+            f"The body is {distance_m:,.0f} m from the origin and moves by {step_m:,.1f} m from "
+            "frame to frame (medians); were translations in metres expected, and millimetres or "
+            "centimetres given? Divide them by 1000 or 100."
+        )
+    return None
+
+
+def plausibility_warnings(motion: Motion) -> Iterator[str]:
+    """Yield sentences about numbers that are possible but hardly meant; none of impossible ones."""
+    if implausibility_reason(motion) is not None:
+        return
+    joints, roots = motion.joint_rotations[motion.valid], motion.root_rotations[motion.valid]
+    bad = int(exceeds_joint_limits(joints).sum())
+    if bad:
+        yield (
+            f"{bad} of {len(motion)} poses bend a joint by more than "
+            f"{np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°, which no pose needs; they are left out."
+        )
+    angles = np.linalg.norm(joints[~exceeds_joint_limits(joints)], axis=-1)
+    if angles.size and angles.max() > SUSPICIOUS_JOINT_ANGLE_RAD:
+        yield (
+            f"A joint is bent by {np.rad2deg(angles.max()):.0f}°; were axis-angles in radians "
+            "expected, and degrees given?"
+        )
+    turned, step_rad = np.linalg.norm(roots, axis=-1), _median_root_step_rad(roots)
+    if turned.max(initial=0.0) > FULL_TURN_RAD and (
+        step_rad > MAX_SPIN_STEP_RAD or turned.min() > MAX_SPIN_START_RAD
+    ):
+        yield (
+            f"The root is turned by up to {np.rad2deg(turned.max()):.0f}°, and by "
+            f"{np.rad2deg(step_rad):.0f}° from pose to pose (the median); were axis-angles in "
+            "radians expected, and degrees given?"
+        )
+    distance_m = _median_distance_m(motion)
+    if distance_m > SUSPICIOUS_DISTANCE_M and not _has_assumed_focal(motion):
+        yield f"The poses lie {distance_m:.0f} m from the origin; are they in metres?"
+
+
+def _has_assumed_focal(motion: Motion) -> bool:
+    """Whether depths are for the tracker's own focal length, with which they grow without limit."""
+    return motion.assumed_focal is not None or (
+        motion.space == "camera" and motion.intrinsic is not None
+    )
+
+
+def _median_root_step_rad(roots: Float[np.ndarray, "poses 3"]) -> float:
+    """Median change of the root's axis-angle from pose to pose, radians; 0 for one pose."""
+    steps = np.linalg.norm(np.diff(roots, axis=0), axis=1)
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def _median_distance_m(motion: Motion) -> float:
+    """Median distance of the valid poses from the origin, metres; 0 if there are none."""
+    places = motion.root_translations[motion.valid]
+    return float(np.median(np.linalg.norm(places, axis=1))) if len(places) else 0.0
+
+
+def _median_step_m(motion: Motion) -> float:
+    """Median distance per frame between the places of valid poses, metres; 0 for one pose."""
+    rows = np.flatnonzero(motion.valid)
+    if len(rows) < 2:
+        return 0.0
+    numbers = np.arange(len(motion), dtype=np.float64)
+    if motion.frames is not None:
+        numbers = motion.frames.astype(np.float64)
+    elif motion.times_s is not None:
+        numbers = motion.times_s * ASSUMED_FPS
+    frames = np.maximum(np.abs(np.diff(numbers[rows])), 1.0)
+    moved = np.linalg.norm(np.diff(motion.root_translations[rows], axis=0), axis=1)
+    return float(np.median(moved / frames))

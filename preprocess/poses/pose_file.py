@@ -1,0 +1,245 @@
+"""Pose files: InstantAvatar's .npz, which its successors read too, with a few keys of ours."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from capture.input_error import InputError
+from preprocess.body.body_pose import Motion, PoseSpace
+from preprocess.body.rotations import stack_axis_angles
+from preprocess.file_content import read_npz
+
+POSE_KEY_LAYOUTS = (
+    ("global_orient", "body_pose", "transl"),
+    ("thetas", "transl"),
+    ("poses", "trans"),
+)
+"""The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
+
+CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
+
+MAX_MAGNITUDE = 1e9
+"""Angles and places beyond this are damage, and nothing can be computed with them."""
+
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
+
+
+def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
+    """Reads poses: axis-angles and metres, one row a pose.
+
+    Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
+    (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
+    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model, space ("world", or "camera":
+    each row is in the camera of its frame). Rows with NaN are marked as not valid. Rotations may be
+    3x3 matrices; a body_pose of 63 numbers has no hands.
+
+    A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
+    a last line that is half written is left out.
+
+    Args:
+        path: The .npz or .jsonl file.
+        default_model: Body family of files that do not say theirs.
+
+    Raises:
+        InputError: If there is no such file, or it holds no such poses.
+    """
+    if path.suffix.lower() not in (".npz", ".jsonl"):
+        raise InputError(
+            f"{path}: poses are read from .npz files (InstantAvatar's keys), or from .jsonl files "
+            "with the same keys, a frame a line."
+        )
+    arrays = read_npz(path) if path.suffix.lower() == ".npz" else _read_lines(path)
+    return motion_from_arrays(arrays, path, default_model=default_model)
+
+
+def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
+    """The poses in the arrays of a file (see `read_motion`).
+
+    Raises:
+        InputError: If they are no such poses; `path` is for the message.
+    """
+    layout = next((keys for keys in POSE_KEY_LAYOUTS if set(keys) <= arrays.keys()), None)
+    if layout is None:
+        expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
+        raise InputError(
+            f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}."
+        )
+    rows = [_rows(arrays, key, path) for key in layout]
+    translations = rows.pop().reshape(len(rows[0]), -1)
+    count = len(translations)
+    try:
+        poses = stack_axis_angles(rows).reshape(count, 72)
+    except ValueError as cause:
+        raise InputError(
+            f"{path}: {' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} "
+            f"numbers ({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or "
+            "rotation matrices."
+        ) from cause
+    if translations.shape != (count, 3):
+        raise InputError(
+            f"`{layout[-1]}` in {path} has {translations.shape}; expected (N, 3) metres."
+        )
+    times = _per_row(arrays, "time", count, path)
+    return Motion(
+        root_rotations=poses[:, :3],
+        root_translations=translations,
+        joint_rotations=poses[:, 3:].reshape(count, 23, 3),
+        valid=_valid(arrays, np.column_stack([poses, translations]), times, path),
+        betas=_betas(arrays, path),
+        body_model=str(arrays["model"]) if "model" in arrays else default_model,
+        model_is_stated="model" in arrays,
+        frames=_frame_numbers(arrays, count, path),
+        times_s=times,
+        intrinsic=_intrinsic(arrays, path),
+        camera_from_world=_cameras(arrays, count, path),
+        space=_space(arrays, path),
+    )
+
+
+def _read_lines(path: Path) -> Arrays:
+    """One array for each key that every line has; of words, what the first line says.
+
+    Raises:
+        InputError: If there is no such file, or a line before the last holds no JSON object.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        lines = [dict(json.loads(line)) for line in whole.splitlines() if line.strip()]
+        keys = set.intersection(*(set(line) for line in lines)) if lines else set()
+        words = {"model", "space"} & keys
+        arrays = {key: np.array([line[key] for line in lines]) for key in keys - words}
+    except (OSError, ValueError, TypeError) as cause:
+        raise InputError(f"{path} is no file of one JSON object a line ({cause}).") from cause
+    return {**arrays, **{key: np.array(lines[0][key]) for key in words}}
+
+
+def write_motion(path: Path, motion: Motion) -> None:
+    """Writes a motion in the keys that `read_motion` reads; reading gives the same numbers."""
+    arrays = {
+        "betas": motion.betas,
+        "global_orient": motion.root_rotations,
+        "body_pose": motion.joint_rotations.reshape(len(motion), 69),
+        "transl": motion.root_translations,
+        "valid": motion.valid,
+        "model": np.array(motion.body_model),
+        "frame": motion.frames,
+        "time": motion.times_s,
+        "K": motion.intrinsic,
+        "camera": motion.camera_from_world,
+        "space": None if motion.space == "world" else np.array(motion.space),
+    }
+    present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
+    np.savez_compressed(path, **present)
+
+
+def _read_numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
+    if arrays[key].dtype.kind not in "biuf":
+        raise InputError(f"`{key}` in {path} holds no numbers.")
+    return arrays[key].astype(np.float64)
+
+
+def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses *numbers"]:
+    """An array of one row a pose."""
+    rows = _read_numbers(arrays, key, path)
+    if rows.ndim < 2 or not rows.size:
+        raise InputError(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
+    first = arrays["transl"] if "transl" in arrays else arrays["trans"]
+    if len(rows) != len(np.atleast_1d(first)):
+        raise InputError(
+            f"{path} holds {len(rows)} rows of `{key}` but {len(np.atleast_1d(first))} "
+            "translations; expected one of each per pose."
+        )
+    return rows
+
+
+def _per_row(arrays: Arrays, key: str, count: int, path: Path) -> Float[np.ndarray, "poses"] | None:
+    """An optional array of one number a pose."""
+    if key not in arrays:
+        return None
+    numbers = _read_numbers(arrays, key, path).reshape(-1)
+    if len(numbers) != count:
+        raise InputError(f"{path} holds {len(numbers)} numbers in `{key}` for {count} poses.")
+    return numbers
+
+
+def _valid(
+    arrays: Arrays,
+    numbers: Float[np.ndarray, "poses 75"],
+    times: Float[np.ndarray, "poses"] | None,
+    path: Path,
+) -> Bool[np.ndarray, "poses"]:
+    """Rows that are finite, of a size that angles and places have, and not marked as lost."""
+    valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < MAX_MAGNITUDE).all(axis=1))
+    marked = _per_row(arrays, "valid", len(valid), path)
+    if marked is not None:
+        valid &= marked > 0
+    return valid if times is None else valid & np.isfinite(times)
+
+
+def _betas(arrays: Arrays, path: Path) -> Float[np.ndarray, "betas"]:
+    """One shape for the whole motion: the mean, where each row has its own."""
+    if "betas" not in arrays:
+        return np.zeros(0)
+    betas = _read_numbers(arrays, "betas", path)
+    if betas.ndim > 2:
+        raise InputError(
+            f"`betas` in {path} have the shape {betas.shape}; expected (10,) or (1, 10)."
+        )
+    rows = np.atleast_2d(betas)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        raise InputError(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
+    return rows.mean(axis=0)
+
+
+def _frame_numbers(arrays: Arrays, count: int, path: Path) -> Int[np.ndarray, "poses"] | None:
+    numbers = _per_row(arrays, "frame", count, path)
+    if numbers is None:
+        return None
+    if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
+        raise InputError(f"`frame` in {path} holds numbers that are no frame numbers.")
+    frames = numbers.astype(np.int64)
+    if len(np.unique(frames)) < count:
+        raise InputError(f"`frame` in {path} names a frame twice; expected one person's poses.")
+    return frames
+
+
+def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
+    """The tracker's K; the median, where each row has its own."""
+    if "K" not in arrays:
+        return None
+    intrinsic = _read_numbers(arrays, "K", path)
+    if intrinsic.ndim == 3:
+        intrinsic = np.nanmedian(intrinsic, axis=0)
+    if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
+        raise InputError(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
+    return intrinsic
+
+
+def _space(arrays: Arrays, path: Path) -> PoseSpace:
+    """Where the poses are."""
+    said = str(arrays["space"]) if "space" in arrays else "world"
+    if said == "world" or said == "camera":
+        return said
+    raise InputError(f"`space` in {path} is {said!r}; expected world or camera.")
+
+
+def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses 4 4"] | None:
+    """The camera of each row; one alone is that of all rows."""
+    key = next((key for key in CAMERA_KEYS if key in arrays), None)
+    if key is None:
+        return None
+    cameras = _read_numbers(arrays, key, path)
+    if cameras.shape not in ((4, 4), (count, 4, 4)) or not np.isfinite(cameras).all():
+        raise InputError(
+            f"`{key}` in {path} has the shape {cameras.shape}; expected finite camera-from-world "
+            f"transforms (4, 4) or ({count}, 4, 4)."
+        )
+    rotations = cameras[..., :3, :3]
+    if np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max() > 1e-3:
+        raise InputError(f"`{key}` in {path} is not rigid; expected no scale, OpenCV's axes.")
+    return np.broadcast_to(cameras, (count, 4, 4)).copy()

@@ -1,0 +1,300 @@
+"""Solves a capture's cameras, stage after stage, and refuses what it cannot vouch for.
+
+Key frames, features, matches, the global mapping, the incremental one as a second opinion, then
+the frames in between. Two mappings that agree, and points followed from key frame to key frame
+that land where the next camera sees them: less is not believed.
+"""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from capture.input_error import InputError
+from capture.source import FrameSource
+from preprocess.frame_association import interpolate_missing_cameras
+from preprocess.sfm import colmap_mapping
+from preprocess.sfm.camera_solution import INTERPOLATED, KEY, MISSING, PLACED, CameraSolution
+from preprocess.sfm.colmap_mapping import ColmapWorkspace
+from preprocess.sfm.point_tracking import StaticCameraTest, detect_static_camera
+from preprocess.sfm.quality_gates import (
+    MIN_REGISTERED_FRACTION,
+    QualityGate,
+    compare_models,
+    evaluate_gates,
+    find_outlier_cameras,
+)
+from preprocess.sfm.resection import ResectionResult, resect_intermediate_frames
+from preprocess.sfm.sfm_keyframes import (
+    MAX_KEYFRAMES,
+    PersonMaskFn,
+    SfmKeyframe,
+    read_keyframes,
+    select_keyframes,
+    write_keyframes,
+)
+from preprocess.sfm.sparse_model import SparseModel
+from preprocess.sfm.stage_cache import StageCache, StageProgressFn
+
+SEED_OFFSETS = (0, 1)
+"""A pair of mappings that disagrees is made anew with the next seed."""
+MIN_PARALLAX_FRACTION = 0.02
+"""Share of the matched pairs of pictures that must be more than one plane's, or a mere turn's."""
+MAX_TRACKED_POINT_ERROR_PX = 3.0
+"""How far points that were followed may land from where a key frame's own camera sees them."""
+MIN_TRACKED_KEYFRAMES = 0.5
+"""Share of the key frames that points must be followed into."""
+MIN_SOLVED_FRAMES = 0.5
+"""Share of the frames that must have a camera in the end."""
+MAX_IGNORED_DISTORTION_PX = 0.3
+"""A lens that bends the corners by less is taken for straight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """What a solution depends on, beside the pictures.
+
+    Attributes:
+        focal_ratio: Focal length in longer sides of the picture, if somebody knows it.
+        seed: Of everything random.
+        threads: Of features and matches.
+        max_keyframes: Key frames at most.
+    """
+
+    focal_ratio: float | None = None
+    seed: int = 0
+    threads: int = 1
+    max_keyframes: int = MAX_KEYFRAMES
+
+
+def solve_cameras(
+    source: FrameSource,
+    person_mask: PersonMaskFn,
+    folder: Path,
+    settings: SolverSettings,
+    report_progress: StageProgressFn,
+) -> CameraSolution:
+    """Solves the cameras of all wanted frames.
+
+    Args:
+        source: The frames.
+        person_in: Where the person is, who moves and must not be looked at.
+        folder: Where stages leave their results; what is finished there is not done again.
+        settings: What it depends on.
+        told: Called with the stage and how much of it is done.
+
+    Raises:
+        InputError: If pycolmap is missing, or no solution can be vouched for.
+    """
+    colmap_mapping.require_pycolmap()
+    stages = StageCache(folder, report_progress)
+    keys = _keyframes(source, person_mask, stages, settings)
+    rest = detect_static_camera(keys)
+    if rest.is_static:
+        return _static_solution(source, rest, keys, stages)
+    height, width = keys[0].gray.shape
+    bench = _prepare_workspace(stages, (width, height), settings)
+    deep = _parallax(bench, len(keys))
+    if not deep.passed:
+        raise _unsolved_error([deep])
+    model, gates = _map_twice(bench, len(keys), stages, settings.seed)
+    model = _drop_small_distortion(model)
+    between = _resect(source, model, keys, stages)
+    gates = [deep, *gates, _tracking_gate(between, len(model.frames))]
+    if not gates[-1].passed:
+        raise _unsolved_error([gates[-1]])
+    cameras, marks = _cameras_of_all_frames(source, model, between)
+    wanted = [i for i in range(source.frames_in_file) if source.selection.contains(i)]
+    share = float((marks[wanted] != MISSING).mean())
+    if share < MIN_SOLVED_FRAMES:
+        raise InputError(
+            f"--cameras solve: only {share:.0%} of the frames could be placed. Film without sudden "
+            "movements, or give only the part that goes well (--frames START:STOP)."
+        )
+    return CameraSolution(
+        still=False, moved=rest.background_motion, gates=tuple(gates), model=model, camera_from_solved=cameras,
+        frame_status=marks, keys=len(keys), costs=stages.totals(),
+    )  # fmt: skip
+
+
+def _keyframes(
+    source: FrameSource, person_in: PersonMaskFn, stages: StageCache, settings: SolverSettings
+) -> list[SfmKeyframe]:
+    def make(part: Path, told: colmap_mapping.ProgressFn) -> None:
+        chosen = select_keyframes(source, person_in, told, settings.max_keyframes)
+        write_keyframes(chosen, part / "images", part / "masks")
+
+    folder = stages.run_or_reuse("key frames", make)
+    return read_keyframes(folder / "images", folder / "masks")
+
+
+def _static_solution(
+    source: FrameSource, rest: StaticCameraTest, keys: list[SfmKeyframe], stages: StageCache
+) -> CameraSolution:
+    none = np.zeros((source.frames_in_file, 4, 4))
+    return CameraSolution(
+        still=True, moved=rest.background_motion, gates=(), model=None, camera_from_solved=none,
+        frame_status=np.zeros(source.frames_in_file, dtype=np.int64), keys=len(keys),
+        costs=stages.totals(),
+    )  # fmt: skip
+
+
+def _prepare_workspace(
+    stages: StageCache, size_px: tuple[int, int], settings: SolverSettings
+) -> ColmapWorkspace:
+    """Features and matches of the key frames."""
+    shown = stages.folder / "key frames"
+    share = settings.focal_ratio
+    bench = ColmapWorkspace(
+        images=shown / "images", masks=shown / "masks", database=shown,
+        focal_px=None if share is None else share * max(size_px), threads=settings.threads,
+    )  # fmt: skip
+    features = stages.run_or_reuse(
+        "features",
+        lambda part, told: colmap_mapping.extract_features(replace(bench, database=part), told),
+    )
+
+    def matched(part: Path, told: colmap_mapping.ProgressFn) -> None:
+        shutil.copyfile(features, part)
+        colmap_mapping.match_features(replace(bench, database=part), told)
+
+    return replace(bench, database=stages.run_or_reuse("matches", matched))
+
+
+def _parallax(bench: ColmapWorkspace, keys: int) -> QualityGate:
+    """Whether enough pairs of pictures show depth."""
+    pairs, share = colmap_mapping.parallax_fraction(bench.database)
+    if pairs < MIN_REGISTERED_FRACTION * (keys - 1):
+        return QualityGate(
+            name="matched_pairs", value=float(pairs), bound=MIN_REGISTERED_FRACTION * (keys - 1),
+            passed=False, failure_reason="the pictures have hardly anything in common",
+        )  # fmt: skip
+    return QualityGate(
+        name="pairs_with_parallax", value=share, bound=MIN_PARALLAX_FRACTION, passed=share >= MIN_PARALLAX_FRACTION,
+        failure_reason="the camera turns on the spot, or sees one flat wall, so that nothing shows depth",
+    )  # fmt: skip
+
+
+def _map_twice(
+    bench: ColmapWorkspace, keys: int, stages: StageCache, seed: int
+) -> tuple[SparseModel, list[QualityGate]]:
+    """The global model, once an incremental one agrees with it, and the gates it has passed.
+
+    Raises:
+        InputError: If none passes, or no two agree.
+    """
+    good: dict[str, list[SparseModel]] = {"global": [], "incremental": []}
+    failed: list[QualityGate] = []
+    for number in SEED_OFFSETS:
+        for kind in good:
+            model = _run_mapper(kind, bench, stages, seed + number)
+            if model is None:
+                continue
+            model = model.without_cameras(find_outlier_cameras(model))
+            gates = evaluate_gates(model, keys)
+            if all(gate.passed for gate in gates):
+                good[kind].append(model)
+            else:
+                failed += [gate for gate in gates if not gate.passed]
+        for one, other in ((a, b) for a in good["global"] for b in good["incremental"]):
+            agreed = compare_models(one, other)
+            if agreed.passed:
+                return one, [*evaluate_gates(one, keys), agreed]
+            failed.append(agreed)
+        if not any(good.values()):
+            break
+    raise _unsolved_error(failed)
+
+
+def _run_mapper(
+    kind: str, bench: ColmapWorkspace, stages: StageCache, seed: int
+) -> SparseModel | None:
+    """One mapper's model; None if it fails."""
+
+    def make(part: Path, told: colmap_mapping.ProgressFn) -> None:
+        part.mkdir()
+        mapper = colmap_mapping.map_global if kind == "global" else colmap_mapping.map_incremental
+        raw = part / "colmap"
+        raw.mkdir()
+        model = mapper(bench, raw, seed, told)
+        shutil.rmtree(raw)
+        if model is not None:
+            model.save(part / "model.npz")
+
+    path = stages.run_or_reuse(f"{kind} mapping {seed}", make) / "model.npz"
+    return SparseModel.load(path) if path.exists() else None
+
+
+def _unsolved_error(failed: list[QualityGate]) -> InputError:
+    """What went wrong, each kind once, and what can be done about it."""
+    words = {gate.name: gate.failure_reason for gate in reversed(failed)}  # the first of each kind
+    why = "; ".join(list(words.values())[::-1][:3]) or "neither way of solving found any"
+    return InputError(
+        f"The cameras could not be solved with certainty: {why}. Film with the surroundings in "
+        "view (textured, not repeating, well lit), walking slowly and without sudden turns; or "
+        "give cameras (--cameras FILE, docs/formats.md); or, if the camera hardly moved, "
+        "--cameras static."
+    )
+
+
+def _resect(
+    source: FrameSource, model: SparseModel, keys: list[SfmKeyframe], stages: StageCache
+) -> ResectionResult:
+    def make(part: Path, told: colmap_mapping.ProgressFn) -> None:
+        found = resect_intermediate_frames(source, model, keys, told)
+        frames, bridges = sorted(found.cameras), sorted(found.keyframe_errors_px)
+        np.savez(
+            part.with_suffix(".npz"),
+            frames=np.array(frames, dtype=np.int64),
+            cameras=np.array([found.cameras[f] for f in frames]).reshape(-1, 4, 4),
+            bridges=np.array(bridges, dtype=np.int64),
+            misses=np.array([found.keyframe_errors_px[f] for f in bridges]),
+        )
+        part.with_suffix(".npz").rename(part)
+
+    path = stages.run_or_reuse("frames between", make)
+    with np.load(path, allow_pickle=False) as file:
+        placed = dict(zip(file["frames"].tolist(), file["cameras"], strict=True))
+        bridges = dict(zip(file["bridges"].tolist(), file["misses"].tolist(), strict=True))
+    return ResectionResult(cameras=placed, keyframe_errors_px=bridges)
+
+
+def _tracking_gate(between: ResectionResult, keys: int) -> QualityGate:
+    """Whether points that were followed land where the next key frame's camera sees them."""
+    misses = np.array(list(between.keyframe_errors_px.values()))
+    known = misses[np.isfinite(misses)]
+    share = len(known) / max(keys - 1, 1)
+    worst = float(known.max()) if len(known) else float("inf")
+    words = f"points followed through the video land up to {worst:.1f} px beside where they should"
+    if share < MIN_TRACKED_KEYFRAMES:
+        words = "the surroundings could hardly be followed from picture to picture"
+    return QualityGate(
+        name="followed_px", value=worst, bound=MAX_TRACKED_POINT_ERROR_PX, failure_reason=words,
+        passed=share >= MIN_TRACKED_KEYFRAMES and worst < MAX_TRACKED_POINT_ERROR_PX,
+    )  # fmt: skip
+
+
+def _drop_small_distortion(model: SparseModel) -> SparseModel:
+    """The same with a straight lens, if it bends too little to be told from one."""
+    corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
+    bends = abs(model.bend) * corner**3 * model.focal_px
+    return replace(model, bend=0.0) if bends < MAX_IGNORED_DISTORTION_PX else model
+
+
+def _cameras_of_all_frames(
+    source: FrameSource, model: SparseModel, between: ResectionResult
+) -> tuple[Float[np.ndarray, "frames 4 4"], Int[np.ndarray, "frames"]]:
+    """A camera for each frame of the file, and what each is; short gaps are filled in."""
+    total = max(source.frames_in_file, int(model.frames.max()) + 1)
+    marks = np.full(total, INTERPOLATED)
+    known = dict.fromkeys(between.cameras, PLACED)
+    known.update(dict.fromkeys(model.frames.tolist(), KEY))
+    for frame, mark in known.items():
+        marks[frame] = mark
+    own = dict(zip(model.frames.tolist(), model.camera_from_world, strict=True))
+    found = {frame: model.camera(at) for frame, at in (between.cameras | own).items()}
+    cameras, missing = interpolate_missing_cameras(found, total)
+    marks[list(missing)] = MISSING
+    return np.stack([camera.camera_from_world for camera in cameras]), marks

@@ -1,0 +1,243 @@
+"""Structure from motion on key frames: pycolmap's features, matches and both of its mappers.
+
+Schönberger & Frahm 2016 (incremental), Pan et al. 2024 (global, GLOMAP). One thread from the
+matches on, pictures registered in order, and fixed seeds: the same pictures give the same cameras,
+bit by bit, however many threads look for features.
+
+The database is COLMAP's alone while it works: it brings a SQLite of its own, and Python's in the
+same process would break its locks (seen: SIGBUS in the write-ahead log).
+"""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.input_error import InputError
+from preprocess.sfm.sparse_model import SparseModel
+
+MAX_FEATURES = 2048
+SEQUENTIAL_OVERLAP = 10
+"""Each key frame is matched with so many after it, and with powers of two beyond."""
+MAX_EXHAUSTIVE_IMAGES = 40
+"""Of so few key frames every pair is matched, which closes loops."""
+MAX_MODELS, MAX_INITIAL_PAIRS = 2, 50
+"""How often the incremental mapper begins anew, and with how many pairs at most: pictures without
+parallax would keep it busy for minutes."""
+MIN_MATCHES = 15
+STATED_FOCAL_TOLERANCE = 0.01
+"""A stated focal length as near as this to the solved one is the true one."""
+IMAGES_PER_THREAD = 4
+"""Pictures that each thread looks at before progress is told."""
+
+ProgressFn = Callable[[float], None]
+"""Called now and then with how much of a stage is done, in [0, 1]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapWorkspace:
+    """Key frames on disk and the database that features and matches go to.
+
+    Attributes:
+        images: Pictures named by their frame's number.
+        masks: For each an 8-bit picture, 0 where nothing is to be looked at.
+        database: COLMAP's.
+        focal_px: What is known of the focal length, else None.
+        threads: Of extraction and matching.
+    """
+
+    images: Path
+    masks: Path
+    database: Path
+    focal_px: float | None
+    threads: int
+
+
+def require_pycolmap() -> None:
+    """Whether cameras can be solved here.
+
+    Raises:
+        InputError: If pycolmap is missing.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            "--cameras solve needs pycolmap, which is not installed: pip install pycolmap. Or give "
+            "the cameras that another program has solved (docs/formats.md)."
+        )
+
+
+def extract_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
+    """Finds SIFT features (Lowe 2004) outside the masked parts."""
+    colmap = _colmap()
+    width, height = _size(bench)
+    reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
+    reader.mask_path = str(bench.masks)
+    reader.camera_model = "SIMPLE_RADIAL"
+    if bench.focal_px is not None:
+        reader.camera_params = f"{bench.focal_px},{width / 2.0},{height / 2.0},0"
+    else:
+        reader.default_focal_length_factor = 0.85
+    options.num_threads, options.use_gpu = bench.threads, False
+    options.max_image_size = max(width, height)
+    options.sift.max_num_features = MAX_FEATURES
+    names, step = _names(bench), IMAGES_PER_THREAD * bench.threads
+    with colmap.Database.open(bench.database):  # makes it
+        pass
+    colmap.import_images(
+        bench.database, bench.images, camera_mode=colmap.CameraMode.SINGLE, image_names=names,
+        options=reader,
+    )  # fmt: skip
+    for first in range(0, len(names), step):
+        told(first / len(names))
+        colmap.extract_features(
+            bench.database, bench.images, image_names=names[first : first + step],
+            camera_mode=colmap.CameraMode.SINGLE, reader_options=reader,
+            extraction_options=options, device=colmap.Device.cpu,
+        )  # fmt: skip
+
+
+def match_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
+    """Matches features between pictures that were taken one soon after the other."""
+    colmap = _colmap()
+    options = colmap.FeatureMatchingOptions()
+    options.num_threads, options.use_gpu = 1, False
+    count = len(_names(bench))
+    told(0.0)
+    if count <= MAX_EXHAUSTIVE_IMAGES:
+        colmap.match_exhaustive(bench.database, matching_options=options, device=colmap.Device.cpu)
+        return
+    pairing = colmap.SequentialPairingOptions()
+    pairing.overlap, pairing.num_threads = SEQUENTIAL_OVERLAP, 1
+    colmap.match_sequential(
+        bench.database, matching_options=options, pairing_options=pairing,
+        device=colmap.Device.cpu,
+    )  # fmt: skip
+
+
+def parallax_fraction(database: Path) -> tuple[int, float]:
+    """How many pairs match, and what share no homography explains: 0 of a camera that only turns.
+
+    A plane, too, is seen by homographies; neither says where the camera was.
+    """
+    colmap = _colmap()
+    flat = colmap.TwoViewGeometryConfiguration
+    with colmap.Database.open(database) as base:
+        found = base.read_two_view_geometries()[1]
+    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= MIN_MATCHES]
+    plain = {int(flat.PLANAR), int(flat.PANORAMIC), int(flat.PLANAR_OR_PANORAMIC)}
+    return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
+
+
+def map_global(
+    bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn
+) -> SparseModel | None:
+    """All cameras at once; None if it fails."""
+    colmap = _colmap()
+    options = colmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = seed
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    told(0.0)
+    found = colmap.global_mapping(bench.database, bench.images, out, options=options)
+    return _largest_model(found, bench.focal_px)
+
+
+def map_incremental(
+    bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn
+) -> SparseModel | None:
+    """One camera after the other; None if it fails."""
+    colmap = _colmap()
+    options = colmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, seed
+    options.min_model_size, options.max_num_models = 3, MAX_MODELS
+    options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
+    total, done = len(_names(bench)), 0
+
+    def next_image() -> None:
+        nonlocal done
+        done += 1
+        told(min(done / total, 1.0))
+
+    told(0.0)
+    found = colmap.incremental_mapping(
+        bench.database, bench.images, out, options=options, next_image_callback=next_image
+    )
+    return _largest_model(found, bench.focal_px)
+
+
+def _colmap() -> Any:
+    import pycolmap  # heavy, and only needed here
+
+    pycolmap.logging.minloglevel = 3  # its log would go to stderr
+    pycolmap.set_random_seed(0)
+    return pycolmap
+
+
+def _names(bench: ColmapWorkspace) -> list[str]:
+    return sorted(path.name for path in bench.images.iterdir())
+
+
+def _size(bench: ColmapWorkspace) -> tuple[int, int]:
+    from PIL import Image
+
+    with Image.open(bench.images / _names(bench)[0]) as picture:
+        return picture.size
+
+
+def _largest_model(models: dict[int, Any], stated_px: float | None) -> SparseModel | None:
+    """The model with most cameras, in plain numbers; with the stated lens, if that may be."""
+    if not models:
+        return None
+    best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    lens = next(iter(best.cameras.values()))
+    if stated_px is not None and abs(lens.params[0] / stated_px - 1.0) < STATED_FOCAL_TOLERANCE:
+        _adjust_to_focal(best, stated_px)
+    return _to_sparse_model(best)
+
+
+def _adjust_to_focal(found: Any, focal_px: float) -> None:
+    """Moves cameras and points until all is seen by a lens of a known focal length."""
+    colmap = _colmap()
+    for lens in found.cameras.values():
+        lens.params = [focal_px, *lens.params[1:]]
+    options = colmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.print_summary = False, False
+    options.ceres.use_gpu, options.ceres.solver_options.num_threads = False, 1
+    colmap.bundle_adjustment(found, options)
+
+
+def _to_sparse_model(found: Any) -> SparseModel:
+    images = {
+        int(Path(found.image(number).name).stem): found.image(number)
+        for number in found.reg_image_ids()
+    }
+    frames = sorted(images)
+    ids = sorted(found.points3D)
+    row_of = {number: row for row, number in enumerate(ids)}
+    seen_by, seen_point, pixels = [], [], []
+    for row, frame in enumerate(frames):
+        for point in images[frame].get_observation_points2D():
+            seen_by.append(row)
+            seen_point.append(row_of[point.point3D_id])
+            pixels.append(point.xy)
+    transforms = np.tile(np.eye(4), (len(frames), 1, 1))
+    for row, frame in enumerate(frames):
+        transforms[row, :3] = images[frame].cam_from_world().matrix()
+    lens = found.camera(images[frames[0]].camera_id)
+    focal, x, y, bend = (float(value) for value in lens.params)
+    return SparseModel(
+        frames=np.array(frames),
+        camera_from_world=transforms,
+        focal_px=focal,
+        center_px=(x, y),
+        bend=bend,
+        size_px=(int(lens.width), int(lens.height)),
+        points=np.array([found.points3D[number].xyz for number in ids]).reshape(-1, 3),
+        observation_camera=np.array(seen_by, dtype=np.int64),
+        observation_point=np.array(seen_point, dtype=np.int64),
+        pixels=np.array(pixels, dtype=np.float64).reshape(-1, 2),
+    )

@@ -1,0 +1,163 @@
+"""One metric scale for a whole capture, from where the person stands.
+
+A camera-frame point q (metres) is X = R_iᵀ q + s c_i in the world, with s metres per unit of the
+solved world: linear in s, so that each cue is a row a s = b of one least-squares problem.
+
+* **ground**: the lowest foot stands on the floor, s h_i = sole - min_j n · (R_iᵀ f_ij), h_i being
+  the camera's height above the floor. One value a frame; half of them agree, or it is no cue.
+* **in place**: the person stays about where it is: s (c_i - c̄) = -(q_i - q̄), q_i = R_iᵀ p_i.
+
+One scale for all frames: with one a frame the body would jitter in depth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from preprocess.sfm.floor_plane import FloorPlane
+
+SIGMA_GROUND_M, SIGMA_PLACE_M = 0.06, 0.20
+"""How far, as a rule, a sole is from the floor by a tracker's depth, and a person from its
+place."""
+IRLS_ITERATIONS = 5
+HUBER_THRESHOLD = 1.345
+MAX_CUE_DIFFERENCE = 0.10
+"""Beyond this difference of both cues the person walks, and the ground is right."""
+MAX_GROUND_SPREAD = 0.25
+"""Of the frames' own scales by ground contact (robust standard deviation)."""
+MAX_WANDER_M = 0.35
+"""How far the person may be from its place, r.m.s., if only that tells the scale."""
+MIN_FRAMES = 5
+SOLE_THICKNESS_M = 0.01
+"""What is under a foot: nothing, or a shoe of two centimetres or three. Bodies are barefoot."""
+MIN_CAMERA_PATH_M = 0.3
+"""Of the camera's path, for the second cue to say anything."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonInCameras:
+    """The person in the cameras' own frames, one row for each frame with a pose and a camera.
+
+    Attributes:
+        world_from_camera: Rotations R_iᵀ.
+        centers: Cameras in the solved world's unit.
+        pelves: Pelvis in the camera, metres.
+        soles: Skin of both feet in the camera, metres.
+    """
+
+    world_from_camera: Float[np.ndarray, "frames 3 3"]
+    centers: Float[np.ndarray, "frames 3"]
+    pelvis_positions: Float[np.ndarray, "frames 3"]
+    soles: Float[np.ndarray, "frames soles 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricScale:
+    """Metres per unit of the solved world.
+
+    Attributes:
+        metres: The scale.
+        cues: Which cues made it: "ground", "in place".
+        ground, place: What each would say alone; None where it says nothing.
+        spread: Of the frames' own values by ground contact, relative; NaN without ground.
+        refused: Why it is not to be believed; None if it is.
+    """
+
+    metres_per_unit: float
+    cues: tuple[str, ...]
+    ground: float | None
+    place: float | None
+    spread: float
+    rejection_reason: str | None = None
+
+
+def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -> MetricScale:
+    """The scale by all cues that hold.
+
+    Args:
+        standing: The person, and the cameras that see it.
+        floor: The floor of the solved world; None if it was not seen.
+    """
+    contact = np.zeros(0)
+    heights = np.zeros(0)
+    if floor is not None and floor.points and len(standing.centers) >= MIN_FRAMES:
+        heights = floor.heights_above(standing.centers)
+        turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
+        contact = SOLE_THICKNESS_M - (turned @ floor.normal).min(axis=1)
+    ground, spread = _scale_from_ground(heights, contact)
+    moves, stays = _static_person_rows(standing)
+    place, wander = _scale_from_static_person(moves, stays)
+    if ground is not None and spread <= MAX_GROUND_SPREAD:
+        if place is None or abs(place - ground) > MAX_CUE_DIFFERENCE * ground:
+            return MetricScale(
+                metres_per_unit=ground, cues=("ground",), ground=ground, place=place, spread=spread
+            )
+        rows = np.concatenate([heights / SIGMA_GROUND_M, moves / SIGMA_PLACE_M])
+        right = np.concatenate([contact / SIGMA_GROUND_M, stays / SIGMA_PLACE_M])
+        both = _fit_scale_huber(rows, right, 0.5 * (ground + place))
+        return MetricScale(
+            metres_per_unit=both,
+            cues=("ground", "in place"),
+            ground=ground,
+            place=place,
+            spread=spread,
+        )
+    refused = None
+    if place is None or wander > MAX_WANDER_M:
+        refused = (
+            "nothing tells how large the room is: "
+            + ("the floor was not seen" if ground is None else "the feet are never on the floor")
+            + ", and the person does not stay in one place. Film so that the floor shows some "
+            "texture (a rug, planks), or give cameras with a size of their own (ARKit, Record3D)"
+        )
+    return MetricScale(
+        metres_per_unit=place or 1.0, cues=("in place",), ground=ground, place=place, spread=spread,
+        rejection_reason=refused,
+    )  # fmt: skip
+
+
+def _scale_from_ground(
+    heights: Float[np.ndarray, "frames"], contact: Float[np.ndarray, "frames"]
+) -> tuple[float | None, float]:
+    """The median over frames, and its relative spread."""
+    usable = (heights > 0.0) & (contact > 0.0)
+    if usable.sum() < MIN_FRAMES:
+        return None, float("nan")
+    each = contact[usable] / heights[usable]
+    middle = float(np.median(each))
+    return middle, 1.4826 * float(np.median(np.abs(each - middle))) / middle
+
+
+def _static_person_rows(
+    standing: PersonInCameras,
+) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
+    """Rows of the second cue: c_i - c̄ and -(q_i - q̄), flattened."""
+    seen = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelvis_positions)
+    moves = standing.centers - standing.centers.mean(axis=0)
+    return moves.ravel(), -(seen - seen.mean(axis=0)).ravel()
+
+
+def _scale_from_static_person(
+    moves: Float[np.ndarray, "rows"], stays: Float[np.ndarray, "rows"]
+) -> tuple[float | None, float]:
+    """The scale for which the person moves least, and how far from its place it is (r.m.s.)."""
+    square = float((moves**2).sum())
+    if len(moves) < 3 * MIN_FRAMES or square <= 0.0:
+        return None, float("inf")
+    scale = float((moves * stays).sum()) / square
+    if scale <= 0.0 or scale * np.sqrt(3.0 * square / len(moves)) < MIN_CAMERA_PATH_M:
+        return None, float("inf")
+    return scale, float(np.sqrt(3.0 * ((moves * scale - stays) ** 2).mean()))
+
+
+def _fit_scale_huber(
+    rows: Float[np.ndarray, "rows"], right: Float[np.ndarray, "rows"], start: float
+) -> float:
+    """Least squares of rows · s = right, far ones weighing less (Huber 1964)."""
+    scale = start
+    for _ in range(IRLS_ITERATIONS):
+        off = np.abs(rows * scale - right)
+        weights = np.minimum(1.0, HUBER_THRESHOLD / np.maximum(off, 1e-12))
+        scale = float((weights * rows * right).sum() / (weights * rows**2).sum())
+    return scale

@@ -1,0 +1,1 @@
+"""The studio: renders synthetic captures of an actor, with ground truth."""

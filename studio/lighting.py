@@ -1,0 +1,198 @@
+"""Light painted onto the body: how much of the sky and the lamp each vertex sees in the A-pose.
+
+It is baked once and moves with the skin, because the field that is to learn it knows neither pose
+nor view. Visibility comes from the z-buffer, seen from each direction far away.
+
+From what the subsamples see to colours: the mean over a pixel's covered subsamples.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32, UInt8
+
+from avatar.numba_kernels.kernel_compiler import compile_kernel
+from capture.camera import Camera
+from studio.procedural_albedo import albedo_at
+from studio.zbuffer import ZBuffer, rasterize
+
+LAMP_FROM = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
+LAMP_RGB = np.array([1.00, 0.96, 0.88])
+SKY_RGB = np.array([0.92, 0.97, 1.00])
+FLOOR_RGB = np.array([0.62, 0.56, 0.50])
+
+SHADOW_BIAS_M = 0.02
+"""A surface does not shade itself nearer than this."""
+
+
+def bake_light(
+    points: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    *,
+    template_points: Float32[np.ndarray, "vertices 3"],
+    materials: Int32[np.ndarray, "faces"],
+    measures: Float32[np.ndarray, "cuts"],
+    directions: int = 32,
+) -> Float32[np.ndarray, "vertices 3"]:
+    """Light on each vertex as a factor of its colour, about 0.45 in folds to 1.15 in the lamp."""
+    sky = np.zeros((len(points), 3))
+    lamp = np.zeros(len(points))
+    weight = lamp_weight = 0.0
+    for toward in _fibonacci_directions(directions):
+        camera = _directional_camera(points, toward)
+        depth_seen = rasterize(
+            points,
+            faces,
+            camera,
+            supersampling=1,
+            template_points=template_points,
+            materials=materials,
+            measures=measures,
+        ).depth
+        free = _visibility(points, camera, depth_seen)
+        facing = np.maximum(normals @ toward, 0.0) * free
+        up = 0.5 + 0.5 * toward[1]
+        sky += facing[:, None] * (up * SKY_RGB + (1.0 - up) * FLOOR_RGB)
+        weight += 0.25
+        near_lamp = max(float(toward @ LAMP_FROM) - 0.55, 0.0)
+        lamp += facing * near_lamp
+        lamp_weight += near_lamp
+    light = 0.32 + 0.58 * sky / weight + 0.42 * LAMP_RGB * (lamp / lamp_weight)[:, None]
+    return light.astype(np.float32)
+
+
+def _fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:
+    """Directions spread evenly over the sphere (Fibonacci's lattice)."""
+    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
+
+
+def _directional_camera(
+    points: Float[np.ndarray, "vertices 3"], toward: Float[np.ndarray, "3"]
+) -> Camera:
+    """A camera 40 m away in the direction `toward` that sees all points in 256 pixels."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    reach = float(np.linalg.norm(points - middle, axis=1).max())
+    forward = -toward
+    right = np.cross(forward, [0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = [right, np.cross(forward, right), forward]
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (middle + 40.0 * toward)
+    focal = 126.0 * 40.0 / (reach + 0.01)
+    return Camera(
+        focal_px=(focal, focal),
+        center_px=(128.0, 128.0),
+        size_px=(256, 256),
+        camera_from_world=camera_from_world,
+    )
+
+
+def _visibility(
+    points: Float[np.ndarray, "vertices 3"],
+    camera: Camera,
+    depth_seen: Float32[np.ndarray, "height width"],
+) -> Float[np.ndarray, "vertices"]:
+    """How far each point is the first one on its way, in [0, 1], softened over 4 pixels."""
+    forward, away = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
+    depth = points @ forward + away
+    pixel = camera.project(points)
+    free = np.zeros(len(points))
+    for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
+        column = np.clip((pixel[:, 0] + dx).astype(int), 0, 255)
+        row = np.clip((pixel[:, 1] + dy).astype(int), 0, 255)
+        free += 0.25 * np.clip(1.5 - (depth - depth_seen[row, column]) / SHADOW_BIAS_M, 0.0, 1.0)
+    return free
+
+
+def shade_pixels(
+    zbuffer: ZBuffer,
+    *,
+    faces: Int32[np.ndarray, "faces 3"],
+    materials: Int32[np.ndarray, "faces"],
+    template_points: Float32[np.ndarray, "vertices 3"],
+    light: Float32[np.ndarray, "vertices 3"],
+    palette: Float32[np.ndarray, "colours 3"],
+    measures: Float32[np.ndarray, "cuts"],
+    checked: bool,
+) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+    """Color of the covered part of each pixel (sRGB in [0, 1]) and how much of it is covered.
+
+    Args:
+        seen: The z-buffer.
+        faces, kinds: Triangles, and what each is made of.
+        place, light: Place on the undressed template and light falling on each vertex.
+        palette, cut, checked: The outfit, as `paint` reads it.
+    """
+    height, width = (
+        zbuffer.face.shape[0] // zbuffer.supersampling,
+        zbuffer.face.shape[1] // zbuffer.supersampling,
+    )
+    rgb = np.zeros((height, width, 3), dtype=np.float32)
+    alpha = np.zeros((height, width), dtype=np.float32)
+    _shade(
+        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, materials, template_points, light, palette, measures, checked,
+        rgb, alpha,
+    )  # fmt: skip
+    return rgb, alpha
+
+
+def composite_over(
+    rgb: Float32[np.ndarray, "height width 3"],
+    alpha: Float32[np.ndarray, "height width"],
+    background: UInt8[np.ndarray, "height width 3"] | None = None,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The person in front of a background (white if None)."""
+    behind = np.float32(1.0) if background is None else background.astype(np.float32) / 255.0
+    mixed = alpha[..., None] * rgb + (1.0 - alpha[..., None]) * behind
+    return (np.clip(mixed, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def _shade(
+    face_of: Int32[np.ndarray, "rows columns"],
+    share_of: Float32[np.ndarray, "rows columns 2"],
+    fine: int,
+    faces: Int32[np.ndarray, "faces 3"],
+    kinds: Int32[np.ndarray, "kinds"],
+    place: Float32[np.ndarray, "vertices 3"],
+    light: Float32[np.ndarray, "vertices 3"],
+    palette: Float32[np.ndarray, "colours 3"],
+    cut: Float32[np.ndarray, "cuts"],
+    checked: bool,
+    rgb: Float32[np.ndarray, "height width 3"],
+    alpha: Float32[np.ndarray, "height width"],
+) -> None:
+    for i in range(alpha.shape[0]):
+        for j in range(alpha.shape[1]):
+            red, green, blue, covered = 0.0, 0.0, 0.0, 0
+            for row in range(i * fine, (i + 1) * fine):
+                for column in range(j * fine, (j + 1) * fine):
+                    face = face_of[row, column]
+                    if face < 0:
+                        continue
+                    covered += 1
+                    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                    on_b, on_c = share_of[row, column, 0], share_of[row, column, 1]
+                    on_a = 1.0 - on_b - on_c
+                    colour = albedo_at(
+                        kinds[face],
+                        on_a * place[a, 0] + on_b * place[b, 0] + on_c * place[c, 0],
+                        on_a * place[a, 1] + on_b * place[b, 1] + on_c * place[c, 1],
+                        on_a * place[a, 2] + on_b * place[b, 2] + on_c * place[c, 2],
+                        palette,
+                        cut,
+                        checked,
+                    )
+                    for_red = on_a * light[a, 0] + on_b * light[b, 0] + on_c * light[c, 0]
+                    for_green = on_a * light[a, 1] + on_b * light[b, 1] + on_c * light[c, 1]
+                    for_blue = on_a * light[a, 2] + on_b * light[b, 2] + on_c * light[c, 2]
+                    red += min(max(colour[0] * for_red, 0.0), 1.0)
+                    green += min(max(colour[1] * for_green, 0.0), 1.0)
+                    blue += min(max(colour[2] * for_blue, 0.0), 1.0)
+            if covered > 0:
+                rgb[i, j, 0] = red / covered
+                rgb[i, j, 1] = green / covered
+                rgb[i, j, 2] = blue / covered
+                alpha[i, j] = covered / (fine * fine)

@@ -1,0 +1,206 @@
+"""Where each garment ends: the borders, decided per subsample from the place on the body at rest.
+
+All places are on the *template* (the mean body in T-pose, metres), so every person wears the same
+cut; `x` is the body's left, `y` up, `z` out of the chest.
+
+What the two subjects wear: measures of the cut, thickness of the cloth, colours.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from avatar.numba_kernels.kernel_compiler import compile_kernel
+
+SKIN, SHIRT, TROUSERS, SHOE, HAIR, EYE = 0, 1, 2, 3, 4, 5
+
+# The tailor's measures: what each entry of a `cut` array says.
+SLEEVE, HEM, CUFF, NECK_DEPTH, NAPE, EARS_COVERED, FRINGE = 0, 1, 2, 3, 4, 5, 6
+
+BELT_Y = -0.15
+"""Trousers end here; the shirt hangs over it."""
+
+
+@compile_kernel(nogil=True, inline="always")
+def smoothstep(value: float, low: float, high: float) -> float:
+    """0 below `low`, 1 above `high`, smooth between."""
+    share = min(max((value - low) / (high - low), 0.0), 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+@compile_kernel(nogil=True, inline="always")
+def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float:
+    """Height of the collar's edge: a scoop, deeper in front, that ends on the shoulders."""
+    front = smoothstep(z, 0.01, 0.09)
+    side = abs(x + 0.002)
+    return (
+        0.350
+        - measures[NECK_DEPTH] * front
+        + 14.0 * max(side - 0.06, 0.0) ** 2
+        + max(side - 0.1, 0.0)
+    )
+
+
+@compile_kernel(nogil=True, inline="always")
+def height_above_hairline(
+    x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
+) -> float:
+    """How far above the hairline a place of the head is, in metres (negative: bare)."""
+    side = abs(x + 0.002)
+    edge = measures[NAPE] + (0.478 - measures[NAPE]) * smoothstep(z, 0.02, 0.075)
+    edge += 0.035 * smoothstep(z, 0.088, 0.104)
+    edge += (measures[FRINGE] - 0.513) * smoothstep(z, 0.104, 0.142)
+    height = y - edge + 0.002 * np.sin(side * 420.0 + y * 130.0)
+    if measures[EARS_COVERED] < 0.5 and side > 0.06:
+        ear = np.hypot((z - 0.066) / 0.026, (y - 0.478) / 0.034)
+        height = min(height, 0.03 * (ear - 1.0))
+    return height
+
+
+@compile_kernel(nogil=True)
+def is_visible(
+    material: int, x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
+) -> bool:
+    """Whether a place of a garment is there, and a place of the skin is bare."""
+    side = abs(x)
+    if material == SHIRT:
+        hem = measures[HEM] + 0.006 * np.sin(x * 31.0 + z * 17.0)
+        return side < measures[SLEEVE] and y > hem and y < neckline(x, z, measures)
+    if material == TROUSERS:
+        return y < BELT_Y and y > measures[CUFF]
+    if material == HAIR:
+        return height_above_hairline(x, y, z, measures) > 0.0
+    if material == SKIN:
+        under_shirt = side < measures[SLEEVE] - 0.03 and y > measures[HEM] + 0.03
+        under_shirt = under_shirt and y < neckline(x, z, measures) - 0.02
+        under_trousers = y < BELT_Y - 0.02 and y > measures[CUFF] + 0.02
+        return not (under_shirt or under_trousers or y < -1.165)
+    return True
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Outfit:
+    """One subject's looks; lengths in metres on the template.
+
+    Attributes:
+        betas: The subject's shape, of the embedded body.
+        sleeve: Distance of the sleeve's end from the middle of the body.
+        hem: Height of the shirt's hem.
+        cuff: Height of the trousers' end.
+        neck_depth: How far the collar drops in front.
+        nape: Height of the hairline at the back.
+        fringe: Height of the hairline above the face.
+        ears_covered: Whether hair falls over the ears.
+        bun: Whether the hair is tied up in a knot.
+        checked: A checked shirt; else a striped one.
+        palette: sRGB colours in [0, 1], in the order that `paint` names.
+    """
+
+    betas: tuple[float, ...]
+    sleeve: float
+    hem: float
+    cuff: float
+    neck_depth: float
+    nape: float
+    fringe: float
+    ears_covered: bool
+    bun: bool
+    checked: bool
+    palette: tuple[tuple[float, float, float], ...]
+
+    @property
+    def measures(self) -> Float32[np.ndarray, "cuts"]:
+        """The measures in the order that `cut` reads them."""
+        ears = float(self.ears_covered)
+        measures = (self.sleeve, self.hem, self.cuff, self.neck_depth, self.nape, ears, self.fringe)
+        return np.array(measures, dtype=np.float32)
+
+    def shirt_thickness(
+        self, place: Float[np.ndarray, "vertices 3"]
+    ) -> Float[np.ndarray, "vertices"]:
+        """How far the shirt stands off: close at the shoulders, 3-4 cm at hem and sleeve end."""
+        x, y, z = place.T
+        side = np.abs(x)
+        torso = 0.010 + 0.024 * _smoothstep_array(-y, -0.22, 0.20)
+        sleeve = 0.009 + 0.020 * _smoothstep_array(side, 0.18, self.sleeve)
+        on_sleeve = _smoothstep_array(side, 0.15, 0.22) * _smoothstep_array(y, 0.06, 0.12)
+        folds = 0.0055 * np.sin(np.arctan2(z - 0.03, x) * 7.0 + 3.0 * np.sin(y * 9.0))
+        folds = folds * _smoothstep_array(-y, -0.12, 0.25) * (1.0 - on_sleeve)
+        creases = 0.003 * np.sin(side * 110.0 + 9.0 * z) * on_sleeve
+        return (1.0 - on_sleeve) * torso + on_sleeve * sleeve + folds + creases
+
+    def trouser_thickness(
+        self, place: Float[np.ndarray, "vertices 3"]
+    ) -> Float[np.ndarray, "vertices"]:
+        """How far the trousers stand off: 7 mm at the hip, 2 cm at the cuff."""
+        x, y, z = place.T
+        down = _smoothstep_array(-y, -BELT_Y, 1.1)
+        knee = np.exp(-(((y + 0.70) / 0.10) ** 2)) + np.exp(-(((y + 1.08) / 0.07) ** 2))
+        creases = 0.0035 * np.sin(y * 95.0 + 14.0 * np.abs(x) + 20.0 * z) * knee
+        return 0.007 + 0.014 * down + creases
+
+    def hair_thickness(
+        self, place: Float[np.ndarray, "vertices 3"]
+    ) -> Float[np.ndarray, "vertices"]:
+        """How far the hair stands off: fullest on the crown, thin at the nape."""
+        _, y, z = place.T
+        crown = _smoothstep_array(y, 0.45, 0.60)
+        tuft = 0.010 * _smoothstep_array(z, 0.05, 0.14) * _smoothstep_array(y, 0.55, 0.60)
+        full = 0.006 + (0.008 if self.bun else 0.014) * crown
+        return full + (0.0 if self.bun else tuft)
+
+
+def _smoothstep_array(
+    value: Float[np.ndarray, "vertices"], low: float, high: float
+) -> Float[np.ndarray, "vertices"]:
+    """0 below `low`, 1 above `high`, smooth between."""
+    share = np.clip((value - low) / (high - low), 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+def _srgb_palette(*codes: str) -> tuple[tuple[float, float, float], ...]:
+    """Colors from hexadecimal codes."""
+    return tuple(
+        (int(c[0:2], 16) / 255, int(c[2:4], 16) / 255, int(c[4:6], 16) / 255) for c in codes
+    )
+
+
+OUTFITS = {
+    1: Outfit(
+        betas=(0.15, -0.4, 0.5, 0.3),
+        sleeve=0.375,
+        hem=-0.290,
+        cuff=-1.150,
+        neck_depth=0.055,
+        nape=0.415,
+        fringe=0.574,
+        ears_covered=False,
+        bun=False,
+        checked=False,
+        palette=_srgb_palette(
+            *("e0ac8b", "b4605a", "4a2d1c", "4f7f86"),  # skin, lips, hair, iris
+            *("f2ead8", "2f6f7e", "e2a23b"),  # shirt, its stripes, its trim
+            *("35466e", "465a86", "c98a45"),  # trousers, their stripes, their thread
+            *("efece4", "c8553d"),  # shoes, soles
+        ),
+    ),
+    2: Outfit(
+        betas=(-0.35, 0.6, -0.6, -0.4),
+        sleeve=0.330,
+        hem=-0.270,
+        cuff=-1.125,
+        neck_depth=0.085,
+        nape=0.425,
+        fringe=0.582,
+        ears_covered=False,
+        bun=True,
+        checked=True,
+        palette=_srgb_palette(
+            *("8d5a3c", "7a3b36", "1d1512", "3a2416"),
+            *("e46f51", "f3c9a0", "5b2a4d"),
+            *("5f6b45", "717f54", "d9cf9a"),
+            *("3b3f4a", "f0ede6"),
+        ),
+    ),
+}

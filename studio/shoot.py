@@ -1,0 +1,278 @@
+"""The stage: the actor before a backdrop or in a room, seen by cameras that stand or walk.
+
+The shoot: the actor in front of the camera, written as a native capture folder.
+"""
+
+import errno
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from os import cpu_count
+from pathlib import Path
+from typing import final
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from apps.cli.output_paths import check_output_folder
+from capture.atomic_files import atomic_folder
+from capture.camera import Camera
+from capture.image_folder import silence_opencv
+from capture.input_error import InputError
+from capture.video_encoder import video_encoder
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.poses.pose_file import write_motion
+from studio import actor_motions, painted_backdrop, studio_cameras
+from studio.actor import Actor
+from studio.furnished_room import FurnishedRoom
+from studio.input_noise import add_mask_noise, add_pose_noise, to_camera_space
+from studio.lighting import composite_over
+from studio.shoot_config import ShootConfig as ShootConfig
+from studio.studio_cameras import static_camera
+
+RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
+"""The actor on the stage, and the exact soft mask."""
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StudioScene:
+    """What a motion is filmed on.
+
+    Attributes:
+        actor: Who is filmed.
+        cameras: One for all pictures, or one for each.
+        behind: A painted backdrop (for one camera), or a room.
+        first: Number of the first picture, of which a room's noise depends.
+    """
+
+    actor: Actor
+    cameras: tuple[Camera, ...]
+    background: UInt8[np.ndarray, "height width 3"] | FurnishedRoom
+    first_frame_number: int = 0
+
+    def render(self, pose: BodyPose, number: int) -> RenderedFrame:
+        """One picture."""
+        camera = self.cameras[min(number, len(self.cameras) - 1)]
+        rgb, alpha = self.actor.render_rgb_alpha(pose, camera)
+        feet = self.actor.shaped.with_pose(pose).joints()[[10, 11]]
+        return composite_over(rgb, alpha, self._render_background(camera, feet, number)), alpha
+
+    def render_all(self, motion: Motion) -> Iterator[RenderedFrame]:
+        """All pictures of a motion in order, a few drawn ahead on other threads."""
+        workers = max(1, min(4, cpu_count() or 1))
+        with ThreadPoolExecutor(workers) as pool:
+            ahead = deque()
+            try:
+                for row in range(len(motion)):
+                    ahead.append(pool.submit(self.render, motion[row], row))
+                    if len(ahead) > workers:
+                        yield ahead.popleft().result()
+                while ahead:
+                    yield ahead.popleft().result()
+            finally:
+                for waiting in ahead:
+                    waiting.cancel()
+
+    def _render_background(
+        self, camera: Camera, feet: Float[np.ndarray, "feet 3"], number: int
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        if isinstance(self.background, FurnishedRoom):
+            return self.background.render(camera, feet, self.first_frame_number + number)
+        return painted_backdrop.add_foot_shadows(self.background, feet, camera)
+
+
+ShootProgress = Callable[[int, int], None]
+"""Called after each picture with how many are done and how many there will be."""
+
+
+def film_capture(
+    out: Path,
+    config: ShootConfig,
+    progress: ShootProgress | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Films the actor into the folder `out`, which appears whole or not at all.
+
+    Args:
+        out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
+            in truth/), poses.npz, dance.npz and truth/.
+        config: What is filmed.
+        progress: Told after each picture; may raise to stop the shoot.
+        overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
+
+    Raises:
+        InputError: If `out` is in the way, or a number of `config` is out of its range.
+        OSError: If the disk is full.
+    """
+    config.validate()
+    _check_output(out, overwrite=overwrite)
+    with atomic_folder(out) as unfinished:
+        _write_capture(unfinished, config, progress or (lambda done, total: None))
+
+
+def _check_output(out: Path, *, overwrite: bool) -> None:
+    check_output_folder(out, "OUT")
+    if not overwrite and out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} already exists. Choose another OUT, or give --overwrite.")
+
+
+def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:
+    actor = Actor.of(config.subject, config.seed)
+    truth = _choose_motion(actor, config)
+    stages = _build_scenes(actor, truth, config)
+    novel = actor_motions.novel_poses(actor)
+    total = len(truth) + len(novel)
+    _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
+    _write_preview(folder, config.fps)
+    _write_novel_poses(
+        folder / "truth" / "novel", stages[1], novel,
+        lambda done: progress(len(truth) + done, total),
+    )  # fmt: skip
+    cameras = stages[0].cameras
+    given = (
+        truth
+        if not config.camera_moves
+        else to_camera_space(truth, cameras, actor.shaped.joints[0])
+    )
+    given = add_pose_noise(
+        given, degrees=config.pose_noise_deg, centimetres=config.pose_noise_cm, seed=config.seed
+    )
+    write_motion(folder / "poses.npz", given)
+    write_motion(folder / "truth" / "poses.npz", truth)
+    write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
+    if config.camera_moves:
+        # Nobody tells a phone where it is: the cameras are truth, and lie where no command looks.
+        _write_cameras(folder / "truth" / "cameras.npz", cameras)
+        _write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
+    else:
+        _write_cameras(folder / "cameras.npz", cameras)
+
+
+def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    acts = {
+        "turn": actor_motions.turning_motion,
+        "dance": actor_motions.dancing_motion,
+        "walkaround": actor_motions.gesturing_motion,
+    }
+    turns = config.turns
+    if turns is None:
+        turns = -0.75 if config.camera_moves else 2.0
+    return acts[config.motion](
+        actor, frames=config.frames, fps=config.fps, turns=turns, seed=config.seed
+    )
+
+
+def _build_scenes(
+    actor: Actor, truth: Motion, config: ShootConfig
+) -> tuple[StudioScene, StudioScene]:
+    """Where the film is made, and where the poses that no film holds are pictured."""
+    kind = config.effective_background
+    if config.camera_moves:
+        tall = studio_cameras.actor_height_m(actor)
+        at = (truth.root_translations + actor.shaped.joints[0])[:, [0, 2]]
+        cameras = studio_cameras.handheld_cameras(at, tall, config.size, config.seed)
+        apart = studio_cameras.standing_camera(tall, config.size)
+    else:
+        apart = static_camera(actor, config.size)
+        cameras = (apart,)
+    if kind == "room" or kind == "tiles":
+        behind = FurnishedRoom.furnished(kind, config.size, config.seed)
+    else:
+        behind = painted_backdrop.paint_backdrop(
+            kind, apart, np.random.default_rng([config.seed, 4])
+        )
+    filmed = StudioScene(actor=actor, cameras=cameras, background=behind)
+    return filmed, replace(filmed, cameras=(apart,), first_frame_number=len(truth))
+
+
+def _write_cameras(path: Path, cameras: tuple[Camera, ...]) -> None:
+    """One camera, or one a frame, with their common K."""
+    extrinsics = np.stack([camera.camera_from_world for camera in cameras])
+    width, height = cameras[0].size_px
+    np.savez(
+        path,
+        intrinsic=cameras[0].intrinsic,
+        extrinsic=extrinsics[0] if len(cameras) == 1 else extrinsics,
+        height=height,
+        width=width,
+    )
+
+
+def _write_video(
+    folder: Path,
+    stage: StudioScene,
+    motion: Motion,
+    config: ShootConfig,
+    done: Callable[[int], None],
+) -> None:
+    """video.mp4, lossless (FFV1), and masks/."""
+    (folder / "masks").mkdir()
+    path = folder / "video.mp4"
+    # The default mp4v costs 30 dB on stripes; FFV1 is exact, fast, and OpenCV reads it.
+    silence_opencv()
+    code = cv2.VideoWriter.fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, stage.cameras[0].size_px)
+    if not writer.isOpened():
+        path.write_bytes(bytes(1 << 16))  # says so if there is no room
+        raise InputError(
+            f"OpenCV {cv2.__version__} cannot write a lossless video (FFV1 in .mp4); 4.13 or newer "
+            "can: pip install --upgrade opencv-contrib-python-headless."
+        )
+    generator = np.random.default_rng([config.seed, 5])
+    try:
+        for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
+            writer.write(np.ascontiguousarray(rgb[..., ::-1]))
+            mask = add_mask_noise(alpha, config.mask_noise_px, generator)
+            _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
+            done(index + 1)
+    finally:
+        writer.release()
+    _check_video(path, len(motion))
+
+
+def _check_video(path: Path, frames: int) -> None:
+    """OpenCV does not say when it could not write; so the file is asked."""
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    written = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
+    video.release()
+    if written != frames:
+        raise OSError(errno.ENOSPC, f"only {written} of {frames} video frames could be written")
+
+
+def _write_preview(folder: Path, fps: float) -> None:
+    """Write preview.webm: the film for browsers and phones, which play no lossless video."""
+
+    def frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        video = cv2.VideoCapture(str(folder / "video.mp4"), cv2.CAP_FFMPEG)
+        while (read := video.read())[0]:
+            yield np.ascontiguousarray(read[1][..., ::-1])
+        video.release()
+
+    video_encoder(".webm", transparent=False).write(folder / "preview.webm", frames(), fps)
+
+
+def _write_novel_poses(
+    folder: Path, stage: StudioScene, motion: Motion, done: Callable[[int], None]
+) -> None:
+    """Never-seen poses with their true images and masks."""
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
+        _write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
+        _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(alpha))
+        done(index + 1)
+    write_motion(folder / "poses.npz", motion)
+
+
+def _to_uint8(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    return (alpha * 255.0 + 0.5).astype(np.uint8)
+
+
+def _write_png(path: Path, image: UInt8[np.ndarray, "..."]) -> None:
+    """A PNG in OpenCV's channel order; unlike OpenCV's own writer it says when the disk is full."""
+    _, code = cv2.imencode(".png", image)
+    path.write_bytes(code.tobytes())

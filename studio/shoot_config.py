@@ -1,0 +1,69 @@
+"""What ia-sample films, as a record that is read without loading what films it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from capture.input_error import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShootConfig:
+    """What is filmed, and how well the poses and masks are known."""
+
+    frames: int = 120
+    """Frames of the video."""
+    fps: float = 30.0
+    """Frames per second of the video."""
+    size: int = 270
+    """Width and height of the pictures in pixels; a walkaround's are so wide, and 16:9."""
+    turns: float | None = None
+    """How often the actor turns round; if not given 2, in a walkaround -0.75 (against the walk)."""
+    seed: int = 0
+    """Of the swaying, the clutter and the noise; from 1 on it varies the actor's looks, too."""
+    subject: Literal[1, 2] = 1
+    """Which of the two actors."""
+    motion: Literal["turn", "dance", "walkaround"] = "turn"
+    """What happens: the actor turns with arms held off the body, or dances; or gestures while a
+    phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras
+    lie in truth/cameras.npz)."""
+    background: Literal["plain", "clutter", "room", "tiles"] | None = None
+    """What stands behind the actor: a bare wall, a painted room full of things (if not given), a
+    real room with furniture (a walkaround's, if not given), or one where every pattern repeats."""
+    pose_noise_deg: float = 0.0
+    """Noise of the poses: standard deviation of each rotation component, in degrees."""
+    pose_noise_cm: float = 0.0
+    """Noise of the poses: standard deviation of each component of the place, in centimetres."""
+    mask_noise_px: float = 0.0
+    """Noise of the masks: standard deviation of their border, in pixels."""
+
+    @property
+    def camera_moves(self) -> bool:
+        """Whether the camera moves."""
+        return self.motion == "walkaround"
+
+    @property
+    def effective_background(self) -> Literal["plain", "clutter", "room", "tiles"]:
+        """What stands behind the actor, if nobody said it, too."""
+        return self.background or ("room" if self.camera_moves else "clutter")
+
+    def validate(self) -> None:
+        """Refuses what cannot be filmed.
+
+        Raises:
+            InputError: If a number is out of its range.
+        """
+        ranges = {
+            "frames": (1, 100_000), "fps": (0.1, 1000.0), "size": (16, 4096),
+            "turns": (-100.0, 100.0), "seed": (0, 2**31 - 1), "pose_noise_deg": (0.0, 90.0),
+            "pose_noise_cm": (0.0, 100.0), "mask_noise_px": (0.0, 50.0),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                option = "--" + name.replace("_", "-")
+                raise InputError(f"{option} is {value}, but must lie between {low} and {high}.")
+        if self.camera_moves and self.effective_background in ("plain", "clutter"):
+            raise InputError(
+                f"--background {self.effective_background} is painted for a camera that stands still; with "
+                "--motion walkaround give room or tiles."
+            )

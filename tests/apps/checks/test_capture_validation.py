@@ -1,0 +1,349 @@
+"""Tests for ia-check on films that were spoilt on purpose, and for what ia-ingest makes of it."""
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from apps import check, ingest
+from apps.checks.capture_validation import check_opened_capture, passes_quick_check
+from benchmarks import capture_corruptions
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion
+from studio.shoot import ShootConfig, film_capture
+
+SPOILS = {
+    "frame_offset": capture_corruptions.delay_poses(4),
+    "frame_rate": capture_corruptions.resample_poses(0.5),
+    "opengl_axes": capture_corruptions.use_opengl_poses,
+    "root_rotation": capture_corruptions.rotate_tracker_input(90),
+    "world_frame": capture_corruptions.apply_extrinsics_twice,
+    "focal": capture_corruptions.scale_focal(0.7),
+    "left_right": capture_corruptions.swap_left_right,
+    "root_origin": capture_corruptions.root_about_origin,
+    "body_scale": capture_corruptions.change_units(1000.0),
+    "mask_polarity": capture_corruptions.invert_masks,
+}
+
+
+@pytest.fixture(scope="module")
+def dancing(tmp_path_factory) -> Path:
+    """A capture folder: 40 frames of 96 px."""
+    folder = tmp_path_factory.mktemp("dancing") / "capture"
+    config = ShootConfig(frames=40, size=96, motion="dance", background="plain", turns=1.0)
+    film_capture(folder, config)
+    return folder
+
+
+@pytest.fixture
+def spoilt(dancing, tmp_path):
+    """Makes a copy with a mistake in it."""
+
+    def make(*mistakes) -> Path:
+        shutil.copytree(dancing, tmp_path / "spoilt")
+        for mistake in mistakes:
+            mistake(tmp_path / "spoilt")
+        return tmp_path / "spoilt"
+
+    return make
+
+
+@pytest.fixture
+def call_check(capsys, tmp_path):
+    """Runs ia-check; returns its exit code, what it said, and its JSON."""
+
+    def call(*arguments):
+        wanted = tmp_path / "found.json"
+        words = [str(a) for a in arguments]
+        code = check.main(
+            [*words, "--json", str(wanted), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
+        )
+        found = json.loads(wanted.read_text()) if wanted.exists() else {}
+        return code, " ".join(capsys.readouterr().err.split()), found
+
+    return call
+
+
+def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
+    code, said, found = call_check(dancing)
+    assert code == 0
+    assert found["verdict"] == "good"
+    assert found["cause"] is None
+    assert found["iou"]["now"] == found["iou"]["after_fix"] > 0.75
+    assert "good" in said
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    assert sheet.shape[1] > 3 * sheet.shape[0]
+
+
+@pytest.mark.slow
+def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
+    config = ShootConfig(frames=40, size=96, pose_noise_deg=2.0, pose_noise_cm=1.0, turns=1.0)
+    film_capture(tmp_path / "noisy", config)
+    _, _, found = call_check(tmp_path / "noisy")
+    assert (found["verdict"], found["cause"]) == ("good", None)
+
+
+def quick_where(causes, quick):
+    """Parameters of which all but a few are slow: each is searched for like any other."""
+    return [c if c in quick else pytest.param(c, marks=pytest.mark.slow) for c in causes]
+
+
+@pytest.mark.parametrize("cause", quick_where(SPOILS, ("frame_offset",)))
+def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_check):
+    folder, out = spoilt(SPOILS[cause]), tmp_path / "mended"
+    code, _, found = call_check(folder, "--fix", out)
+    assert found["cause"] == cause
+    assert [cure["cause"] for cure in found["corrections"]] == [cause]
+    assert found["iou"]["now"] + 0.05 < found["iou"]["after_fix"]
+    assert found["tried"][0]["cause"] == cause
+    assert code == 0
+    assert passes_quick_check(open_capture(CaptureInputs(video=out)))
+    if cause in ("frame_offset", "frame_rate"):
+        mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
+        assert mended.frames is not None
+        assert np.diff(mended.frames).max() == 1  # rows of half the rate are interpolated
+        off = mended.root_translations - true.root_translations[mended.frames]
+        assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
+
+
+@pytest.mark.slow
+def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
+    _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
+    assert (found["verdict"], found["cause"]) == ("good", "mask_polarity")
+    assert f"agree by {found['iou']['after_fix']:.2f}" in said
+    assert "nothing needs to be done" in said
+    assert "To correct it" not in said
+
+
+FILM_SPOILS = {
+    "video_rotation": capture_corruptions.rotate_video(1),
+    "undo_video_mirroring": capture_corruptions.mirror_video,
+    "video_crop": capture_corruptions.crop_video(0.05, 0.05, 0.85),
+    "video_offset": capture_corruptions.trim_video(4),
+}
+
+
+@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("undo_video_mirroring",)))
+def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
+    folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
+    code, said, found = call_check(folder, "--fix", out)
+    assert code == 0
+    assert [cure["cause"] for cure in found["corrections"]] == [cause]
+    assert found["iou"]["now"] > 0.75
+    assert found["film"]["now"] + 0.05 < found["film"]["after_fix"] > 0.7
+    assert "but not with the pictures" in said
+    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+    recording = open_capture(CaptureInputs(video=out))
+    examined_again = check_opened_capture(recording)
+    assert examined_again.causes == ()
+    assert examined_again.diagnosis.video.now > found["film"]["after_fix"] - 0.03
+    assert recording.source.frames_in_file == (36 if cause == "video_offset" else 40)
+
+
+def narrowed(folder: Path) -> None:
+    """Takes 16 columns from each side of film and masks, so that they are no longer square."""
+    capture_corruptions.rewrite_video(
+        folder, lambda pictures: [picture[:, 16:-16] for picture in pictures]
+    )
+    for path in (folder / "masks").iterdir():
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        cv2.imwrite(str(path), mask[:, 16:-16])
+    with np.load(folder / "cameras.npz") as archive:
+        camera = dict(archive)
+    camera["intrinsic"][0, 2] -= 16.0
+    np.savez(folder / "cameras.npz", **{**camera, "width": 64})
+
+
+@pytest.mark.slow
+def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path, call_check):
+    folder, out = spoilt(narrowed, capture_corruptions.rotate_video(3)), tmp_path / "corrected"
+    code, said, found = call_check(folder, "--fix", out)
+    assert code == 0
+    assert "expected the same shape" in found["refused"]
+    assert [cure["cause"] for cure in found["corrections"]] == ["video_rotation"]
+    assert "rotated by 90° clockwise" in said
+    recording = open_capture(CaptureInputs(video=out))
+    assert recording.source.size_px == (64, 96)
+    assert passes_quick_check(recording)
+
+
+@pytest.mark.slow
+def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_path, call_check):
+    folder, out = spoilt(capture_corruptions.add_second_person), tmp_path / "corrected"
+    _, _, found = call_check(folder, "--fix", out)
+    assert [cure["cause"] for cure in found["corrections"]] == ["add_second_person"]
+    assert found["iou"]["after_fix"] > 0.75
+    masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (out / "masks").iterdir()]
+    masks = [mask for mask in masks if mask is not None and mask.any()]
+    assert len(masks) == 40
+    alone = [mask for mask in masks if not mask[:, :6].any()]
+    assert len(alone) > 35  # an arm that touches the other person makes one part of both
+
+
+@pytest.mark.slow
+def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call_check):
+    _, _, found = call_check(spoilt(capture_corruptions.keep_last_poses(22)))
+    assert found["cause"] == "frame_offset"
+    assert "18 frames too early" in found["corrections"][0]["words"]
+    assert found["iou"]["after_fix"] > 0.75
+
+
+@pytest.mark.slow
+def test_a_world_with_z_up_is_one_mistake_however_it_was_converted(spoilt, call_check):
+    _, _, found = call_check(spoilt(capture_corruptions.use_z_up_poses_without_pelvis))
+    assert [cure["cause"] for cure in found["corrections"]] == ["root_rotation"]
+    assert found["iou"]["after_fix"] > 0.8
+
+
+def test_without_masks_the_sheet_shows_the_body(spoilt, call_check, tmp_path):
+    folder = spoilt(lambda folder: shutil.rmtree(folder / "masks"))
+    _, said, found = call_check(folder)
+    assert found["iou"]["now"] is None
+    assert "times as much as beside it" in said
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet is not None
+    orange = (sheet[..., 2] > 200) & (sheet[..., 0] < 60)
+    assert orange.mean() > 0.005
+
+
+@pytest.mark.slow
+def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call_check, changed):
+    folder = spoilt()
+    with np.load(folder / "poses.npz") as archive:
+        fewer = {key: archive[key] for key in archive.files}
+    count = len(fewer["transl"])
+    fewer = {key: a[:-12] if a.shape[:1] == (count,) else a for key, a in fewer.items()}
+    np.savez(folder / "poses.npz", **fewer)
+    _, said, found = call_check(folder)
+    assert found["verdict"] == "warn"
+    assert "12 of" in said
+    assert "They fit in the frames that have both" in said
+
+
+@pytest.mark.slow
+def test_the_command_that_corrects_can_be_pasted(spoilt, call_check, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # the sheet goes to runs/ there
+    folder = spoilt(SPOILS["left_right"]).rename(tmp_path / "my film")
+    _, said, _ = call_check(folder, "--poses", folder / "poses.npz", "--no-mask-invert")
+    command = said[said.index("To correct it: ") :].removeprefix("To correct it: ")
+    words = shlex.split(command)
+    assert words[:4] == ["ia-check", str(folder), "--poses", str(folder / "poses.npz")]
+    assert words[4:6] == ["--no-mask-invert", "--fix"]
+    assert words[6] == f"{folder}-corrected"
+    assert check.main(words[1:]) == 0
+    assert passes_quick_check(open_capture(CaptureInputs(video=tmp_path / "my film-corrected")))
+
+
+@pytest.mark.slow
+def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt, call_check):
+    code, said, found = call_check(
+        spoilt(capture_corruptions.use_opengl_poses, capture_corruptions.delay_poses(-5))
+    )
+    assert code == 2
+    assert found["verdict"] == "unusable"
+    assert {cure["cause"] for cure in found["corrections"]} == {"opengl_axes", "frame_offset"}
+    assert found["iou"]["after_fix"] > 0.75
+    assert "OpenGL" in said
+    assert "--fix" in said
+
+
+@pytest.mark.slow
+def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
+    _, _, found = call_check(spoilt(capture_corruptions.reset_extrinsics))
+    assert found["cause"] == "world_frame"
+    assert found["iou"]["after_fix"] > 0.75
+
+
+def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check):
+    code, said, _ = call_check(dancing, "--fix", tmp_path / "mended")
+    assert code == 2
+    assert "No mistake" in said
+    assert not (tmp_path / "mended").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("keep")
+    code, said, _ = call_check(dancing, "--fix", tmp_path / "full")
+    assert code == 2
+    assert "--fix" in said
+
+
+def test_a_sheet_that_is_no_picture_is_refused_before_anything_is_looked_at(tmp_path, capsys):
+    assert check.main([str(tmp_path / "nothing"), "--sheet", str(tmp_path / "sheet.pdf")]) == 2
+    assert ".png" in capsys.readouterr().err
+
+
+def test_what_cannot_be_read_is_said_in_the_json_too(tmp_path, call_check):
+    code, said, found = call_check(tmp_path / "nothing", "--poses", tmp_path / "none.npz")
+    assert code == 2
+    assert found["verdict"] == "unusable"
+    assert found["refused"] in said
+
+
+@pytest.mark.filterwarnings("error")
+def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
+    folder = spoilt()
+    motion = read_motion(folder / "poses.npz")
+    orient, moved = motion.root_rotations.copy(), motion.root_translations.copy()
+    orient[3] = np.nan
+    moved[20:22] += [0.9, 0.0, 0.0]
+    moved[3] = np.nan
+    changed(folder / "poses.npz", global_orient=orient, transl=moved)
+    code, said, found = call_check(folder)
+    assert said.count("1 of 40 poses") == 1
+    assert code == 0
+    assert found["verdict"] == "warn"
+    assert any("1 of 40 poses" in odd for odd in found["anomalies"])
+    assert any("jump 2 times (20, 22)" in odd for odd in found["anomalies"])
+
+
+def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, spoilt):
+    assert passes_quick_check(open_capture(CaptureInputs(video=dancing)))
+    assert not passes_quick_check(
+        open_capture(CaptureInputs(video=spoilt(capture_corruptions.delay_poses(1))))
+    )
+
+
+def test_a_glance_notices_a_mirrored_film(spoilt):
+    assert not passes_quick_check(
+        open_capture(CaptureInputs(video=spoilt(capture_corruptions.mirror_video)))
+    )
+
+
+def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
+    folder = spoilt(capture_corruptions.scale_focal(0.4))
+    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the focal length is too short" in said
+    assert "--force" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
+    folder = spoilt(capture_corruptions.resample_poses(0.5))
+    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "There are 20 poses, but 40 frames" in said
+    assert "0.5 times the video's frame rate" in said
+
+
+@pytest.mark.slow
+def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path):
+    outcome = call_ingest(
+        spoilt(capture_corruptions.delay_poses(-9)), "--force", "--out", tmp_path / "run"
+    )
+    assert outcome.code == 0
+    assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
+
+
+@pytest.mark.slow
+def test_ingest_warns_of_late_poses_and_goes_on(spoilt, call_ingest, without_baking, tmp_path):
+    outcome = call_ingest(spoilt(capture_corruptions.delay_poses(2)), "--out", tmp_path / "run")
+    assert outcome.code == 0
+    assert "the poses come 2 frames too late" in " ".join(outcome.err.split())

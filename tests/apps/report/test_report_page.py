@@ -1,0 +1,362 @@
+"""The report: numbers that a machine can read and a page that needs nothing else."""
+
+import json
+import re
+from dataclasses import is_dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args, get_type_hints
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from apps.report.learning_curve import CurvePoint, curve_svg, largest_drop, largest_drops
+from apps.report.report_page import ComparisonPair, report_page
+from apps.report.report_schema import (
+    DroppedFrameEntry,
+    ForgettingStats,
+    FrameStats,
+    HeldOutStats,
+    MachineInfo,
+    Percentiles,
+    Report,
+    StreamStats,
+    TrainingStats,
+    finite_mean,
+    format_psnr,
+)
+from apps.run.report_writer import (
+    animated_webp_data_uri,
+    diagnose_failure,
+    play_command,
+    webp_data_uri,
+)
+from avatar.events import HeldOutScore
+
+
+def point(seconds, psnr, psnr_mask=None):
+    return CurvePoint(
+        wall_seconds=seconds, cpu_seconds=seconds, frames_seen=9, psnr=psnr, psnr_mask=psnr_mask
+    )
+
+
+def report(**changes):
+    content = {
+        "command": {"video": "a <b> & c.mp4"},
+        "recipe": {"rays": 1024, "finest_m": 0.0081234567},
+        "machine": MachineInfo(device="cpu", backend="numba", threads=2),
+        "frames": FrameStats(
+            read=20,
+            used=17,
+            held_out=2,
+            dropped=(DroppedFrameEntry(index=7, reason="pose invalid"),),
+            near_duplicates=0,
+            not_replayed=0,
+        ),
+        "training": TrainingStats(
+            wall_seconds=60.0,
+            cpu_seconds=61.0,
+            cpu_contention_seconds=0.5,
+            startup_seconds=3.0,
+            steps=100,
+            rays=102400,
+            rays_per_second=1706.7,
+            samples_per_ray=7.0,
+            peak_memory_mb=900.0,
+        ),
+        "held_out": HeldOutStats.of((), None),
+        "curve": (point(2.0, 24.0, 18.0), point(5.0, 29.0, 23.0)),
+        "stream": StreamStats(
+            realtime=False,
+            ingest_ms=Percentiles(p50=20.0, p95=30.0),
+            inbox_dropped=0,
+            ready_after_last_frame_seconds=None,
+            latency_ms=Percentiles(p50=25.0, p95=40.0),
+            lateness_ms=Percentiles(p50=0.0, p95=1.0),
+            inbox_depth=Percentiles(p50=0.0, p95=2.0),
+        ),
+        "package": None,
+    }
+    return Report(**{**content, **changes})
+
+
+def scores(*values):
+    return tuple(
+        HeldOutScore(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
+        for i, (psnr, mask) in enumerate(values)
+    )
+
+
+def test_the_mean_leaves_out_what_is_no_number():
+    assert finite_mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
+    assert finite_mean([float("nan")]) is None
+    assert finite_mean([]) is None
+
+
+def test_a_frame_without_a_person_has_no_masked_score():
+    note = HeldOutStats.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
+    assert (note.psnr, note.psnr_mask) == (31.0, 20.0)
+    assert note.frames == (9, 19)
+
+
+def test_nothing_to_score_is_null():
+    content = json.loads(report().to_json())
+    assert content["held_out"]["psnr"] is None
+    assert content["held_out"]["frames"] == []
+    assert content["package"] is None
+    assert content["held_out_refined"] is None
+
+
+def test_the_file_holds_no_number_that_json_does_not_know():
+    text = report(curve=(point(2.0, float("nan"), float("inf")),)).to_json()
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert content["curve"][0]["psnr"] is None
+    assert content["curve"][0]["psnr_mask"] is None
+
+
+def test_a_fall_is_a_frames_own_and_not_that_of_a_mean():
+    def scored(*frames):
+        return replace(point(2.0, 24.0), frames=frames)
+
+    joined = (scored((9, 30.0)), scored((9, 31.0), (19, 20.0)), scored((9, 30.5), (19, 26.0)))
+    assert largest_drop(joined) == pytest.approx(0.5)
+    assert largest_drop(joined[:2]) == 0.0
+    assert largest_drop(joined[:1]) is None
+
+
+def test_a_frame_of_another_video_has_no_best_in_this_one():
+    first = replace(point(2.0, 30.0), frames=((9, 30.0),))
+    added = replace(point(4.0, 20.0), frames=((9, 20.0), (19, 21.0)), video=2)
+    assert largest_drop((first, added)) is None
+    lower = replace(point(6.0, 19.0), frames=((9, 19.5), (19, 22.0)), video=2)
+    assert largest_drops((first, added, lower)) == {(2, 9): 0.5, (2, 19): 0.0}
+
+
+def test_the_page_says_what_the_curve_is_a_mean_of():
+    """Where it falls because other frames joined, that is said; where frames fall, how far."""
+    one = replace(point(2.0, 30.0), frames=((9, 30.0),))
+    nine = replace(point(5.0, 24.0), frames=((9, 30.0), (19, 18.0)))
+    joined = report_page(report(curve=(one, nine)), name="clip")
+    assert "means over different frames (1 to 2 of them)" in joined
+    assert "Of the held-out frames, 1 was scored more than once" in joined
+    assert "more than 0.0 dB below its own best" in joined
+    fallen = replace(point(9.0, 22.0), frames=((9, 28.0), (19, 16.0)))
+    same = report_page(report(curve=(nine, fallen)), name="clip")
+    assert "different frames" not in same
+    assert "Of the held-out frames, 2 were" in same
+    other = replace(fallen, frames=((3, 28.0), (13, 16.0)), video=2)
+    assert "different frames" not in report_page(report(curve=(nine, fallen, other)), name="clip")
+    assert "more than 2.0 dB below its own best" in same
+    assert "whether one got worse cannot be said" in report_page(report(curve=(one,)), name="clip")
+
+
+def test_the_page_tells_of_the_video_before():
+    marks = (
+        point(2.0, 24.0),
+        replace(point(40.0, 20.0), video=2),
+        replace(point(50.0, 21.0), video=2),
+    )
+    before, after = scores((20.0, 18.0), (22.0, 19.0)), scores((21.0, 18.0), (21.5, 19.0))
+    earlier = ForgettingStats.of(
+        before, after, videos=("first <1>.mp4",), video_of_frame=(1, 1), frames_trained=54, wall_seconds=30.0,
+        replayed_key_frames=40,
+    )  # fmt: skip
+    page = report_page(report(extended=earlier, curve=marks), name="second.mp4")
+    lead = "17 frames of this video, and 54 of first &lt;1&gt;.mp4 before"
+    assert lead in page
+    assert "60 seconds (30 on this video)" in page
+    assert "40 frames of first" in page
+    assert "21.00 dB before this video, 21.25 dB now; none of them lost more than 0.50 dB" in page
+    svg = ElementTree.fromstring(curve_svg(marks))
+    lines = [line.get("points").split() for line in svg.findall("polyline[@class='whole']")]
+    assert [len(line) for line in lines] == [1, 2]
+    assert [text.text for text in svg.findall("text") if "video" in text.text] == [
+        "video 1",
+        "video 2",
+    ]
+
+
+def test_a_point_of_the_curve_survives_a_checkpoint():
+    kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
+    assert CurvePoint.from_checkpoint(json.loads(json.dumps(vars(kept)))) == kept
+    older = {key: value for key, value in vars(kept).items() if key not in ("frames", "verdict")}
+    assert CurvePoint.from_checkpoint(older).frames == ()
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects addresses."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.addresses = [], []
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_asks_for_no_other_file():
+    white = webp_data_uri(np.full((4, 4, 3), 255, np.uint8))
+    page = report_page(
+        report(),
+        name="a <b> & c.mp4",
+        pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
+        animation=animated_webp_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
+        warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
+    )
+    tags = Tags(page)
+    assert len(tags.addresses) == 3
+    assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
+    assert "a &lt;b&gt; &amp; c.mp4" in page
+    assert "masks &lt;turned&gt;" in page
+    assert "Left out, pose invalid: frame 7." in page
+    assert "url(" not in page
+    assert "prefers-color-scheme: dark" in page
+
+
+def test_a_page_without_pictures_or_scores_is_whole_too():
+    page = report_page(report(curve=()), name="clip")
+    assert Tags(page).addresses == []
+    assert "<svg" not in page
+    assert "n/a" in page
+    assert "not scored" in page
+
+
+def test_every_decibel_on_the_page_has_its_word():
+    note = replace(
+        HeldOutStats.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
+    )
+    pair = ComparisonPair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
+    page = report_page(replace(report(), held_out=note), name="clip", pairs=[pair])
+    assert "held-out PSNR, on white: blurred" in page
+    assert "22.78 dB (blurred)" in page
+    assert "no usable avatar" not in page
+
+
+def failed(*, steps, video="my clip.mp4", overlap=0.9):
+    note = replace(
+        HeldOutStats.of(scores((6.88, 6.0)), (64, 48)), verdict="failed", overlap=overlap
+    )
+    given = report()
+    return replace(
+        given,
+        held_out=note,
+        training=replace(given.training, steps=steps),
+        command={"video": video, "poses": "p.npz", "masks": None, "cameras": "solve"},
+    )
+
+
+def test_a_failure_names_what_was_seen_and_what_to_do():
+    room = diagnose_failure(failed(steps=900, overlap=0.2))
+    assert "6.88 dB (failed)" in room
+    assert "agrees with the masks by only 0.20" in room
+    assert room.endswith("ia-check 'my clip.mp4' --poses p.npz")
+    assert "8% of the person's height" in diagnose_failure(failed(steps=900))
+    assert "Only 26 steps were made" in diagnose_failure(failed(steps=26))
+    assert "ia-check" not in diagnose_failure(failed(steps=900, video="camera:0"))
+    assert diagnose_failure(report()) is None
+
+
+def test_nothing_has_failed_while_it_is_learnt():
+    assert format_psnr(13.3, "failed", digits=1) == "13.3 dB (failed)"
+    assert format_psnr(13.3, "failed", provisional=True) == "13.30 dB (no person to be seen yet)"
+    assert format_psnr(30.0, "soft", provisional=True) == "30.00 dB (soft)"
+    assert format_psnr(30.0, None) == "30.00 dB"
+    assert format_psnr(None, None) == "n/a"
+
+
+def test_an_avatar_that_is_good_in_fitted_poses_has_not_failed():
+    fitted = replace(HeldOutStats.of(scores((23.0, 18.0)), (64, 48)), verdict="soft")
+    kept = replace(failed(steps=900), held_out_refined=fitted)
+    assert kept.verdict == "soft"
+    assert diagnose_failure(kept) is None
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, None),
+        ({"verdict": "still"}, "stood still"),
+        ({"verdict": "stopped"}, "--resume"),
+        ({"verdict": "refused", "reason": "tiles < tiles"}, "tiles &lt; tiles"),
+        (
+            {
+                "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground", "in place"]},
+                "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
+            },
+            "434 px; the size of the room is told by ground and in place",
+        ),
+    ],
+)  # fmt: skip
+def test_the_page_says_where_the_camera_was(found, said):
+    page = report_page(replace(report(), cameras=found), name="clip")
+    assert Tags(page).addresses == []
+    assert ("Where the camera was" in page) == (said is not None)
+    assert said is None or said in page
+
+
+SOLVED = {
+    "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground"]},
+    "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("there", [(), ("cameras.npz",), ("cameras.npz", "poses.npz")])
+def test_the_page_names_no_file_that_is_not_there(there):
+    solved = replace(report(), cameras=SOLVED)
+    page = report_page(solved, name="clip", present_files=there)
+    assert "60 key frames" in page
+    assert ("cameras.npz" in page) == ("poses.npz" in page) == (len(there) == 2)
+    assert "avatar.iavatar" not in page
+    assert "ia-play" not in page
+    command = play_command(Path("a run/avatar.iavatar"), Path("clip/poses.npz"))
+    page = report_page(solved, name="clip", play_command=command)
+    assert "ia-play &#x27;a run/avatar.iavatar&#x27; --poses clip/poses.npz" in page
+
+
+def test_the_curve_goes_up_when_the_score_does():
+    svg = ElementTree.fromstring(curve_svg((point(2.0, 24.0), point(5.0, 29.0), point(9.0, 29.0))))
+    (line,) = svg.findall("polyline")
+    places = [tuple(map(float, pair.split(","))) for pair in line.get("points").split()]
+    (x0, y0), (x1, y1), (x2, y2) = places
+    assert x0 < x1 < x2
+    assert y0 > y1 == y2
+    assert (x1 - x0) / (x2 - x1) == pytest.approx(3.0 / 4.0, abs=0.01)
+    width, height = map(float, svg.get("viewBox").split()[2:])
+    assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
+
+
+def test_nothing_measured_draws_nothing():
+    assert curve_svg((point(2.0, None),)) == ""
+
+
+def paths_in(record, above=""):
+    """Every key of a record in dots, as in `training.steps`."""
+    for name, kind in get_type_hints(record).items():
+        yield f"{above}{name}"
+        for part in (kind, *get_args(kind)):
+            if is_dataclass(part):
+                yield from paths_in(part, f"{above}{name}.")
+
+
+def test_the_page_on_the_report_names_every_key_and_no_other():
+    page = (Path(__file__).parents[2] / "docs" / "report.md").read_text()
+    told = set(re.findall(r"`([a-z0-9_.]+)`", page))
+    free = {"command", "recipe", "cameras"}  # what is in these, no record says
+    paths = {path for path in paths_in(Report) if path.split(".")[0] not in free} | free
+    above = {path.split(".")[0] for path in told}
+    alike = {path: path.replace("held_out_refined.", "held_out.") for path in paths}
+    known = told | above
+    assert not [p for p, like in alike.items() if not {like, like.split(".")[-1]} & known]
+    dotted = {path for path in told if "." in path and path.split(".")[0] not in {"report", *free}}
+    assert len(dotted) > 20
+    assert dotted <= paths

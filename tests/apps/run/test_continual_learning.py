@@ -1,0 +1,115 @@
+"""Another video added to a finished avatar: both are learnt from, and the body stays."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.training import checkpoint
+from preprocess.alignment.mask_alignment import body_height_m
+from preprocess.body.body_file import load_body_model, read_shaped_body
+
+GIVEN = "--no-refine-poses"
+"""What is shown here is not how poses are refined; fits of held-out frames take a while."""
+FEW = ("--frames", "0:8", GIVEN)
+
+
+def test_another_video_is_added_and_what_the_first_lost_is_said(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch
+):
+    from avatar.training import saved_frames
+
+    out, other = tmp_path / "run", tmp_path / "other"
+    shutil.copytree(capture, other)
+    first = call_ingest(capture, "--out", out, "--frames", "0:12", GIVEN)
+    assert first.code == 0
+    before = json.loads((out / "report.json").read_text())
+    assert before["earlier_videos"] is None
+    assert (out / "checkpoint" / saved_frames.LAST_RUN_FILE).exists()
+    outcome = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
+    assert outcome.code == 0
+    after = json.loads((out / "report.json").read_text())
+    extended = after["earlier_videos"]
+    assert extended["frames"] == before["held_out"]["frames"]
+    assert extended["psnr_before"] == pytest.approx(before["held_out"]["psnr"], abs=0.05)
+    assert extended["replayed_key_frames"] == before["frames"]["used"]
+    assert extended["largest_drop"] >= 0.0
+    assert extended["videos"] == ["capture"]
+    assert extended["video_of_frame"] == [1, 1, 1]
+    assert extended["used"] == before["frames"]["used"]
+    assert extended["wall_seconds"] == pytest.approx(before["training"]["wall_seconds"])
+    held = {1: before["held_out"]["frames"], 2: after["held_out"]["frames"]}
+    assert {point["video"] for point in after["curve"]} == {1, 2}
+    for point in after["curve"]:  # numbers in the video, whichever it was
+        assert {number for number, _ in point["frames"]} <= set(held[point["video"]])
+    page = (out / "report.html").read_text()
+    assert "of capture before, learnt in" in page
+    assert "The video before" in page
+    assert "earlier video" in outcome.err
+    assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
+    assert after["training"]["steps"] == 2 * before["training"]["steps"]
+    # both videos are learnt from, and an interrupted run finds both again
+    kept = saved_frames.SavedFrames.load(out / "checkpoint" / saved_frames.LAST_RUN_FILE)
+    numbers = [frame.index for frame in kept.replay_frames]
+    assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
+    again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
+    assert again.code == 0
+    assert json.loads((out / "report.json").read_text())["earlier_videos"]["frames"] == [9, 10, 11]
+
+
+def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
+    capture, call_ingest, without_baking, tmp_path, changed, rig
+):
+    out, other = tmp_path / "run", tmp_path / "other"
+    shutil.copytree(capture, other)
+    assert call_ingest(capture, "--out", out, *FEW).code == 0
+    body = load_body_model()
+    person = read_shaped_body(out / "checkpoint" / "person.npz", body)
+    betas = np.zeros(10)
+    betas[0] = 3.0
+    stated = body.with_shape(betas)
+    assert abs(body_height_m(stated) - body_height_m(person)) > 0.02
+    changed(other / "poses.npz", betas=betas)
+    outcome = call_ingest(other, "--out", out, "--resume", *FEW)
+    assert outcome.code == 0
+    assert f"state a body of {100 * body_height_m(stated):.0f} cm" in " ".join(outcome.err.split())
+    kept = read_shaped_body(out / "checkpoint" / "person.npz", body)
+    np.testing.assert_array_equal(kept.vertices, person.vertices)
+    trainer, _ = checkpoint.load(out / "checkpoint", torch.device("cpu"))
+    np.testing.assert_allclose(trainer.avatar.rig.rest_joints, rig.rest_joints, atol=1e-6)
+
+
+def test_an_added_video_of_another_body_is_refused(
+    capture, call_ingest, without_baking, tmp_path, changed
+):
+    out, other = tmp_path / "run", tmp_path / "other"
+    shutil.copytree(capture, other)
+    assert call_ingest(capture, "--out", out, *FEW).code == 0
+    for arguments, word in (
+        (("--height-cm", "150"), "--height-cm is 150"),
+        (("--body", small_body(tmp_path)), "Give the same --body"),
+    ):
+        outcome = call_ingest(other, "--out", out, "--resume", *FEW, *arguments)
+        assert outcome.code == 2
+        assert word in outcome.complaint()
+    (out / "checkpoint" / "person.npz").unlink()
+    changed(other / "poses.npz", betas=np.full(10, 2.0))
+    outcome = call_ingest(other, "--out", out, "--resume", *FEW)
+    assert outcome.code == 2
+    assert "another body than these poses" in outcome.complaint()
+    assert (out / "avatar.iavatar").exists()
+
+
+def small_body(folder):
+    """The embedded body with a vertex less."""
+    body, path = load_body_model(), folder / "small.npz"
+    faces = body.faces[(body.faces < len(body.template) - 1).all(axis=1)]
+    tree = np.stack([body.parents, np.arange(24)])
+    np.savez(
+        path, v_template=body.template[:-1], shapedirs=body.shape_directions[:-1], f=faces,
+        weights=body.weights[:-1], J=body.joints, J_shapedirs=body.joint_directions,
+        kintree_table=tree,
+    )  # fmt: skip
+    return path

@@ -1,0 +1,250 @@
+"""No command removes or changes a file that it did not write: not one byte, also when killed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from apps import check, evaluate, export, ingest, play, sample
+
+COMMANDS = {
+    "ia-check": check.main, "ia-evaluate": evaluate.main, "ia-export": export.main,
+    "ia-ingest": ingest.main, "ia-play": play.main, "ia-sample": sample.main,
+}  # fmt: skip
+
+OTHERS = (
+    "poses.npz", "cameras.npz", "report.json", "report.html", "avatar.iavatar", "avatar.webm",
+    "checkpoint/state.pt", "checkpoint/person.npz", "checkpoint/frames.tensors", "video.mp4",
+    "checkpoint/step_100.ckpt", "checkpoint/state.pt.part", "masks/0000.png", "images/0000.png",
+    "cameras/01/intri.yml", "0000.png", "0001.png", "dance.npz", "truth/poses.npz", "index.html",
+    "avatar.json", "mesh.glb", "mesh.ply", "clip.webm", "letter.txt", "table.md", "runs/a.png",
+    ".avatar.iavatar.swp", ".report.1234.part.json", ".capture.99.old/letter.txt", "job.json",
+)  # fmt: skip
+"""Names of our own, and of others, that other people's files have."""
+
+
+def contents(folder):
+    """Every file below a folder, link or not, with what it holds; and every folder."""
+    found = {path: None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")}
+    return {str(path.relative_to(folder)): content for path, content in found.items()}
+
+
+def unchanged(before, folder):
+    """Whether all that was there still is, byte for byte."""
+    now = contents(folder)
+    return {name: now.get(name, "gone") for name in before} == before
+
+
+@pytest.fixture
+def hoard(tmp_path) -> Path:
+    """A folder full of other people's files."""
+    folder = tmp_path / "hoard"
+    for number, name in enumerate(OTHERS):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"mine %d" % number)
+    return folder
+
+
+@pytest.fixture
+def package(run, tmp_path) -> Path:
+    """A package away from its run."""
+    shutil.copyfile(run / "avatar.iavatar", tmp_path / "mine.iavatar")
+    return tmp_path / "mine.iavatar"
+
+
+def called(line, **places):
+    """Exit code of a command line in which places are written {so}."""
+    program, *words = [word.format(**places) for word in line.split()]
+    try:
+        return COMMANDS[program](words)
+    except SystemExit as end:
+        return end.code
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ia-ingest {film} --out {hoard}",
+        "ia-ingest {film} --out {hoard} --overwrite",
+        "ia-ingest {film} --out {hoard} --resume",
+        "ia-ingest {film} --out {hoard}/letter.txt",
+        "ia-ingest {film} --out new --json {hoard}/poses.npz",
+        "ia-ingest {film} --out new --json {hoard}/report.json",
+        "ia-sample {hoard}",
+        "ia-sample {hoard} --overwrite",
+        "ia-sample {hoard}/masks --overwrite",
+        "ia-sample {hoard}/video.mp4 --overwrite",
+        "ia-check {film} --fix {hoard}",
+        "ia-check {film} --fix {hoard}/masks",
+        "ia-check {film} --sheet {hoard}/0000.png",
+        "ia-check {film} --json {hoard}/report.json",
+        "ia-play {package} --out {hoard}",
+        "ia-play {package} --out {hoard}/images",
+        "ia-play {package} --out {hoard}/masks",
+        "ia-play {package} --out {hoard}/clip.webm",
+        "ia-play {package} --out {hoard}/video.mp4",
+        "ia-play {package} --out {hoard}/0000.png",
+        "ia-play {hoard}/avatar.iavatar",
+        "ia-play {package} --verify --json {hoard}/report.json",
+        "ia-play {package} --bench --json {hoard}/poses.npz",
+        "ia-play {package} --web --out {hoard}",
+        "ia-play {package} --web --out {hoard}/truth",
+        "ia-export {run} --out {hoard}/avatar.iavatar",
+        "ia-export {package} --to glb --out {hoard}/mesh.glb",
+        "ia-export {package} --to ply --out {hoard}/mesh.ply",
+        "ia-evaluate {run} --json {hoard}/report.json",
+        "ia-evaluate {run} --markdown {hoard}/table.md",
+    ],
+)
+def test_a_place_with_other_peoples_files_is_refused(
+    line, hoard, film, run, package, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("export.web.onnxruntime_web.runtime_files", dict)
+    before = contents(tmp_path)
+    assert called(line, film=film, hoard=hoard, run=run, package=package) == 2
+    assert contents(tmp_path) == before
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "ia-ingest {capture} --out {capture}",
+        "ia-ingest {capture} --out {capture} --overwrite",
+        "ia-ingest {capture} --out {capture} --resume",
+        "ia-ingest . --out .",
+        "ia-ingest .",
+        "ia-ingest {capture} --out {capture}/run",
+        "ia-ingest {capture} --out {capture}/masks --overwrite",
+        "ia-ingest {capture} --out {above} --overwrite",
+        "ia-ingest {above}/link --out {capture}",
+        "ia-ingest {capture}/video.mp4 --poses {capture}/poses.npz --out {capture}",
+        "ia-ingest {above}/film.mp4 --poses {capture}/poses.npz --out {capture} --overwrite",
+        "ia-ingest {above}/film.mp4 --poses {capture}/poses.npz --out {capture}/masks",
+        "ia-ingest {capture} --out new --json {capture}/poses.npz --overwrite",
+        "ia-check {capture} --sheet {capture}/masks/0001.png --overwrite",
+        "ia-check {capture} --sheet {capture}/masks/9999.png",
+        "ia-check {capture} --json {capture}/cameras.npz --overwrite",
+        "ia-check {capture} --json {capture}/transforms.json",
+        "ia-check {capture} --fix {capture}",
+        "ia-check {capture} --fix {capture}/mended",
+        "ia-play {package} --poses {capture}/poses.npz --out {capture}/poses.png --json x",
+        "ia-play {package} --background {capture}/masks/0001.png --out {capture}/masks/0001.png"
+        " --overwrite",
+        "ia-play {package} --bench --json {package} --overwrite",
+        "ia-export {package} --to ply --out {capture}/video.mp4 --overwrite",
+        "ia-evaluate {run} --on {capture} --json {capture}/poses.npz --overwrite",
+        "ia-evaluate {run} --on {capture} --markdown {capture}/masks/0000.png --overwrite",
+        "ia-evaluate {package} --on {capture} --json {package} --overwrite",
+    ],
+)
+def test_no_command_writes_over_what_it_reads(
+    line, capture, run, package, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(capture)
+    (tmp_path / "link").symlink_to(capture)
+    os.link(capture / "video.mp4", tmp_path / "film.mp4")
+    before = contents(tmp_path)
+    assert called(line, capture=capture, above=tmp_path, run=run, package=package) == 2
+    assert contents(tmp_path) == before
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_what_is_written_beside_other_peoples_files_leaves_them(
+    hoard, film, package, monkeypatch, capsys
+):
+    for name in ("0001.png", "avatar.webm"):
+        (hoard / name).unlink()
+    before = contents(hoard)
+    monkeypatch.chdir(hoard)
+    for line, made in (
+        ("ia-play {package} --out new.png --size 32", "new.png"),
+        ("ia-play {package} --verify --json verdict.json", "verdict.json"),
+        ("ia-export {package} --to ply --out new.ply", "new.ply"),
+        ("ia-check {film} --json found.json", "runs/capture-check.png"),
+        ("ia-check {film} --json found.json --overwrite", "found.json"),
+        ("ia-sample new --frames 1 --size 16", "new/video.mp4"),
+        ("ia-sample new --frames 1 --size 16 --overwrite", "new/poses.npz"),
+    ):
+        assert called(line, film=film, package=package) == 0, capsys.readouterr().err
+        assert (hoard / made).is_file()
+        assert unchanged(before, hoard), line
+    (hoard / "new" / "letter.txt").write_text("mine")
+    before = contents(hoard)
+    assert called("ia-sample new --frames 1 --size 16 --overwrite") == 2
+    assert contents(hoard) == before
+
+
+KILLED = """
+import os, shutil, signal, sys
+from pathlib import Path
+
+from apps.run.run_folder import RunFolder
+from capture.atomic_files import Draft, atomic_folder, write_text_atomically
+
+EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
+folder, left = Path(sys.argv[1]), -1
+
+def count(event, arguments):
+    global left
+    if left >= 0 and event in EVENTS and str(folder) in str(arguments):
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+def work():
+    run = RunFolder(path=folder)
+    run.check([], resume=False, overwrite=True)
+    run.begin(resume=False)
+    for _ in range(2):
+        write_text_atomically(run.checkpoint / "state.pt", "learnt")
+    package = AtomicFile(run.package)
+    package.part.write_bytes(b"avatar")
+    package.finish()
+    write_text_atomically(run.report, "{}")
+    with atomic_folder(folder / "frames") as part:
+        (part / "0000.png").write_bytes(b"new")
+
+sys.addaudithook(count)
+work()
+ours = {str(path.relative_to(folder)) for path in folder.rglob("*")}
+others = ["letter.txt", "checkpoint/step_100.ckpt", ".avatar.iavatar.swp", "0000.png"]
+for name in others:
+    (folder / name).write_bytes(b"mine")
+before = shutil.copytree(folder, folder.with_name("before"))
+events = 0
+while True:
+    child = os.fork()
+    if child == 0:
+        left = events
+        work()
+        os._exit(0)
+    killed = os.waitpid(child, 0)[1] != 0
+    assert all((folder / name).read_bytes() == b"mine" for name in others), events
+    run = RunFolder(path=folder)
+    run.check([], resume=False, overwrite=True)
+    run.begin(resume=False)
+    rest = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    rest -= {name for name in rest if "frames" in name or name.endswith(".instant-avatar-files")}
+    assert rest == set(others), (events, rest)
+    if not killed:
+        break
+    shutil.rmtree(folder)
+    shutil.copytree(before, folder)
+    events += 1
+print(events)
+"""
+"""What a run writes, by a process that is killed at each of its operations on files in turn."""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_wherever_a_run_is_killed_other_peoples_files_stay_and_ours_are_known(tmp_path):
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 60

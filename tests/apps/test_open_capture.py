@@ -1,0 +1,175 @@
+"""A video with poses as a stranger's tracker wrote them."""
+
+import pickle
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import capture_corruptions
+from capture.input_error import InputError
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.open_capture import open_capture
+from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.poses.root_placement import SMPLX_PELVIS, place_in_camera_world
+
+
+@pytest.fixture
+def own(film) -> Capture:
+    """The film with its own poses, in the world."""
+    return open_capture(CaptureInputs(video=film))
+
+
+@pytest.fixture
+def in_camera(own) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation matrices and places of the film's poses in its camera."""
+    camera, pelvis = own.cameras[0].camera_from_world, own.shaped.body.joints[0]
+    motion = own.motion
+    turned = camera[:3, :3] @ rotation_matrices(motion.root_rotations)
+    places = (pelvis + motion.root_translations) @ camera[:3, :3].T + camera[:3, 3] - pelvis
+    body = rotation_matrices(motion.joint_rotations)
+    return np.concatenate([turned[:, None], body], axis=1), places
+
+
+def test_a_trackers_file_and_the_films_own_poses_are_one(film, own, in_camera, tmp_path):
+    matrices, places = in_camera
+    camera = own.cameras[0]
+    rows = {"pred_rotmat": matrices, "pred_trans": places[:, None], "frame": np.arange(24)}
+    rows |= {"img_focal": camera.focal_px[0], "img_center": np.array(camera.center_px)}
+    np.save(tmp_path / "hps_track_0.npy", rows)
+    poses, cameras = tmp_path / "hps_track_0.npy", str(film / "cameras.npz")
+    other = open_capture(CaptureInputs(video=film, poses=poses, cameras=cameras))
+    read = place_in_camera_world(read_poses(poses), own.shaped, own.cameras, cameras_given=True)
+    for row in range(0, 24, 5):  # before they are fitted to a body that is not SMPL's
+        joints = [own.shaped.with_pose(m[row]).joints() for m in (own.motion, read)]
+        np.testing.assert_allclose(joints[0], joints[1], atol=1e-9)
+    assert any("body model 'smpl'" in note for note in other.notes)
+
+
+def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp_path):
+    poses = axis_angles_from_matrices(in_camera[0]).reshape(-1, 72)
+    actor = {"pose": poses, "trans": in_camera[1], "frame_ids": np.arange(24)}
+    visitor = {key: value[:6] for key, value in actor.items()}
+    path = tmp_path / "wham_output.pkl"
+    path.write_bytes(pickle.dumps({1: visitor, 2: actor}))
+    paths = {"video": film, "poses": path}
+    longest = open_capture(CaptureInputs(**paths))
+    assert len(longest.motion) == 24
+    assert any("2 people; 2 was taken" in note for note in longest.notes)
+    chosen = open_capture(CaptureInputs(**paths, person="1"))
+    assert len(chosen.motion) == 6
+    assert not any("people" in note for note in chosen.notes)
+    with pytest.raises(InputError, match="nobody called '7'"):
+        open_capture(CaptureInputs(**paths, person="7"))
+
+
+def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("video.mp4", "poses.npz", "cameras.npz"):
+        shutil.copy(film / name, bare / name)
+    recording = open_capture(CaptureInputs(video=bare))
+    assert any("estimated" in note and "segmenter:grabcut" in note for note in recording.notes)
+    true = open_capture(CaptureInputs(video=film))
+    assert true.mask_report() == {"masks": "masks", "mask_agreement": None}
+    alike = [
+        np.minimum(a.alpha, b.alpha).sum() / np.maximum(a.alpha, b.alpha).sum()
+        for a, b in zip(recording.observations(), true.observations(), strict=True)
+    ]
+    assert np.mean(alike) > 0.85  # of 64 px; larger pictures reach 0.95 and more
+    told = recording.mask_report()
+    assert told["masks"] == "estimated by GrabCut"
+    assert 0.6 < told["mask_agreement"] < 1.0
+
+
+def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_path):
+    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
+    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
+    far = own.motion.root_translations.copy()
+    far[:, 2] -= 0.4  # of somebody an eighth taller than SMPL's mean, as its tracker thinks
+    np.savez(tmp_path / "poses.npz", **rows, transl=far)
+    fitted = open_capture(CaptureInputs(video=film, poses=tmp_path / "poses.npz"))
+    note = next(note for note in fitted.notes if "body model 'smpl'" in note)
+    before, after = (float(number) for number in re.findall(r"(0\.\d\d) (?:before|after)", note))
+    assert after > before + 0.05
+    assert after > 0.7
+
+
+def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
+    folder = tmp_path / "live"
+    folder.mkdir()
+    frames = list(own.source.frames())[:4]
+    for frame in frames:
+        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
+    (folder / "DONE").touch()
+    paths = {"video": folder, "poses": film / "poses.npz", "cameras": f"{film}/cameras.npz"}
+    with pytest.raises(InputError, match="segmenter:grabcut"):
+        open_capture(CaptureInputs(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
+    named = Path("segmenter:grabcut")
+    live = open_capture(CaptureInputs(**paths, live=True, masks=named, idle_s=1.0))
+    assert any("estimated" in note for note in live.notes)
+    found = list(live.observations())
+    assert [observation.frame.index for observation in found] == [0, 1, 2, 3]
+    assert all((observation.alpha > 0.5).any() for observation in found)
+
+
+def test_a_focal_length_that_nobody_knows_is_found_in_the_masks(capture, own):
+    capture_corruptions.convert_to_camera_space(capture)
+    (capture / "cameras.npz").unlink()
+    found = open_capture(CaptureInputs(video=capture))
+    assert found.cameras[0].focal_px == pytest.approx(own.cameras[0].focal_px, rel=0.04)
+    assert any("found from the masks" in note for note in found.notes)
+
+
+def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
+    capture_corruptions.convert_to_camera_space(capture)
+    (capture / "cameras.npz").unlink()
+    intrinsic = own.cameras[0].intrinsic.copy()
+    intrinsic[[0, 1], [0, 1]] *= 0.8
+    changed(capture / "poses.npz", K=intrinsic)
+    found = open_capture(CaptureInputs(video=capture))
+    assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
+
+
+def test_a_live_strangers_poses_are_fitted_while_they_come(film, own, tmp_path):
+    folder = tmp_path / "live"
+    (folder / "images").mkdir(parents=True)
+    shutil.copytree(film / "masks", folder / "masks")
+    for frame in own.source.frames():
+        Image.fromarray(frame.rgb).save(folder / "images" / f"{frame.index:04d}.png")
+    (folder / "images" / "DONE").touch()
+    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
+    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
+    far = own.motion.root_translations.copy()
+    far[:, 2] -= 0.4
+    np.savez(folder / "poses.npz", **rows, transl=far)
+    cameras = f"{film}/cameras.npz"
+    live = open_capture(CaptureInputs(video=folder, cameras=cameras, live=True, idle_s=1.0))
+    assert any("fitted to the masks as they come" in note for note in live.notes)
+    assert live.body_fit_report() is None
+    assert len(list(live.observations())) == 24
+    (said,) = live.final_notes()
+    assert "By the first 16 frames" in said
+    told = live.body_fit_report()
+    assert told["taken"]
+    assert told["agreement_after"] > max(0.7, told["agreement_before"] + 0.05)
+
+
+def test_smplx_poses_of_a_live_source_turn_about_smpls_pelvis(film, own, tmp_path):
+    folder = tmp_path / "live"
+    folder.mkdir()
+    for frame in list(own.source.frames())[:2]:
+        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
+    (folder / "DONE").touch()
+    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smplx")}
+    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
+    np.savez(folder / "poses.npz", **rows, transl=own.motion.root_translations)
+    named = {"video": folder, "cameras": f"{film}/cameras.npz", "masks": film / "masks"}
+    live = open_capture(CaptureInputs(**named, live=True, idle_s=1.0))
+    pelves = live.shaped.joints[0] + live.motion.root_translations
+    np.testing.assert_allclose(pelves, SMPLX_PELVIS + own.motion.root_translations)

@@ -1,0 +1,152 @@
+"""The coach's sentence: what it says about a body that was seen in known ways."""
+
+import numpy as np
+import pytest
+
+from avatar.evaluation.coverage import Coverage, VisibilityStage
+from avatar.evaluation.coverage_advice import (
+    NOT_SEEN_YET,
+    SEEN_COMPLETELY,
+    coverage_advice,
+    unseen_regions,
+)
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES
+
+AROUND = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+
+
+def without(
+    coverage: Coverage, where: np.ndarray, stage: VisibilityStage = VisibilityStage.FACING_AWAY
+) -> Coverage:
+    """Everything is seen squarely but some patches, which came only so far."""
+    coverage.stages[:] = np.where(where, stage, VisibilityStage.SEEN)
+    coverage.cosines[:] = np.where(where, 0.0, 1.0)
+    return coverage
+
+
+def here(coverage: Coverage, *parts: str, side: str | None = None) -> np.ndarray:
+    """The patches of some parts (all parts if none is named), on one side of them or on all."""
+    patches = coverage.patches
+    where = np.isin(patches.parts, [PART_NAMES.index(part) for part in parts or PART_NAMES])
+    return where if side is None else where & (patches.sides == SIDE_NAMES.index(side))
+
+
+def arm(whose: str) -> tuple[str, str, str]:
+    return f"{whose} upper arm", f"{whose} forearm", f"{whose} hand"
+
+
+@pytest.fixture
+def coverage(shaped) -> Coverage:
+    return Coverage(shaped)
+
+
+def test_before_the_first_frame_nobody_has_been_seen(coverage):
+    assert coverage_advice(coverage) == NOT_SEEN_YET
+
+
+def test_who_faces_the_camera_is_told_to_turn(observed, coverage):
+    coverage.add(observed())
+    assert coverage_advice(coverage) == "Turn until your back has been seen."
+
+
+@pytest.mark.parametrize(
+    ("turned", "sentence"),
+    [
+        (np.pi, "Face the camera: your front was never seen."),
+        (-np.pi / 2, "Turn until your right side has been seen."),
+        (np.pi / 2, "Turn until your left side has been seen."),
+    ],
+)
+def test_the_side_is_the_persons_and_opposite_to_the_seen_one(observed, coverage, turned, sentence):
+    coverage.add(observed(turned=turned))
+    assert coverage_advice(coverage) == sentence
+
+
+def test_turning_once_is_enough(observed, coverage):
+    for turned in AROUND:
+        coverage.add(observed(turned=turned))
+    assert coverage_advice(coverage) == SEEN_COMPLETELY
+
+
+def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
+    for turned in AROUND:
+        coverage.add(observed(turned=turned, up_m=1.0))
+    assert coverage_advice(coverage) == "Step back: your legs were never in the picture."
+
+
+@pytest.mark.parametrize(
+    ("parts", "side", "sentence"),
+    [
+        (arm("left"), "under", "Raise your left arm: its underside was never seen."),
+        (arm("right"), "back", "Turn until the back of your right arm has been seen."),
+        (arm("left"), "top", "Lower your left arm: its upper side was never seen."),
+        (
+            ("left thigh", "left shin"),
+            "right",
+            "Stand with your legs apart: its inner side was never seen.",
+        ),
+        (
+            ("right thigh", "right shin"),
+            "right",
+            "Turn until the outer side of your right leg has been seen.",
+        ),
+        (("head",), "back", "Turn until the back of your head has been seen."),
+        (("head",), "left", "Turn until the left side of your head has been seen."),
+        (("head",), "front", "Look at the camera: your face was never seen."),
+        (("left hand",), None, "Show your left hand: it was never seen."),
+    ],
+)
+def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, sentence):
+    assert coverage_advice(without(coverage, here(coverage, *parts, side=side))) == sentence
+
+
+def test_the_same_piece_of_both_arms_is_one_sentence(coverage):
+    both = here(coverage, *arm("left"), *arm("right"), side="under")
+    said = coverage_advice(without(coverage, both))
+    assert said == "Raise your arms: their undersides were never seen."
+    assert {gap.laterality for gap in unseen_regions(coverage)} == {"left", "right"}
+
+
+def test_arms_that_hide_a_side_are_to_be_raised(coverage):
+    where = here(coverage, "torso", side="left")
+    said = coverage_advice(without(coverage, where, VisibilityStage.SELF_OCCLUDED))
+    assert said == "Raise your arms: they hide your left side."
+
+
+def test_what_only_the_masks_leave_out_is_looked_for_there(coverage):
+    said = coverage_advice(
+        without(coverage, here(coverage, "right hand"), VisibilityStage.OUTSIDE_MASK)
+    )
+    assert said.startswith("Look at the masks: your right hand was never in them")
+
+
+def test_the_largest_piece_is_spoken_of_first(coverage):
+    where = here(coverage, "torso", side="back") | here(coverage, "left shin")
+    assert coverage_advice(without(coverage, where)) == "Turn until your back has been seen."
+    shares = [gap.share for gap in unseen_regions(coverage)]
+    assert shares == sorted(shares, reverse=True)
+    assert len(shares) == 2
+
+
+def test_a_piece_is_as_large_as_its_skin(coverage):
+    where = here(coverage, "torso", side="front")
+    (gap,) = unseen_regions(without(coverage, where))
+    expected = coverage.patches.areas[where].sum() / coverage.patches.areas.sum()
+    assert gap.share == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_is_scattered_is_counted_and_not_chased(coverage, rng):
+    said = coverage_advice(without(coverage, rng.random(len(coverage.stages)) < 0.1))
+    assert "10% that are missing are small pieces" in said
+
+
+def test_every_sentence_is_one(coverage, rng):
+    """Any ball of unseen skin, for any reason, makes a sentence without a hole in it."""
+    points = coverage.patches.points
+    for center in points[rng.integers(0, len(points), 60)]:
+        near = np.linalg.norm(points - center, axis=1) < rng.uniform(0.1, 0.5)
+        said = coverage_advice(without(coverage, near, VisibilityStage(int(rng.integers(0, 4)))))
+        assert said[0].isupper()
+        assert said.endswith(".")
+        assert "{" not in said
+        assert "  " not in said

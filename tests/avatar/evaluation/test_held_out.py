@@ -1,0 +1,171 @@
+"""Held-out frames: which they are, what they are compared with, and how they are scored."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from avatar.config import TrainConfig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.evaluation.held_out import (
+    HeldOutFrame,
+    add_held_out,
+    coarse_to_fine_order,
+    composite_on_white,
+    ground_truth_on_white,
+    is_held_out,
+    prepare_stream,
+    score_frame,
+    subsample_evenly,
+)
+from avatar.evaluation.image_metrics import psnr, ssim
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import TrainingFrame
+from capture.camera import Camera
+from capture.frame import Frame
+from preprocess.body.body_pose import BodyPose
+from preprocess.observation import Observation
+from preprocess.observe import DroppedFrame
+
+
+def held_of(total, every=10):
+    return [p for p in range(total) if is_held_out(p, stride=every, total=total)]
+
+
+@pytest.fixture(scope="module")
+def held(rig, clip) -> HeldOutFrame:
+    observation = clip.observations[3]
+    cells = CorrespondenceGrid.solve(rig, observation.pose.joint_rotations)
+    return HeldOutFrame(observation=observation, correspondences=cells)
+
+
+@given(st.integers(20, 500))
+def test_every_tenth_frame_is_held_out_from_the_ninth_on(total):
+    assert held_of(total) == list(range(9, total, 10))
+
+
+@given(st.integers(2, 19))
+def test_of_a_short_clip_it_is_the_last_quarter_and_at_least_one(total):
+    assert held_of(total) == list(range(total - max(1, total // 4), total))
+
+
+def test_a_single_frame_is_trained_on():
+    assert held_of(1) == held_of(0) == []
+
+
+@given(st.integers(0, 10_000))
+def test_a_stream_of_unknown_length_is_held_out_like_a_long_one(position):
+    assert is_held_out(position, stride=10, total=None) == (position % 10 == 9)
+
+
+@given(st.integers(1, 500))
+def test_nothing_is_held_out_if_nobody_wants_it(total):
+    assert held_of(total, every=0) == []
+
+
+def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip):
+    items = [
+        *clip.observations[:5],
+        DroppedFrame(index=5, reason="empty mask"),
+        clip.observations[6],
+    ]
+    ready = list(prepare_stream(iter(items), rig, stride=3, total=None))
+    assert [type(item) for item in ready] == [
+        TrainingFrame, TrainingFrame, HeldOutFrame, TrainingFrame, TrainingFrame, DroppedFrame, TrainingFrame
+    ]  # fmt: skip
+    assert ready[5] is items[5]
+    assert ready[2].observation is items[2]
+    indices = [item.index for item in ready if isinstance(item, TrainingFrame)]
+    assert indices == [0, 1, 3, 4, 6]
+
+
+def observed(rgb, alpha) -> Observation:
+    size = alpha.shape[::-1]
+    camera = Camera(
+        focal_px=(9.0, 9.0), center_px=(1.0, 1.0), size_px=size, camera_from_world=np.eye(4)
+    )
+    frame = Frame(index=0, time_s=0.0, rgb=rgb)
+    return Observation(frame=frame, alpha=alpha, pose=BodyPose.rest(), camera=camera)
+
+
+def test_the_truth_is_the_picture_where_the_person_is_and_white_elsewhere():
+    rgb = np.array([[[255, 51, 0], [10, 20, 30], [0, 102, 204]]], dtype=np.uint8)
+    alpha = np.array([[1.0, 0.0, 0.5]], dtype=np.float32)
+    expected = [[[1.0, 0.2, 0.0], [1.0, 1.0, 1.0], [0.5, 0.7, 0.9]]]
+    np.testing.assert_allclose(ground_truth_on_white(observed(rgb, alpha)), expected, atol=1e-6)
+
+
+def test_a_perfect_rendering_on_white_is_the_truth(rng):
+    rgb = rng.integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    alpha = rng.random((7, 5), dtype=np.float32)
+    color = rgb.astype(np.float32) / 255.0 * alpha[..., None]
+    perfect = np.concatenate([color, alpha[..., None]], axis=-1)
+    np.testing.assert_allclose(
+        composite_on_white(perfect), ground_truth_on_white(observed(rgb, alpha)), atol=1e-6
+    )
+
+
+def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
+    trainer = Trainer(rig, TrainConfig(levels=2, table_size=1 << 10), torch.device("cpu"))
+    trainer.avatar.occupancy.density_grid.occupied.zero_()
+    truth, mask = ground_truth_on_white(held.observation), held.observation.alpha > 0.5
+    white = np.ones_like(truth)
+    got = score_frame(trainer.avatar, held)
+    assert got.frame == held.observation.frame.index
+    assert got.psnr == pytest.approx(psnr(white, truth))
+    assert got.psnr_mask == pytest.approx(psnr(white, truth, mask))
+    assert got.ssim == pytest.approx(ssim(white, truth))
+    assert got.psnr_mask < got.psnr < math.inf
+
+
+@given(count=st.integers(0, 60), most=st.integers(2, 20))
+def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
+    frames = [
+        HeldOutFrame(observation=held.observation, correspondences=held.cells) for _ in range(count)
+    ]
+    chosen = [frames.index(frame) for frame in subsample_evenly(frames, most)]
+    assert len(chosen) == min(count, most)
+    if count > most:
+        gaps = np.diff(chosen)
+        assert (chosen[0], chosen[-1]) == (0, count - 1)
+        assert gaps.min() >= 1
+        assert gaps.max() - gaps.min() <= 1
+    else:
+        assert chosen == list(range(count))
+
+
+def test_every_beginning_of_the_interleaved_order_is_spread_over_the_stream():
+    order = coarse_to_fine_order(list(range(12)))
+    assert sorted(order) == list(range(12))
+    assert order[:2] == [0, 8]
+    assert max(np.diff(sorted([*order[:3], 12]))) <= 4
+
+
+@given(count=st.integers(1, 700), most=st.integers(3, 40))
+@settings(max_examples=15, deadline=None)
+def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count, most):
+    kept, places = [], range(9, 10 * count, 10)
+    for place in places:
+        frame = replace(held.observation.frame, index=place)
+        add_held_out(
+            kept, HeldOutFrame(observation=replace(held.observation, frame=frame)), max_frames=most
+        )
+    indices = [frame.observation.frame.index for frame in kept]
+    assert min(len(places), most // 2) <= len(indices) <= most
+    assert indices[0] == places[0]
+    if len(places) > 1:
+        (gap,) = set(np.diff(indices))
+        assert places[-1] - indices[-1] < gap
+    if len(places) <= most:
+        assert indices == list(places)
+
+
+def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
+    lazy = HeldOutFrame(observation=held.observation)
+    assert score_frame(learnt.trainer.avatar, lazy) == score_frame(
+        learnt.trainer.avatar, lazy.with_correspondences(rig)
+    )

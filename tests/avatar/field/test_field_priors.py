@@ -1,0 +1,130 @@
+"""What a field is asked to be where no ray tells: where following each prior alone ends."""
+
+import math
+
+import pytest
+import torch
+
+from avatar.config import TrainConfig
+from avatar.field import field_priors
+from avatar.field.field_priors import OPACITY_LENGTH_M, OpacityWithSlope
+
+
+def raw_of(*opacities: float) -> torch.Tensor:
+    """Raw numbers of points with these opacities of a centimetre."""
+    raw = torch.zeros(len(opacities), 4)
+    raw[:, 3] = torch.tensor([math.log(-math.log1p(-a) / OPACITY_LENGTH_M) for a in opacities])
+    return raw
+
+
+def followed(raw: torch.Tensor, prior, *, steps: int = 2000) -> list[float]:
+    """Opacities after gradient descent on one prior."""
+    raw = raw.clone()
+    for _ in range(steps):
+        raw -= prior(raw, 1.0)
+    return OpacityWithSlope.of(raw).value.tolist()
+
+
+def test_opacity_is_that_of_one_centimetre():
+    assert OpacityWithSlope.of(raw_of(0.01, 0.5, 0.99)).value.tolist() == pytest.approx(
+        [0.01, 0.5, 0.99]
+    )
+
+
+def test_the_double_well_drives_fog_apart_at_one_half():
+    thin, even, thick = followed(raw_of(0.4, 0.5, 0.6), field_priors.double_well_gradient)
+    assert thin < 0.01
+    assert even == pytest.approx(0.5, abs=1e-3)
+    assert thick > 0.95
+
+
+def test_where_a_body_is_solid_even_nothing_becomes_something():
+    """Opacity's own slope is gone where there is nothing; cross-entropy's is 1."""
+    raw = raw_of(1e-4)
+    assert float(field_priors.interior_gradient(raw, 1.0)[0, 3]) == pytest.approx(-1.0, abs=1e-3)
+    assert -float(field_priors.empty_space_gradient(raw, 1.0)[0, 3]) == pytest.approx(0.0, abs=1e-3)
+    assert followed(raw, field_priors.interior_gradient)[0] > 0.99
+
+
+def test_emptiness_clears_fog():
+    assert followed(raw_of(0.9), field_priors.empty_space_gradient)[0] < 0.01
+
+
+def test_variation_draws_a_pair_together_and_leaves_an_even_one_alone():
+    thin, even, thick, same = followed(
+        raw_of(0.2, 0.5, 0.8, 0.5), field_priors.density_tv_gradient, steps=200
+    )
+    assert thick - thin < 0.1
+    assert even == same == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        field_priors.empty_space_gradient,
+        field_priors.interior_gradient,
+        field_priors.density_tv_gradient,
+        field_priors.double_well_gradient,
+    ],
+)
+def test_no_prior_asks_anything_of_colours_or_of_no_points(prior):
+    raw = torch.randn(10, 4, generator=torch.Generator().manual_seed(0))
+    assert not prior(raw, 1.0)[:, :3].any()
+    assert prior(raw[:0], 1.0).shape == (0, 4)
+
+
+def along_a_line(*logs: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Raw numbers of two points with these log densities, and where they lie, 2 mm apart."""
+    raw, points = torch.zeros(2, 4), torch.zeros(2, 3)
+    raw[:, 3], points[1, 2] = torch.tensor(logs), 0.002
+    return raw, points
+
+
+def test_a_steep_edge_becomes_as_gentle_as_is_asked_and_a_gentle_one_stays():
+    raw, points = along_a_line(5.0, -5.0)
+    for _ in range(2000):
+        raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
+    assert float(raw[0, 3] - raw[1, 3]) == pytest.approx(1.2, abs=0.03)
+    raw, points = along_a_line(3.0, 2.0)
+    assert not field_priors.density_slope_gradient(raw, points, 600.0, 0.01).any()
+
+
+def test_nobody_asks_how_steep_emptiness_is():
+    raw, points = along_a_line(-1.0, -20.0)
+    assert not field_priors.density_slope_gradient(raw, points, 600.0, 1.0).any()
+
+
+def test_needless_density_is_asked_to_fall():
+    raw, points = along_a_line(8.0, 8.0)
+    for _ in range(4000):
+        raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
+    assert raw[:, 3].tolist() == pytest.approx([field_priors.MAX_USEFUL_LOG_DENSITY] * 2, abs=0.01)
+
+
+def test_colours_of_a_visible_pair_become_even_and_nobody_sees_others():
+    raw = torch.tensor([[1.0, 0.0, -1.0, 5.0], [-1.0, 0.0, 1.0, -9.0]])
+    for _ in range(2000):
+        raw -= field_priors.color_tv_gradient(raw, 0.01)
+    assert float((raw[0, :3] - raw[1, :3]).abs().max()) < 0.02
+    assert raw[:, 3].tolist() == [5.0, -9.0]
+    raw[:, 3] = 1.0
+    assert not field_priors.color_tv_gradient(raw, 1.0).any()
+
+
+def test_close_pairs_are_drawn_only_where_something_is_asked_of_them(generator):
+    samples = torch.rand(100, 3, generator=generator)
+    before = generator.get_state()
+    assert len(field_priors.sample_smoothness_pairs(samples, TrainConfig(), generator)) == 0
+    assert torch.equal(generator.get_state(), before)
+    config = TrainConfig(density_slope_weight=0.1, smoothness_pairs=5000)
+    one, other = field_priors.sample_smoothness_pairs(samples, config, generator).chunk(2)
+    assert float((other - one).std()) == pytest.approx(0.5 * config.finest_m, rel=0.03)
+
+
+def test_pairs_lie_about_a_centimetre_apart(generator):
+    config = TrainConfig(density_tv_pairs=5000)
+    samples = torch.rand(100, 3, generator=generator)
+    one, other = field_priors.sample_tv_pairs(samples, config, generator).chunk(2)
+    assert len(one) == config.density_tv_pairs
+    assert float((other - one).std()) == pytest.approx(field_priors.TV_PAIR_SIGMA_M, rel=0.03)
+    assert (one[:, None] == samples).all(dim=2).any(dim=1).all()

@@ -1,0 +1,184 @@
+"""Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten.
+
+Between the legs, off the skin: where few photographs leave webs.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.field.occupancy_grid import (
+    INTERIOR_DEPTH_M,
+    MIN_STEP_OPACITY,
+    OFF_SKIN_M,
+    OccupancyGrid,
+    dilate,
+    find_floaters,
+    inner_leg_cells,
+)
+
+CPU = torch.device("cpu")
+STEP_M = 0.01
+
+
+@pytest.fixture
+def occupancy(rig):
+    return OccupancyGrid(rig, CPU)
+
+
+def shell_at(rig, *, thickness_m):
+    """A log density that is high in a thin sheet across the chest and nothing elsewhere."""
+    middle = float(rig.rest_joints[6, 2]) + 0.05
+
+    def log_density_at(points):
+        return torch.where((points[:, 2] - middle).abs() < thickness_m / 2, 6.0, -20.0)
+
+    return log_density_at, middle
+
+
+def run(occupancy, log_density_at, generator, updates, **kwargs):
+    for _ in range(updates):
+        occupancy.update(log_density_at, share=0.25, step_m=STEP_M, generator=generator, **kwargs)
+
+
+def test_everything_near_the_skin_is_occupied_at_first(rig, occupancy):
+    assert torch.equal(occupancy.grid.occupied.bool(), torch.from_numpy(rig.distance <= 0.08))
+
+
+def test_empty_space_is_given_up(occupancy, generator):
+    run(occupancy, lambda points: torch.full_like(points[:, 0], -20.0), generator, 40)
+    dense = occupancy.grid.density > MIN_STEP_OPACITY / STEP_M
+    assert not dense.any()
+
+
+def test_a_sheet_thinner_than_a_cell_is_never_forgotten(rig, occupancy, generator):
+    """One probe a cell often misses it; an EMA that decays fast lost it (15 dB)."""
+    log_density_at, middle = shell_at(rig, thickness_m=0.005)
+    run(occupancy, log_density_at, generator, 100)
+    cell = int((middle - rig.box_low[2]) * occupancy.grid.cells_per_m[2])
+    sheet = (rig.distance <= 0.08)[:, :, cell]
+    for _ in range(100):
+        run(occupancy, log_density_at, generator, 1)
+        held = occupancy.grid.occupied[:, :, cell].bool().numpy()[sheet]
+        assert held.mean() > 0.99
+
+
+def test_nothing_is_occupied_far_from_the_skin(rig, occupancy, generator):
+    run(occupancy, lambda points: torch.full_like(points[:, 0], 5.0), generator, 30)
+    assert not occupancy.grid.occupied[torch.from_numpy(rig.distance > 0.08)].any()
+
+
+def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
+    log_density_at, _ = shell_at(rig, thickness_m=0.05)
+    run(occupancy, log_density_at, generator, 60)
+    points = occupancy.empty_points(500, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 500
+    assert not occupancy.grid.occupied[tuple(cell.T)].any()
+    assert (rig.distance[tuple(cell.T.numpy())] <= 0.08).all()
+
+
+def test_empty_points_follow_every_change_of_the_occupancy(occupancy, generator):
+    occupied = occupancy.grid.occupied
+    occupied.zero_()
+    assert len(occupancy.empty_points(100, generator)) == 100
+    occupied.fill_(1)
+    assert len(occupancy.empty_points(100, generator)) == 0
+    occupied.view(-1)[occupancy.band[7]] = 0
+    points = occupancy.empty_points(100, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 100
+    assert not occupied[tuple(cell.T)].any()
+    run(occupancy, lambda at: torch.full_like(at[:, 0], 5.0), generator, 60)
+    assert len(occupancy.empty_points(100, generator)) == 0
+
+
+def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, generator):
+    assert len(occupancy.empty_points(100, generator)) == 0
+
+
+def test_haze_counts_as_nothing_where_that_is_asked(occupancy, generator):
+    def haze(at):
+        return torch.full_like(at[:, 0], math.log(30.0))
+
+    run(occupancy, haze, generator, 60, thinnest=20.0)
+    assert occupancy.grid.occupied.view(-1)[occupancy.band].all()
+    run(occupancy, haze, generator, 60, thinnest=40.0)
+    assert not occupancy.grid.occupied.any()
+
+
+def test_growing_adds_the_six_neighbours():
+    one = torch.zeros(5, 5, 5, dtype=torch.uint8)
+    one[2, 2, 2] = 1
+    assert int(dilate(one).sum()) == 7
+    corner = torch.zeros(3, 3, 3, dtype=torch.uint8)
+    corner[0, 0, 0] = 1
+    assert int(dilate(corner).sum()) == 4
+
+
+def test_specks_go_and_pieces_near_the_skin_stay():
+    firm = torch.zeros(40, 40, 40, dtype=torch.bool)
+    firm[:10] = True  # the body
+    firm[20:22, 20:30, 20:30] = True  # a foot without contact: 200 of 16,000 cells, on the skin
+    firm[30:33, 5:15, 5:15] = True  # as large, off the skin
+    firm[15, 35, 35] = True  # a speck
+    near_skin = np.ones(firm.shape, dtype=bool)
+    near_skin[28:] = False
+    gone = find_floaters(firm, near_skin).bool()
+    assert not gone[firm][: 10 * 1600].any()
+    assert not gone[20:22, 20:30, 20:30].any()
+    assert gone[30:33, 5:15, 5:15].all()
+    assert gone[15, 35, 35]
+    assert gone[15, 35, 37]  # and the haze around it
+    assert not gone[12].any()  # but not what is nearer to the body
+
+
+def test_one_piece_has_no_specks():
+    firm = torch.zeros(8, 8, 8, dtype=torch.bool)
+    firm[2:5, 2:5, 2:5] = True
+    assert int(find_floaters(firm, np.ones(firm.shape, dtype=bool)).sum()) == 0
+
+
+def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
+    points = occupancy.solid_points(500, generator)
+    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(points) == 500
+    assert rig.inside[tuple(cell.T.numpy())].all()
+    assert (rig.distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()
+
+
+def cell_at(rig, point):
+    cells = np.array(rig.distance.shape)
+    place = ((point - rig.box_low) / (rig.box_high - rig.box_low) * cells).astype(int)
+    return int(np.ravel_multi_index(place, rig.distance.shape))
+
+
+def knees(rig):
+    """Where they are in canonical space."""
+    return [rig.seeds[rig.seed_weights.argmax(axis=1) == joint].mean(axis=0) for joint in (4, 5)]
+
+
+def test_the_middle_of_the_knees_is_between_legs_and_what_is_before_or_beside_them_is_not(rig):
+    left, right = knees(rig)
+    middle = 0.5 * (left + right)
+    ahead, beside = left + np.array([0.0, 0.0, 0.14]), left + (left - right) * 0.7
+    cells = np.array([cell_at(rig, point) for point in (middle, ahead, beside)])
+    np.testing.assert_array_equal(inner_leg_cells(rig, cells), [True, False, False])
+
+
+def test_nothing_near_the_skin_or_under_it_is_between_legs(rig):
+    cells = np.flatnonzero(rig.distance <= 0.08)
+    found = cells[inner_leg_cells(rig, cells)]
+    assert 0.01 * len(cells) < len(found) < 0.2 * len(cells)
+    assert rig.distance.reshape(-1)[found].min() > OFF_SKIN_M
+    assert not rig.inside.reshape(-1)[found].any()
+
+
+def test_points_are_drawn_between_the_legs(rig, generator):
+    occupancy = OccupancyGrid(rig, torch.device("cpu"))
+    points = occupancy.sample_inner_leg(200, generator).numpy()
+    cells = np.array([cell_at(rig, point) for point in points])
+    assert len(points) == 200
+    assert inner_leg_cells(rig, cells).all()

@@ -1,0 +1,94 @@
+"""A pose's step: it goes where the rays agree, and nowhere where they do not."""
+
+import numpy as np
+import pytest
+
+from avatar.pose.gauss_newton import (
+    FULL_EVIDENCE,
+    MIN_EVIDENCE,
+    OVERRELAXATION,
+    PRIOR_SIGMA_M,
+    PRIOR_SIGMA_RAD,
+    gauss_newton_step,
+)
+from avatar.pose.temporal_prior import PosePrior
+
+NONE = np.zeros((25, 3))
+SCALE = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)[:, None]
+
+
+@pytest.fixture
+def slopes(rng):
+    """What each of 600 rays' residual does for one spread of each of the 75 numbers."""
+    return rng.normal(size=(600, 25, 3)) / SCALE
+
+
+def rays_of(slopes, off):
+    """Gradients and losses of rays whose residuals are linear, in a pose that is off."""
+    residual = np.einsum("rja,ja->r", slopes, off)
+    gradients = residual[:, None, None] * slopes
+    return gradients.astype(np.float32), (0.5 * residual**2).astype(np.float32)
+
+
+def test_the_step_solves_what_is_linear_and_goes_as_much_farther_as_it_says(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    step = gauss_newton_step(*rays_of(slopes, off), NONE, 1.0)
+    assert step.evidence > FULL_EVIDENCE
+    np.testing.assert_allclose(step.change / SCALE, -OVERRELAXATION * off / SCALE, atol=0.05)
+
+
+def test_rays_that_pull_by_chance_move_nothing(slopes, rng):
+    gradients, loss = rays_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)
+    signs = rng.choice([-1.0, 1.0], size=(len(loss), 1, 1)).astype(np.float32)
+    step = gauss_newton_step(gradients * signs, loss, NONE, 1.0)
+    assert step.evidence == pytest.approx(1.0, abs=0.4)
+    assert not step.change.any()
+
+
+def test_what_no_ray_feels_goes_back_to_where_it_was_given(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    slopes[:, 7] = 0.0
+    off[7] = 0.0
+    correction = np.zeros((25, 3))
+    correction[7] = 0.02
+    step = gauss_newton_step(*rays_of(slopes, off), correction, 1.0)
+    np.testing.assert_allclose(step.change[7], -correction[7], rtol=1e-3)
+
+
+def test_what_no_ray_feels_goes_to_where_it_is_expected(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    slopes[:, 7] = 0.0
+    off[7] = 0.0
+    mean = np.zeros((25, 3))
+    mean[7] = 0.02
+    told = PosePrior(mean, 5.0)
+    step = gauss_newton_step(*rays_of(slopes, off), NONE, 1.0, prior=told)
+    np.testing.assert_allclose(step.change[7], 0.02, rtol=1e-3)
+    assert np.linalg.norm(np.delete(step.change, 7, axis=0)) > 0.1
+
+
+def test_what_rays_alone_ask_for_is_where_they_end_whatever_is_expected(slopes, rng):
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    correction = rng.normal(size=(25, 3)) * SCALE * 0.1
+    told = PosePrior(rng.normal(size=(25, 3)) * SCALE, 13.0)
+    one = gauss_newton_step(*rays_of(slopes, off + correction), correction, 1.0)
+    other = gauss_newton_step(*rays_of(slopes, off + correction), correction, 1.0, prior=told)
+    np.testing.assert_array_equal(one.unregularized, other.unregularized)
+    np.testing.assert_allclose(one.unregularized, -off / SCALE, atol=0.05)
+
+
+def test_rays_that_feel_nothing_ask_for_nothing():
+    step = gauss_newton_step(np.zeros((9, 25, 3), np.float32), np.zeros(9, np.float32), NONE, 1.0)
+    assert step.evidence == 0.0
+    assert not step.change.any()
+
+
+def test_evidence_that_would_not_move_a_pose_moves_it_where_other_frames_are_off(slopes, rng):
+    gradients, loss = rays_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)
+    signs = rng.choice([-1.0, 1.0], size=(len(loss), 1, 1), p=[0.3, 0.7]).astype(np.float32)
+    alone, among = (
+        gauss_newton_step(gradients * signs, loss, NONE, common) for common in (1.0, 3.0)
+    )
+    assert alone.evidence == among.evidence < 2.0 * MIN_EVIDENCE - 1.0
+    assert not alone.change.any()
+    assert among.change.any()

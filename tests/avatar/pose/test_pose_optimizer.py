@@ -1,0 +1,306 @@
+"""Pose refinement: kernels, the implicit gradient, cells that follow, and poses that come back."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from avatar.config import TrainConfig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.kernels import torch_skinning
+from avatar.kernels.backend_protocol import CorrespondenceTables, RaySamples
+from avatar.kernels.hash_levels import FEATURES_PER_LEVEL
+from avatar.kernels.torch_backend import TorchBackend
+from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.pose.pose_optimizer import (
+    FIRST_CORRECTION_STEPS,
+    FREEZE_AFTER_STEPS,
+    MIN_ESTIMATES_BEFORE_FREEZE,
+    MIN_STEPS_BEFORE_FREEZE,
+    PoseOptimizer,
+)
+from avatar.render import correspondence_tables
+from avatar.training import checkpoint
+from avatar.training.held_out_pose_fitting import score_with_fitted_poses
+from avatar.training.trainer import Trainer
+from avatar.training.training_step import cosine_decay
+from preprocess.body.body_pose import BodyPose
+
+TORCH, NUMBA = TorchBackend(), NumbaBackend()
+CPU = torch.device("cpu")
+
+
+def pose_of(rotations, root=(0.1, 0.7, -0.2), place=(0.2, 0.1, -0.3)) -> BodyPose:
+    return BodyPose(
+        root_rotation=np.array(root),
+        root_translation=np.array(place),
+        joint_rotations=np.asarray(rotations),
+    )
+
+
+@pytest.fixture
+def table(rig, bent_pose) -> PoseOptimizer:
+    table = PoseOptimizer(rig, 2, CPU)
+    table.set_pose(0, pose_of(np.zeros((23, 3))))
+    table.set_pose(1, pose_of(bent_pose))
+    return table
+
+
+def copied(cells: CorrespondenceTables) -> CorrespondenceTables:
+    return cells._replace(roots=cells.roots.clone())
+
+
+def samples_near_the_skin(rig, count, generator):
+    """Canonical samples of one ray of slot 1, each warped with a root of its own."""
+    chosen = torch.randint(len(rig.seeds), (count,), generator=generator)
+    points = torch.from_numpy(rig.seeds)[chosen]
+    points = points + torch.randn(count, 3, generator=generator) * 0.01
+    counts = torch.tensor([count], dtype=torch.int32)
+    rows = torch.arange(count, dtype=torch.int32)
+    return RaySamples(points, torch.zeros(1, dtype=torch.int64), counts, rows)
+
+
+def jacobians(table, points, slot):
+    """Inverse Jacobians of skinning at the points, by autograd."""
+    leaf = points.clone().requires_grad_()
+    posed = torch_skinning.skin_points(leaf, *table.skin, table.bones[slot])
+    rows = [torch.autograd.grad(posed[:, k].sum(), leaf, retain_graph=True)[0] for k in range(3)]
+    return torch.linalg.inv(torch.stack(rows, dim=1))
+
+
+def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, generator):
+    table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
+    extent = torch.from_numpy((levels.counts[0] - 1) / levels.cells_per_m[0]).float()
+    points = torch.from_numpy(levels.low) + torch.rand(500, 3, generator=generator) * extent
+    slope = torch.randn(500, levels.width, generator=generator)
+    torch.testing.assert_close(
+        NUMBA.encode_points_backward(points, slope, table, levels),
+        TORCH.encode_points_backward(points, slope, table, levels),
+        atol=1e-2, rtol=1e-4,
+    )  # fmt: skip
+
+
+def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
+    samples = samples_near_the_skin(rig, 400, generator)
+    pull = torch.randn(400, 3, generator=generator)
+    roots = torch.zeros(2, 400, 12)
+    roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
+    cells = CorrespondenceTables(
+        torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
+    )
+    samples = samples._replace(
+        offsets=torch.tensor([0, 150, 150]), counts=torch.tensor([150, 0, 250], dtype=torch.int32)
+    )
+    slots = torch.ones(3, dtype=torch.int32)
+    results = [
+        backend.bone_wrenches(samples, pull, slots, cells, table.skin, table.bones)
+        for backend in (NUMBA, TORCH)
+    ]
+    assert float(results[0][1].abs().max()) == 0.0
+    torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
+
+
+def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
+    cells = correspondence_tables(CorrespondenceGrid.solve(rig, bent_pose), CPU)
+    moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
+    bones = torch.from_numpy(moved.astype(np.float32))
+    ours, theirs = copied(cells), copied(cells)
+    NUMBA.update_roots(ours, 0, table.skin, bones)
+    TORCH.update_roots(theirs, 0, table.skin, bones)
+    off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
+    assert float((off < 1e-2).float().mean()) > 0.99
+    assert not torch.equal(ours.roots, cells.roots)
+
+
+def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, table, bent_pose):
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
+    turned = (
+        Rotation.from_rotvec(bent_pose) * Rotation.from_rotvec(np.full((23, 3), 0.006))
+    ).as_rotvec()
+    tables = correspondence_tables(cells, CPU)
+    bones = torch.from_numpy(
+        rig.body_from_canonical(turned)[:, :3].reshape(24, 12).astype(np.float32)
+    )
+    before = residual(rig, table, cells, tables.roots[0], bones)
+    for _ in range(2):
+        NUMBA.update_roots(tables, 0, table.skin, bones)
+    after = residual(rig, table, cells, tables.roots[0], bones)
+    assert np.median(before) > 3e-3
+    assert np.quantile(after, 0.95) < 5e-4
+
+
+def residual(rig, table, cells, roots, bones):
+    """How far each root, skinned, is from its cell's centre."""
+    place = np.argwhere(cells.index > 0)
+    rows = cells.index[tuple(place.T)] >> 3
+    posed = torch_skinning.skin_points(roots[rows, :3], *table.skin, bones).numpy()
+    return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
+
+
+def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table, generator):
+    """Against differences: move one number of the correction, find the roots again."""
+    samples = samples_near_the_skin(rig, 300, generator)
+    pull = torch.randn(300, 3, generator=generator)
+    roots = torch.zeros(2, 300, 12)
+    roots[1, :, 3:] = jacobians(table, samples.points, 1).flatten(1)
+    cells = CorrespondenceTables(
+        torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
+    )
+    slots = torch.ones(1, dtype=torch.int32)
+    wrenches = NUMBA.bone_wrenches(samples, pull, slots, cells, table.skin, table.bones)
+    table.feel(slots.long(), wrenches, torch.ones(1))
+    (gradient,) = table.gradients(1)
+    given = torch_skinning.skin_points(samples.points, *table.skin, table.bones[1]).double().numpy()
+
+    def pulled(joint: int, axis: int, size: float) -> float:
+        table.corrections[1, joint, axis] = size
+        table._move(1)
+        root = table.root(1)
+        target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
+        x = samples.points.clone()
+        for _ in range(8):
+            off = torch.from_numpy(target).float() - torch_skinning.skin_points(
+                x, *table.skin, table.bones[1]
+            )
+            x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
+        table.corrections[1, joint, axis] = 0.0
+        table._move(1)
+        return float((x.double() * pull.double()).sum())
+
+    for joint in (0, 1, 4, 9, 16, 18, 24):
+        for axis in range(3):
+            measured = (pulled(joint, axis, 2e-3) - pulled(joint, axis, -2e-3)) / 4e-3
+            scale = float(np.abs(gradient[joint]).max()) + 0.1
+            assert gradient[joint, axis] == pytest.approx(measured, abs=0.08 * scale), joint
+
+
+@pytest.fixture(scope="module")
+def jittered(clip):
+    """The clip with poses as a poor tracker gives them, but for every sixth frame."""
+    rng = np.random.default_rng(0)
+
+    def shaken(pose: BodyPose) -> BodyPose:
+        def noise(shape, size):
+            return rng.normal(size=shape) * size
+
+        return BodyPose(
+            root_rotation=pose.root_rotation + noise(3, 0.03),
+            root_translation=pose.root_translation + noise(3, 0.02),
+            joint_rotations=pose.joint_rotations + noise((23, 3), 0.05),
+        )
+
+    return [
+        dataclasses.replace(o, pose=o.pose if o.frame.index % 6 == 5 else shaken(o.pose))
+        for o in clip.observations
+    ]
+
+
+@pytest.mark.slow
+def test_refining_poses_makes_up_for_a_trackers_jitter(rig, clip, jittered):
+    """Scored in true poses: the canonical body itself must have become sharper."""
+    config = TrainConfig(rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14)
+    frames = list(prepare_stream(iter(jittered), rig, stride=6, total=None))
+    held = [frame for frame in frames if isinstance(frame, HeldOutFrame)]
+    reached = {}
+    for refine_poses in (False, True):
+        trainer = Trainer(rig, dataclasses.replace(config, refine_poses=refine_poses), CPU)
+        for frame in frames:
+            if not isinstance(frame, HeldOutFrame):
+                trainer.add_frame(frame)
+        for step in range(600):
+            trainer.step(rate=cosine_decay(step / 600), hard_surface_share=1.0)
+        scores = [score_frame(trainer.avatar, frame) for frame in held]
+        reached[refine_poses] = np.mean([s.psnr_mask for s in scores])
+    assert reached[True] > reached[False] + 2.0
+
+
+def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_off(learnt, clip):
+    pose = clip.observations[11].pose
+    off = dataclasses.replace(pose, root_translation=pose.root_translation + np.array([0.03, 0, 0]))
+    observation = dataclasses.replace(clip.observations[11], pose=off)
+    cells = CorrespondenceGrid.solve(learnt.trainer.avatar.rig, off.joint_rotations)
+    held = HeldOutFrame(observation=observation, correspondences=cells)
+    table = learnt.trainer.avatar.field.table.detach().clone()
+    (fitted,) = score_with_fitted_poses(learnt.trainer, [held])
+    assert fitted.psnr_mask > score_frame(learnt.trainer.avatar, held).psnr_mask + 2.0
+    assert torch.equal(table, learnt.trainer.avatar.field.table)
+
+
+def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
+    held = [HeldOutFrame(observation=observation) for observation in clip.observations[9:12]]
+    given = [score_frame(learnt.trainer.avatar, frame).psnr for frame in held]
+    fitted = [frame.psnr for frame in score_with_fitted_poses(learnt.trainer, held)]
+    assert all(after >= before for before, after in zip(given, fitted, strict=True))
+
+
+def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator):
+    """Its rays pull no more; those of a frame that came later do."""
+    table, pose = PoseOptimizer(rig, 2, torch.device("cpu")), pose_of(bent_pose)
+    table.set_pose(0, pose, step=0)
+    table.set_pose(1, pose, step=1000)
+    slots = torch.arange(2).repeat_interleave(300)
+    wrenches, loss = torch.randn(600, 24, 6, generator=generator), torch.full((600,), 0.1)
+
+    def corrected(step):
+        if table.freeze_converged(step):
+            table.accumulate(slots, wrenches + 3.0, loss)
+        return {table.correct_next(rate=1.0) for _ in range(2)} - {None}
+
+    assert corrected(FREEZE_AFTER_STEPS - 1) == {0, 1}
+    assert corrected(FREEZE_AFTER_STEPS) == {1}
+    assert corrected(FREEZE_AFTER_STEPS + 1000) == set()
+
+
+def test_a_frame_that_has_just_come_is_not_corrected_yet(rig, bent_pose, generator):
+    """The field does not know yet what is seen from there, and all of its rays pull one way."""
+    table = PoseOptimizer(rig, 2, CPU)
+    table.set_pose(0, pose_of(bent_pose), step=500)
+    wrenches, loss = torch.randn(300, 24, 6, generator=generator) + 3.0, torch.full((300,), 0.1)
+
+    def corrected(step):
+        open_now = table.freeze_converged(step)
+        table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches, loss)
+        slot = table.correct_next(rate=1.0)
+        assert open_now == (slot is not None)
+        return slot
+
+    assert corrected(500 + FIRST_CORRECTION_STEPS - 1) is None
+    assert corrected(500 + FIRST_CORRECTION_STEPS) == 0
+
+
+def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, generator):
+    """Chance is not believed again later; the frame whose rays all pull one way stays open."""
+    table, pose = PoseOptimizer(rig, 2, CPU), pose_of(bent_pose)
+    table.set_pose(0, pose)
+    table.set_pose(1, pose)
+    loss, later = torch.full((300,), 0.1), MIN_STEPS_BEFORE_FREEZE
+
+    def pulled(step, slot, bias):
+        table.freeze_converged(step)
+        wrenches = torch.randn(300, 24, 6, generator=generator) + bias
+        table.accumulate(torch.full((300,), slot), wrenches, loss)
+        return table.correct_next(rate=1.0) is not None
+
+    for step in range(60, 120):  # too early to judge; so long it takes until all together agree
+        pulled(step, 0, 0.0)
+    for step in range(later, later + MIN_ESTIMATES_BEFORE_FREEZE):
+        pulled(step, 0, 0.0)
+    assert not pulled(later + MIN_ESTIMATES_BEFORE_FREEZE, 0, 3.0)
+    assert any(pulled(later + MIN_ESTIMATES_BEFORE_FREEZE + k, 1, 3.0) for k in range(5))
+
+
+def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
+    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=3, finest_m=0.05), CPU)
+    frame = next(prepare_stream(iter(clip.observations), rig, stride=0, total=None))
+    correction = np.full((25, 3), 0.02)
+    trainer.pose_corrections[frame.index] = correction
+    checkpoint.save(trainer, tmp_path)
+    again, _ = checkpoint.load(tmp_path, CPU)
+    again.add_frame(frame, is_restored=True)
+    assert again.frames_seen == 0
+    np.testing.assert_allclose(again.poses.corrections[0], correction)
+    moved = again.poses.pose(0).root_translation - frame.pose.root_translation
+    assert np.linalg.norm(moved) == pytest.approx(0.02 * np.sqrt(3))

@@ -1,0 +1,82 @@
+"""Neighbours tell of a pose's error what a wandering tracker lets them, and else nothing."""
+
+import numpy as np
+import pytest
+
+from avatar.pose.temporal_prior import (
+    MAX_FRAME_GAP,
+    MIN_NEIGHBOR_PAIRS,
+    NEIGHBOR_PRECISION,
+    UNINFORMATIVE_PRIOR,
+    TemporalPosePrior,
+    interpolate_correction,
+    neighbor_correlation,
+    prior_from_neighbors,
+)
+
+
+def errors_of(rng, frames, *, alike):
+    """An autoregressive process of unit variance, of this correlation from frame to frame."""
+    errors = [rng.normal(size=(25, 3))]
+    for _ in range(frames - 1):
+        errors.append(alike * errors[-1] + np.sqrt(1.0 - alike**2) * rng.normal(size=(25, 3)))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.5, 0.9])
+def test_the_correlation_of_a_process_is_found_in_any_order_of_its_frames(rng, alike):
+    errors, order = errors_of(rng, 100, alike=alike), rng.permutation(100)
+    assert neighbor_correlation(order, errors[order]) == pytest.approx(alike, abs=0.06)
+
+
+def test_too_few_neighbours_tell_nothing(rng):
+    errors = errors_of(rng, MIN_NEIGHBOR_PAIRS + 1, alike=0.99)
+    numbers = np.arange(MIN_NEIGHBOR_PAIRS + 1)
+    assert neighbor_correlation(numbers, errors) > 0.8
+    assert neighbor_correlation(numbers[1:], errors[1:]) == 0.0
+    assert neighbor_correlation((MAX_FRAME_GAP + 1) * numbers, errors) == 0.0
+
+
+def test_a_frame_is_expected_to_err_as_those_around_it_do_the_nearest_most(rng):
+    errors = errors_of(rng, 40, alike=0.95)
+    frames = np.delete(np.arange(41), 20)
+    told = prior_from_neighbors(20, frames, errors, 0.95)
+    distances = np.abs(frames - 20)
+    weights = np.where(distances <= MAX_FRAME_GAP, 1.0 / distances, 0.0)
+    mean = (
+        NEIGHBOR_PRECISION
+        / (1.0 + NEIGHBOR_PRECISION)
+        * np.average(errors, axis=0, weights=weights)
+    )
+    assert told.precision == 1.0 + NEIGHBOR_PRECISION
+    np.testing.assert_allclose(told.mean, mean)
+    np.testing.assert_allclose(
+        interpolate_correction(20, dict(zip(frames.tolist(), errors, strict=True))), mean
+    )
+
+
+def test_the_error_of_a_frame_in_between_is_guessed_where_errors_wander(rng):
+    errors = errors_of(rng, 60, alike=0.97)
+    known = {frame: error for frame, error in enumerate(errors) if frame % 10}
+    missed = [errors[frame] - interpolate_correction(frame, known) for frame in range(10, 60, 10)]
+    assert np.mean(np.square(missed)) < 0.3 * np.mean(np.square(errors[10::10]))
+
+
+def test_a_slot_is_asked_of_by_its_neighbours_and_does_not_tell_of_itself(rng):
+    errors, neighbours = errors_of(rng, 40, alike=0.95), TemporalPosePrior(40)
+    for slot in range(40):
+        neighbours.set_frame(slot, slot)
+        neighbours.record_estimate(slot, errors[slot])
+    before = neighbours.prior_for(20, errors)
+    assert before.precision == 1.0 + NEIGHBOR_PRECISION
+    errors[20] += 100.0
+    np.testing.assert_array_equal(neighbours.prior_for(20, errors).mean, before.mean)
+    neighbours.set_frame(20, None)
+    assert neighbours.prior_for(20, errors) is UNINFORMATIVE_PRIOR
+
+
+def test_neighbours_say_nothing_where_errors_flicker_or_nobody_is_near(rng):
+    flickering, wandering = (errors_of(rng, 40, alike=alike) for alike in (0.0, 0.95))
+    assert not interpolate_correction(20, dict(enumerate(flickering))).any()
+    assert not interpolate_correction(60, dict(enumerate(wandering))).any()
+    assert not interpolate_correction(20, {}).any()

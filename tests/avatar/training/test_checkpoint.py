@@ -1,0 +1,235 @@
+"""Checkpoints: what is read is what was written, whole or not at all, and never code."""
+
+import dataclasses
+import errno
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.config import TrainConfig
+from avatar.deformation.rig import Rig
+from avatar.render import render
+from avatar.training import checkpoint
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import prepare_frame
+from capture.input_error import InputError
+
+CPU = torch.device("cpu")
+CONFIG = TrainConfig(
+    rays=128,
+    sample_step_m=0.03,
+    finest_m=0.05,
+    levels=3,
+    table_size=1 << 12,
+    empty_space_points=32,
+    seed=7,
+)
+
+
+@pytest.fixture(scope="module")
+def frames(rig, clip):
+    return [prepare_frame(observation, rig) for observation in clip.observations[:3]]
+
+
+@pytest.fixture
+def trainer(rig, frames) -> Trainer:
+    trainer = Trainer(rig, CONFIG, CPU)
+    for frame in frames:
+        trainer.add_frame(frame)
+    for _ in range(20):
+        trainer.step(rate=1.0, hard_surface_share=0.5)
+    trainer.wall_seconds, trainer.cpu_seconds = 12.5, 11.75
+    return trainer
+
+
+@pytest.fixture
+def saved(trainer, tmp_path) -> Path:
+    return checkpoint.save(trainer, tmp_path / "checkpoint")
+
+
+def damaged(path: Path, change) -> Path:
+    """Rewrites a checkpoint after a change to its content; returns its folder."""
+    state = torch.load(path, weights_only=True)
+    change(state)
+    torch.save(state, path)
+    return path.parent
+
+
+def numbers(trainer):
+    """Everything that training has changed."""
+    grid = trainer.avatar.occupancy.grid
+    moments = [t for state in trainer.optimizer.state_dict()["state"].values() for t in
+               (state["exp_avg"], state["exp_avg_sq"], state["step"])]  # fmt: skip
+    fields = [*trainer.field.parameters(), *trainer.avatar.field.parameters()]
+    return [*fields, grid.density, grid.occupied, *moments]
+
+
+def test_what_is_read_is_what_was_written_to_the_last_bit(trainer, tmp_path):
+    notes = {"video": "a.mp4", "curve": [{"psnr": 31.5}, {"psnr": None}], "held": [9, 19]}
+    folder = tmp_path / "run" / "checkpoint"
+    path = checkpoint.save(trainer, folder, notes=notes)
+    again, read = checkpoint.load(folder, CPU)
+    assert list(folder.iterdir()) == [path]
+    assert read == notes
+    assert again.config == trainer.config
+    for name in checkpoint.COUNTERS:
+        assert getattr(again, name) == getattr(trainer, name) != 0
+    for ours, theirs in zip(numbers(again), numbers(trainer), strict=True):
+        assert torch.equal(ours, theirs)
+    for item in dataclasses.fields(Rig):
+        ours, theirs = getattr(again.avatar.rig, item.name), getattr(trainer.avatar.rig, item.name)
+        np.testing.assert_array_equal(ours, theirs)
+        assert ours.dtype == theirs.dtype
+
+
+def test_the_avatar_looks_the_same_afterwards(trainer, clip, saved):
+    seen = clip.novel
+    again, _ = checkpoint.load(saved.parent, CPU)
+    before = render(trainer.avatar, seen.pose, seen.camera)
+    np.testing.assert_array_equal(render(again.avatar, seen.pose, seen.camera), before)
+
+
+def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
+    again, fresh = checkpoint.load(saved.parent, CPU)[0], Trainer(rig, CONFIG, CPU)
+    losses = []
+    for learner in (again, fresh):
+        for frame in frames:
+            learner.replay.add(frame)
+        taken = [learner.step(rate=1.0, hard_surface_share=0.5) for _ in range(5)]
+        losses.append(np.mean([float(result.loss.mean()) for result in taken]))
+    assert losses[0] < 0.5 * losses[1]
+    assert (again.steps, again.rays) == (25, 25 * CONFIG.rays)
+    assert again.frames_seen == 3
+
+
+def test_a_second_checkpoint_replaces_the_first(trainer, saved):
+    trainer.step(rate=1.0, hard_share=0.5)
+    checkpoint.save(trainer, saved.parent)
+    assert checkpoint.load(saved.parent, CPU)[0].steps == 21
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_a_write_that_fails_half_way_leaves_the_old_one(trainer, saved, monkeypatch):
+    before = saved.read_bytes()
+
+    def full_disk(state, file):
+        file.write(before[: len(before) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="No space") as caught:
+        checkpoint.save(trainer, saved.parent)
+    assert caught.value.errno == errno.ENOSPC
+    assert list(saved.parent.iterdir()) == [saved]
+    assert saved.read_bytes() == before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
+def test_a_disk_that_really_is_full_is_called_so(trainer, saved, monkeypatch):
+    before, save = saved.read_bytes(), torch.save
+
+    def on_a_full_disk(state, file):
+        with open("/dev/full", "wb") as full:
+            save(state, full)
+
+    monkeypatch.setattr(torch, "save", on_a_full_disk)
+    with pytest.raises(OSError, match="No space") as caught:
+        checkpoint.save(trainer, saved.parent)
+    assert caught.value.errno == errno.ENOSPC
+    assert list(saved.parent.iterdir()) == [saved]
+    assert saved.read_bytes() == before
+
+
+def test_a_first_checkpoint_that_fails_leaves_nothing(trainer, tmp_path, monkeypatch):
+    def interrupted(state, file):
+        file.write(b"PK")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint.save(trainer, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_a_checkpoint_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match="checkpoint"):
+        checkpoint.load(tmp_path / "checkpoint", CPU)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
+def test_a_file_that_was_cut_off_is_refused_by_name(saved, share):
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(InputError, match=str(saved)):
+        checkpoint.load(saved.parent, CPU)
+
+
+@pytest.mark.parametrize("content", [b"hello, I am no checkpoint", b"\x80\x02garbage", bytes(999)])
+def test_a_file_of_something_else_is_refused_by_name(saved, content):
+    saved.write_bytes(content)
+    with pytest.raises(InputError, match=str(saved)):
+        checkpoint.load(saved.parent, CPU)
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.mark.parametrize("write", [torch.save, lambda trap, path: path.write_bytes(trap)])
+def test_code_in_a_checkpoint_is_refused_and_not_executed(saved, tmp_path, write):
+    mark = tmp_path / "executed"
+    trap = Trap(mark)
+    write(trap if write is torch.save else pickle.dumps(trap, protocol=2), saved)
+    with pytest.raises(InputError, match=rf"{saved} holds something other than numbers"):
+        checkpoint.load(saved.parent, CPU)
+    assert not mark.exists()
+    pickle.loads(pickle.dumps(trap))  # the trap works
+    assert mark.exists()
+
+
+def test_a_checkpoint_of_another_format_says_which(saved):
+    folder = damaged(saved, lambda state: state.update(format=checkpoint.CHECKPOINT_FORMAT + 1))
+    with pytest.raises(
+        InputError, match=rf"format {checkpoint.CHECKPOINT_FORMAT + 1}.*--overwrite"
+    ):
+        checkpoint.load(folder, CPU)
+
+
+@pytest.mark.parametrize(
+    "key", ["format", "config", "rig", "field", "optimizer", "density", "occupied", "counts"]
+)
+@pytest.mark.parametrize("change", ["missing", "nothing", "too little"])
+def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change):
+    def lose(state):
+        if change == "missing":
+            del state[key]
+        elif change == "nothing":
+            state[key] = None
+        else:
+            state[key] = {} if isinstance(state[key], dict) else []
+
+    with pytest.raises(InputError, match=str(saved)):
+        checkpoint.load(damaged(saved, lose), CPU)
+
+
+def test_a_checkpoint_from_before_there_was_a_mean_shows_what_was_learnt(saved, trainer):
+    again, _ = checkpoint.load(damaged(saved, lambda state: state.pop("mean")), CPU)
+    shown = zip(again.avatar.field.parameters(), trainer.field.parameters(), strict=True)
+    assert all(torch.equal(ours, theirs) for ours, theirs in shown)
+
+
+def test_a_checkpoint_from_before_anything_was_inside_knows_of_nothing_solid(saved, trainer):
+    again, _ = checkpoint.load(damaged(saved, lambda state: state["rig"].pop("inside")), CPU)
+    assert not again.avatar.rig.inside_skin.any()
+    assert again.avatar.rig.inside_skin.shape == trainer.avatar.rig.inside.shape
+    assert len(again.avatar.occupancy.sample_interior(10, torch.Generator())) == 0

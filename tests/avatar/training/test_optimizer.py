@@ -1,0 +1,123 @@
+"""The running mean of the field: how far it reaches back, and what it is worth while it streams.
+
+Our Adam takes torch's own steps, and loads no compiler for them.
+"""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.backends import backend_for
+from avatar.config import TrainConfig
+from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.field.radiance_field import RadianceField
+from avatar.training import optimizer
+from avatar.training.optimizer import EMA_HORIZON_STEPS, EMA_INTERVAL, UncompiledAdam, update_ema
+from avatar.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def field(levels) -> RadianceField:
+    return RadianceField(levels, backend_for(CPU), CPU, torch.Generator().manual_seed(3))
+
+
+def filled(field, value) -> RadianceField:
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.fill_(value)
+    return field
+
+
+def test_a_copy_has_the_same_numbers_and_none_in_common(field):
+    copied = field.copied()
+    for ours, theirs in zip(copied.parameters(), field.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+        assert ours.data_ptr() != theirs.data_ptr()
+        assert ours.grad.data_ptr() != theirs.grad.data_ptr()
+
+
+def test_the_first_steps_are_followed_at_once(field):
+    mean = filled(field.copied(), 0.0)
+    for steps in range(1, EMA_INTERVAL + 1):
+        update_ema(mean, filled(field, float(steps)), steps)
+        assert all((p == steps).all() for p in mean.parameters())
+
+
+def test_later_it_is_the_exponential_mean_over_the_horizon(field):
+    mean, late = filled(field.copied(), 0.0), EMA_INTERVAL * 1000
+    filled(field, 1.0)
+    for steps in range(late, late + EMA_INTERVAL * 20):
+        update_ema(mean, field, steps)
+    expected = 1.0 - (1.0 - EMA_INTERVAL / EMA_HORIZON_STEPS) ** 20
+    for parameter in mean.parameters():
+        torch.testing.assert_close(parameter, torch.full_like(parameter, expected))
+
+
+@pytest.mark.slow
+def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_last_step(rig, clip):
+    config = TrainConfig(
+        rays=512,
+        sample_step_m=0.015,
+        finest_m=0.03,
+        levels=6,
+        table_size=1 << 14,
+        refine_poses=False,
+    )
+    trainer, held = Trainer(rig, config, CPU), []
+    for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
+        if isinstance(item, HeldOutFrame):
+            held.append(item)
+        else:
+            trainer.add_frame(item)
+    for _ in range(50 * optimizer.EMA_INTERVAL):
+        trainer.step(rate=1.0, hard_surface_share=1.0)
+    last = dataclasses.replace(trainer.avatar, field=trainer.field)
+    mean, swinging = (
+        np.mean([score_frame(avatar, frame).psnr for frame in held])
+        for avatar in (trainer.avatar, last)
+    )
+    assert mean > swinging + 0.3
+
+
+WITHOUT_COMPILER = """
+import sys, torch
+from avatar.training.optimizer import UncompiledAdam
+numbers = torch.nn.Parameter(torch.zeros(3))
+numbers.grad = torch.ones(3)
+UncompiledAdam([numbers], fused=True).step()
+assert numbers.max() < 0
+print("torch._dynamo" in sys.modules)
+"""
+
+
+def test_its_steps_are_those_of_torch():
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(50, 4, generator=generator)
+    ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
+    pair = [
+        (numbers, kind([{"params": [numbers], "lr": 0.01}], betas=(0.9, 0.99), fused=True))
+        for numbers, kind in ((ours, UncompiledAdam), (theirs, torch.optim.Adam))
+    ]
+    for _ in range(5):
+        grad = torch.randn(50, 4, generator=generator)
+        for numbers, adam in pair:
+            numbers.grad = grad.clone()
+            adam.step()
+    assert torch.equal(ours, theirs)
+    assert not torch.equal(ours, start)
+
+
+def test_a_first_step_loads_no_compiler():
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_COMPILER],
+        cwd=root, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,190 @@
+"""Replay: the rays are those of the video, and the frames that stay are worth keeping."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from avatar.training.replay_buffer import NEAR_PERSON_RAY_SHARE, ReplayBuffer
+from avatar.training.training_frame import prepare_frame
+from preprocess.body.body_pose import BodyPose
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def frames(rig, clip):
+    """Four prepared frames, from four sides."""
+    return [prepare_frame(clip.observations[i], rig) for i in (0, 5, 11, 18)]
+
+
+def store(frames, capacity=8) -> ReplayBuffer:
+    replay = ReplayBuffer(capacity, CPU)
+    for frame in frames:
+        replay.add(frame)
+    return replay
+
+
+def cut(frame, near, far):
+    """The same frame with fewer pixels."""
+    kept = np.r_[:near, frame.near : frame.near + far]
+    return dataclasses.replace(
+        frame, directions=frame.directions[kept], colors=frame.colors[kept], near_person_bits=near
+    )
+
+
+def posed(frame, index, *, knee):
+    """The same frame, said to be another one, with a knee bent by so many radians."""
+    rotations = np.zeros((23, 3))
+    rotations[3, 0] = knee
+    pose = BodyPose(
+        root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=rotations
+    )
+    return dataclasses.replace(frame, index=index, pose=pose)
+
+
+def places(batch, frames):
+    """Where each ray stands in the list of its frame's pixels; fails if it does not."""
+    lists = [{d.tobytes(): i for i, d in enumerate(frame.directions)} for frame in frames]
+    rays = zip(batch.rays.slots.tolist(), batch.rays.directions.numpy(), strict=True)
+    return np.array([lists[slot][direction.tobytes()] for slot, direction in rays])
+
+
+def drawn_from(replay, generator, count=40_000):
+    """The share of the rays that each slot gets."""
+    slots = replay.draw(count, generator).rays.slots.long()
+    return torch.bincount(slots, minlength=len(replay)).numpy() / count
+
+
+def test_targets_are_the_videos_colours_along_exactly_those_rays(rig, clip, frames, generator):
+    """From the ray back through the root's motion and the camera to a pixel of the picture."""
+    batch = store(frames).sample_rays(4000, generator)
+    for slot, index in enumerate((0, 5, 11, 18)):
+        seen, mine = clip.observations[index], (batch.rays.slots == slot).numpy()
+        world = rig.world_from_body(seen.pose)
+        origin = batch.rays.origins.numpy()[mine].astype(np.float64)
+        along = origin + 3.0 * batch.rays.directions.numpy()[mine]
+        for point in (origin, along):
+            point[:] = point @ world[:3, :3].T + world[:3, 3]
+        np.testing.assert_allclose(origin - seen.camera.center_world, 0.0, atol=1e-5)
+        pixels = seen.camera.project(along)
+        column, row = np.floor(pixels).astype(int).T
+        np.testing.assert_allclose(pixels, np.stack([column, row], axis=1) + 0.5, atol=1e-3)
+        alpha = seen.alpha[row, column][:, None]
+        shown = np.concatenate([seen.frame.rgb[row, column] / 255.0 * alpha, alpha], axis=1)
+        np.testing.assert_allclose(batch.target.numpy()[mine], shown, atol=0.5 / 255 + 1e-6)
+
+
+def test_rays_begin_anywhere_within_a_step(frames, generator):
+    jitter = store(frames).sample_rays(20_000, generator).rays.jitter
+    assert 0.0 <= float(jitter.min()) < float(jitter.max()) < 1.0
+    assert float(jitter.mean()) == pytest.approx(0.5, abs=0.01)
+    assert float(jitter.std()) == pytest.approx(12**-0.5, abs=0.01)
+
+
+def test_nine_rays_in_ten_go_near_the_person(frames, generator):
+    batch = store(frames).sample_rays(20_000, generator)
+    near = np.array([frame.near for frame in frames])[batch.rays.slots.numpy()]
+    share = float((places(batch, frames) < near).mean())
+    assert share == pytest.approx(NEAR_PERSON_RAY_SHARE, abs=0.01)
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@given(sizes=st.lists(st.tuples(st.integers(1, 60), st.integers(0, 60)), min_size=1, max_size=4))
+def test_whatever_the_frames_hold_rays_stay_within_it(frames, sizes):
+    """Frames without far pixels, with a single pixel, later ones larger than earlier ones."""
+    small = [cut(f, near, far) for f, (near, far) in zip(frames, sizes, strict=False)]
+    batch = store(small).sample_rays(400, torch.Generator().manual_seed(1))
+    colors = [small[slot].colors for slot in batch.rays.slots.tolist()]
+    place = places(batch, small)
+    expected = np.stack([c[p] for c, p in zip(colors, place, strict=True)]) / np.float32(255.0)
+    np.testing.assert_array_equal(batch.target.numpy(), expected.astype(np.float32))
+
+
+def test_stores_that_grow_keep_what_they_hold(frames):
+    replay = store([cut(frames[0], 3, 2), cut(frames[1], 40, 0), frames[2]])
+    for slot, frame in enumerate(frames[:3]):
+        index, roots = frame.cells.index.reshape(-1), frame.cells.roots
+        tables = replay.correspondences
+        np.testing.assert_array_equal(tables.packed_cells[slot, : len(index)], index)
+        np.testing.assert_array_equal(tables.roots[slot, : len(roots)], roots)
+        np.testing.assert_array_equal(tables.low[slot], frame.cells.low)
+        assert tuple(tables.shape[slot].tolist()) == frame.cells.index.shape
+    assert replay.correspondences.cell_m == frames[0].cells.cell_m
+
+
+def test_half_of_the_rays_follow_the_error_and_a_new_frame_enters_with_the_largest(
+    frames, generator
+):
+    replay = store(frames[:2])
+    np.testing.assert_allclose(drawn_from(replay, generator), [0.5, 0.5], atol=0.01)
+    for _ in range(150):  # the second frame is learnt, the first is not
+        replay.update_errors(torch.tensor([0, 0, 1]), torch.tensor([1.5, 0.5, 0.0]))
+    np.testing.assert_allclose(drawn_from(replay, generator), [0.75, 0.25], atol=0.01)
+    replay.add(frames[2])
+    expected = [1 / 6 + 1 / 4, 1 / 6, 1 / 6 + 1 / 4]
+    np.testing.assert_allclose(drawn_from(replay, generator), expected, atol=0.01)
+
+
+def test_frames_without_rays_keep_their_error(frames, generator):
+    replay = store(frames[:2])
+    for _ in range(150):
+        replay.update_errors(torch.tensor([0]), torch.tensor([3.0]))
+    expected = [1 / 4 + 3 / 8, 1 / 4 + 1 / 8]
+    np.testing.assert_allclose(drawn_from(replay, generator), expected, atol=0.01)
+
+
+def test_when_full_the_more_replaceable_of_the_two_most_alike_goes(frames):
+    knees = {10: 0.0, 11: 0.3, 12: 1.5, 13: 2.5}
+    replay = store([posed(frames[0], i, knee=k) for i, k in knees.items()], capacity=4)
+    replay.add(posed(frames[0], 20, knee=9.0))  # 11 is nearer to 12 than 10 is
+    assert sorted(replay.frame_indices) == [10, 12, 13, 20]
+    replay.add(posed(frames[0], 21, knee=5.0))  # then 12 and 13 are most alike; 12 is nearer to 10
+    assert sorted(replay.frame_indices) == [10, 13, 20, 21]
+
+
+def test_frames_seen_from_two_sides_are_not_alike(frames):
+    """The pose is the same; the view alone tells them apart."""
+    front, behind = posed(frames[0], 0, knee=0.0), posed(frames[2], 1, knee=0.0)
+    replay = store([front, behind, posed(frames[0], 2, knee=0.1)], capacity=3)
+    replay.add(posed(frames[1], 3, knee=0.0))
+    assert {1, 3} < set(replay.frame_indices)
+
+
+@given(capacity=st.integers(1, 6), arriving=st.integers(1, 12))
+@settings(deadline=None, max_examples=30)
+def test_the_capacity_is_kept_and_the_newest_frame_is_in(frames, capacity, arriving):
+    replay = ReplayBuffer(capacity, CPU)
+    for index in range(arriving):
+        replay.add(posed(cut(frames[0], 5, 5), index, knee=0.1 * index))
+        assert index in replay.frame_indices
+    assert len(replay) == len(set(replay.frame_indices)) == min(capacity, arriving)
+
+
+def test_a_slot_that_is_taken_over_shows_the_new_frame(frames, generator):
+    replay = store(frames[:3], capacity=2)
+    held = [next(f for f in frames if f.index == index) for index in replay.frame_indices]
+    batch = replay.sample_rays(2000, generator)
+    place = places(batch, held)
+    np.testing.assert_array_equal(
+        batch.target.numpy() * 255.0,
+        np.stack([held[s].colors[p] for s, p in zip(batch.rays.slots, place, strict=True)]),
+    )
+    np.testing.assert_array_equal(
+        batch.rays.origins, np.stack([held[s].origin for s in batch.rays.slots])
+    )
+
+
+def test_distances_that_are_kept_are_those_that_would_be_found_anew(frames, rng):
+    """What goes is chosen from distances that are updated one row at a time."""
+    replay = ReplayBuffer(6, CPU)
+    for index in range(40):
+        turned = dataclasses.replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
+        replay.add(dataclasses.replace(frames[index % 4], index=index, pose=turned))
+    likeness = replay._descriptors
+    anew = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
+    np.fill_diagonal(anew, np.inf)
+    np.testing.assert_allclose(replay._descriptor_distances, anew)

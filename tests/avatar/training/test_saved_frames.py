@@ -1,0 +1,123 @@
+"""Frames that a finished avatar keeps: the same after a round trip, and bounded."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.training.replay_buffer import ReplayBuffer
+from avatar.training.saved_frames import (
+    INDEX_SHIFT_PER_VIDEO,
+    MAX_HELD_OUT_KEPT,
+    SavedFrames,
+    number_in_video,
+    video_age,
+)
+from avatar.training.training_frame import prepare_frame, rebuild_frame
+from capture.input_error import InputError
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def frames(rig, clip):
+    return [prepare_frame(clip.observations[i], rig) for i in (0, 5, 11)]
+
+
+@pytest.fixture
+def kept(frames, clip):
+    replay = ReplayBuffer(2, CPU)
+    for frame in frames:
+        replay.add(frame)
+    return SavedFrames.of(replay, [HeldOutFrame(observation=o) for o in clip.observations[3:5]])
+
+
+def test_a_frame_is_made_ready_again_from_its_colours_alone(frames, rig):
+    for frame in frames:
+        again = rebuild_frame(frame.index, frame.pose, frame.sight, frame.colors, rig)
+        assert again.near_count == frame.near
+        np.testing.assert_array_equal(again.directions, frame.directions)
+        np.testing.assert_array_equal(again.origin, frame.origin)
+        np.testing.assert_array_equal(again.correspondences.packed_cells, frame.cells.index)
+
+
+def test_replay_gives_back_the_colours_that_it_was_given(frames):
+    replay = ReplayBuffer(3, CPU)
+    for frame in frames:
+        replay.add(frame)
+    for frame, kept in zip(frames, replay.replay_frames(), strict=True):
+        assert kept.index == frame.index
+        np.testing.assert_array_equal(kept.colors, frame.colors)
+    replay = ReplayBuffer(1, CPU)
+    for frame in frames:  # one after the other in the same slot, of different sizes
+        replay.add(frame)
+        (kept,) = replay.replay_frames()
+        np.testing.assert_array_equal(kept.colors, frame.colors)
+
+
+def test_what_is_written_is_read(kept, tmp_path):
+    kept.save(tmp_path / "frames.tensors")
+    again = SavedFrames.load(tmp_path / "frames.tensors")
+    assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]
+    for one, other in zip(kept.key_frames, again.replay_frames, strict=True):
+        assert one.index == other.index
+        np.testing.assert_array_equal(one.colors, other.colors)
+        np.testing.assert_array_equal(one.sight.near, other.view.near_person_bits)
+        for name in ("focal_px", "center_px", "size_px", "distortion"):
+            assert getattr(one.sight.camera, name) == getattr(other.view.camera, name)
+        np.testing.assert_array_equal(one.pose.joint_rotations, other.pose.joint_rotations)
+    for one, other in zip(kept.held, again.held_out, strict=True):
+        assert one.observation.frame.index == other.observation.frame.index
+        np.testing.assert_array_equal(one.observation.frame.rgb, other.observation.frame.rgb)
+        np.testing.assert_allclose(one.observation.alpha, other.observation.alpha, atol=1e-5)
+
+
+def test_frames_of_an_earlier_video_have_numbers_of_their_own(kept):
+    earlier = kept.earlier().earlier()
+    assert [frame.index + 2 * INDEX_SHIFT_PER_VIDEO for frame in earlier.key_frames] == [
+        frame.index for frame in kept.key_frames
+    ]
+    indices = [h.observation.frame.index for h in earlier.held]
+    assert all(index < 0 for index in indices)
+    assert [number_in_video(index) for index in indices] == [3, 4]
+    assert [video_age(index) for index in indices] == [2, 2]
+    assert [video_age(h.observation.frame.index) for h in kept.held] == [0, 0]
+
+
+def test_few_held_out_frames_are_kept_of_many(clip):
+    held = [HeldOutFrame(observation=o) for o in clip.observations]
+    kept = SavedFrames.of(ReplayBuffer(1, CPU), held)
+    assert len(kept.held_out) == MAX_HELD_OUT_KEPT < len(held)
+    assert kept.held_out[0] is held[0]
+    assert kept.held_out[-1] is held[-1]
+
+
+def test_a_frame_that_nobody_can_make_ready_again_is_not_kept(frames):
+    replay = ReplayBuffer(2, CPU)
+    replay.add(dataclasses.replace(frames[0], view=None))
+    assert replay.replay_frames() == []
+
+
+def test_without_a_file_there_are_no_frames_and_a_damaged_one_is_refused(kept, tmp_path):
+    path = tmp_path / "frames.tensors"
+    assert SavedFrames.load(path) == SavedFrames([], [])
+    kept.save(path)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(InputError, match="cannot be read"):
+        SavedFrames.load(path)
+
+
+def test_a_full_disk_leaves_the_older_file(kept, tmp_path, monkeypatch):
+    path = tmp_path / "frames.tensors"
+    path.write_bytes(b"older")
+
+    def full(state, file):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        kept.save(path)
+    assert path.read_bytes() == b"older"
+    assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]

@@ -1,0 +1,372 @@
+"""Training: what it reaches, that it never falls back, and what it says on the way."""
+
+import dataclasses
+import itertools
+import threading
+import time
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
+from avatar.evaluation.held_out import HeldOutFrame, prepare_stream
+from avatar.events import Evaluated, Finished, FrameArrived, Stepped, WaitingForFrame, Warned
+from avatar.render import render
+from avatar.training import train as train_module
+from avatar.training.train import train
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import prepare_frame
+from capture.inbox import Inbox
+from preprocess.observe import DroppedFrame
+
+CPU = torch.device("cpu")
+QUICK = TrainConfig(
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_space_points=32,
+    seconds=60.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def ready(rig, clip):
+    """Prepared frames 0 … 7, where 2 and 5 are held out and 4 is left out."""
+    observations = [*clip.observations[:4], DroppedFrame(index=4, reason="empty mask")]
+    observations += clip.observations[5:8]
+    return list(prepare_stream(iter(observations), rig, stride=3, total=None))
+
+
+def taught(rig, ready, config):
+    """A trainer that was taught by `train`, its held-out frames and its events."""
+    trainer, held = Trainer(rig, config, CPU), []
+    return trainer, held, list(train(trainer, Inbox(ready), held))
+
+
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock that goes on by 5 ms each time it is read: time that no other program can take."""
+    ticks = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.005 * next(ticks))
+
+
+def silhouettes(learnt, held):
+    """Where the avatar is, and where the person was."""
+    observation = held.observation
+    picture = render(learnt.trainer.avatar, observation.pose, observation.camera, cells=held.cells)
+    return picture[..., 3] > 0.5, observation.alpha > 0.5
+
+
+# --- what it reaches --------------------------------------------------------------------------
+
+
+def test_frames_it_has_never_seen_are_rendered_well(learnt):
+    last = [score.psnr for score in learnt.marks[-1][:-1]]
+    assert np.mean(last) > 32.0
+    assert min(last) > 31.0
+    assert np.mean([score.ssim for score in learnt.marks[-1][:-1]]) > 0.98
+
+
+def test_a_pose_that_was_never_filmed_is_rendered_well(learnt):
+    assert learnt.marks[-1][-1].psnr > 28.0
+
+
+def test_the_silhouette_is_the_persons(learnt):
+    for held in [*learnt.held, learnt.novel]:
+        avatar, person = silhouettes(learnt, held)
+        assert (avatar & person).sum() / (avatar | person).sum() > 0.93
+
+
+def test_no_frame_ever_falls_back(learnt):
+    """An occupancy that forgot thin surfaces, and rays cut too early, once cost 15 dB."""
+    scores = np.array([[score.psnr for score in mark] for mark in learnt.marks])
+    best = np.maximum.accumulate(scores, axis=0)
+    assert (best - scores).max() < 1.0
+
+
+def test_rays_need_few_samples(learnt):
+    """Without cells and occupancy a ray would have about a hundred."""
+    assert learnt.trainer.samples / learnt.trainer.rays < 12.0
+
+
+# --- that it can be repeated ------------------------------------------------------------------
+
+
+def after_three_steps(rig, ready, config):
+    trainer = Trainer(rig, config, CPU)
+    for item in ready:
+        if not isinstance(item, HeldOutFrame | DroppedFrame):
+            trainer.add_frame(item)
+    losses = [trainer.step(rate=1.0, hard_surface_share=0.5).loss for _ in range(3)]
+    grid = trainer.avatar.occupancy.density_grid
+    return [*losses, *trainer.avatar.field.parameters(), grid.density, grid.occupied]
+
+
+def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    try:
+        first, again = (after_three_steps(rig, ready, QUICK) for _ in range(2))
+        other = after_three_steps(rig, ready, dataclasses.replace(QUICK, seed=1))
+    finally:
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(first[0], other[0])
+
+
+# --- what the generator does and says ---------------------------------------------------------
+
+
+def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
+    trainer, held, events = taught(rig, ready, dataclasses.replace(QUICK, steps=60))
+    assert trainer.frames_seen == 5
+    assert trainer.replay.frame_indices == [0, 1, 3, 6, 7]
+    assert [frame.observation.frame.index for frame in held] == [2, 5]
+    warnings = [event.message for event in events if isinstance(event, Warned)]
+    assert len(warnings) == 1
+    assert "4" in warnings[0]
+    assert "empty mask" in warnings[0]
+
+
+def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
+    trainer, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=25))
+    steps = [event for event in events if isinstance(event, Stepped)]
+    finished = events[-1]
+    assert isinstance(finished, Finished)
+    assert sum(isinstance(event, Finished) for event in events) == 1
+    assert [event.step for event in steps] == list(range(1, 26))
+    for before, after in itertools.pairwise(steps):
+        assert before.wall_seconds <= after.wall_seconds <= finished.wall_seconds
+        assert before.frames_seen <= after.frames_seen
+    assert finished.steps == trainer.steps == 25
+    assert finished.rays == trainer.rays == 25 * QUICK.rays
+    assert finished.samples == trainer.samples
+    per_ray = sum(event.samples_per_ray for event in steps)
+    assert per_ray * QUICK.rays == pytest.approx(finished.samples)
+
+
+def test_it_stops_when_the_time_is_up(rig, ready, ticking):
+    trainer, inbox = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4), CPU), Inbox(ready)
+    inbox._thread.join()  # the last frame comes before the first step
+    events = list(train(trainer, inbox, []))
+    steps = [event for event in events if isinstance(event, Stepped)]
+    late = [step for step in steps if step.wall_seconds >= 0.4]
+    assert len(late) <= 1 or len(steps) == train_module.MIN_STEPS_AFTER_LAST_FRAME
+    assert events[-1].wall_seconds >= 0.4
+
+
+def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
+    monkeypatch.setattr(
+        train_module, "EVALUATION_TIMES_S", (1 / 50, 10 / 50, 60.0)
+    )  # after 1 and 10 steps
+    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=20))
+    marks = [event for event in events if isinstance(event, Evaluated)]
+    assert [mark.frames_seen for mark in marks] == [2, 5]
+    assert [[score.frame for score in mark.scores] for mark in marks] == [[], [2, 5]]
+    assert np.isfinite([score.psnr for score in marks[1].scores]).all()
+
+
+def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch, ticking):
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.05, 60.0))
+    monkeypatch.setattr(train_module, "EVALUATION_TIME_SHARE", 0.0)
+    trainer, held = Trainer(rig, dataclasses.replace(QUICK, seconds=0.5), CPU), []
+    inbox = Inbox(ready)
+    inbox._thread.join()  # all frames are there before the first mark
+    (mark,) = [event for event in train(trainer, inbox, held) if isinstance(event, Evaluated)]
+    assert len(held) == 2
+    assert len(mark.scores) == 1
+
+
+def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ticking):
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
+    gate = threading.Event()
+
+    def arriving():
+        yield from frames[:2]
+        gate.wait(10.0)
+        yield frames[2]
+
+    config = dataclasses.replace(QUICK, seconds=1.2)
+    trainer, rates = Trainer(rig, config, CPU), {1: [], 2: [], 3: []}
+    for event in train(trainer, Inbox(arriving()), []):
+        if isinstance(event, Stepped):
+            group = trainer.optimizer.param_groups[0]
+            rates[event.frames_seen].append(group["lr"])
+            if event.step == 10:
+                gate.set()
+    assert set(rates[1] + rates[2]) == {config.learning_rate}
+    falling = np.array(rates[3][1:])
+    assert (np.diff(falling) <= 0.0).all()
+    assert falling[0] > 0.9 * config.learning_rate
+    assert falling[-1] < 0.1 * config.learning_rate
+
+
+def test_a_stream_without_a_usable_frame_ends_without_a_step(rig):
+    nothing = [DroppedFrame(index=index, reason="pose invalid") for index in range(3)]
+    trainer, _, events = taught(rig, nothing, QUICK)
+    assert [type(event) for event in events if not isinstance(event, WaitingForFrame)] == [
+        Warned
+    ] * 3
+    assert trainer.steps == 0
+
+
+def test_an_error_in_the_source_is_raised_in_training(rig, ready):
+    def breaking():
+        yield ready[0]
+        raise OSError("the disk was pulled out")
+
+    with pytest.raises(OSError, match="pulled out"):
+        list(train(Trainer(rig, QUICK, CPU), Inbox(breaking()), []))
+
+
+def test_a_resumed_trainer_goes_on_counting(rig, ready):
+    trainer, held, _ = taught(rig, ready, dataclasses.replace(QUICK, steps=10))
+    used, trainer.config = trainer.wall_seconds, dataclasses.replace(QUICK, steps=15)
+    events = list(train(trainer, Inbox([]), held))
+    assert [event.step for event in events if isinstance(event, Stepped)] == [11, 12, 13, 14, 15]
+    assert events[0].wall_seconds > used
+    assert trainer.frames_seen == 5
+
+
+# --- frames that come at times of their own ----------------------------------------------------
+
+
+def test_every_frame_that_arrives_is_announced_in_order(rig, ready):
+    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=30))
+    arrived = [(event.index, event.held_out) for event in events if isinstance(event, FrameArrived)]
+    assert arrived == [(0, False), (1, False), (2, True), (3, False), (5, True), (6, False),
+                       (7, False)]  # fmt: skip
+
+
+def arriving_at(rig, clip, *, gate):
+    """One frame at once, and two more when the gate opens."""
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
+    yield frames[0]
+    gate.wait(10.0)
+    yield from frames[1:]
+
+
+def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
+    """The learning rates of the steps after each number of frames."""
+    gate = threading.Event()
+    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds), CPU)
+    inbox = Inbox(arriving_at(rig, clip, gate=gate), paced=paced)
+    rates = {1: [], 2: [], 3: []}
+    for event in train(trainer, inbox, []):
+        if isinstance(event, Stepped):
+            rates[event.frames_seen].append(trainer.optimizer.param_groups[0]["lr"])
+            if event.wall_seconds > opens_after_s:
+                gate.set()
+    return rates, trainer
+
+
+def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip, ticking):
+    """Read as fast as possible, reading would come first after half of the time."""
+    rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
+    assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
+    assert len(rates[3]) == train_module.MIN_STEPS_AFTER_LAST_FRAME
+    assert trainer.wall_seconds > 0.8  # the last frame came after the time that was given
+
+
+def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
+    rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=1.5, opens_after_s=0.0)
+    assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
+    falling = np.array(rates[3][1:])
+    assert (np.diff(falling) <= 0.0).all()
+    assert falling[-1] < 0.1 * QUICK.learning_rate
+    assert trainer.wall_seconds >= 1.5
+
+
+def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
+    closed = threading.Event()
+
+    def never_ending():
+        yield from frames
+        closed.wait(30.0)
+
+    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4), CPU)
+    inbox = Inbox(never_ending(), paced=True, live=True)
+    events = list(train(trainer, inbox, []))
+    closed.set()
+    inbox.close()
+    assert isinstance(events[-1], Finished)
+    assert trainer.wall_seconds >= 0.4
+    assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
+
+
+def test_while_nothing_has_come_the_listener_is_heard(rig):
+    """So that Ctrl-C ends a run that waits for its first frame."""
+    closed = threading.Event()
+
+    def nothing():
+        closed.wait(30.0)
+        yield from ()
+
+    inbox = Inbox(nothing(), paced=True, live=True)
+    assert isinstance(next(train(Trainer(rig, QUICK, CPU), inbox, [])), WaitingForFrame)
+    closed.set()
+    inbox.close()
+
+
+def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
+    config = dataclasses.replace(QUICK, replay_capacity=3)
+    trainer = Trainer(rig, config, CPU)
+    frame = prepare_frame(clip.observations[0], rig)
+    for index in range(40):
+        trainer.add_frame(dataclasses.replace(frame, index=index))
+        trainer.pose_corrections[index] = np.full((25, 3), float(index))
+    assert len(trainer.pose_corrections) <= 2 * config.replay_capacity + 1
+    assert set(trainer.replay.frame_indices) <= set(trainer.pose_corrections)
+
+
+# --- steps instead of seconds -----------------------------------------------------------------
+
+
+def taught_at_a_pace(rig, ready, config, *, pause_s):
+    """What training makes of frames that each take so long to prepare."""
+
+    def arriving():
+        for item in ready:
+            time.sleep(pause_s)
+            yield item
+
+    trainer = Trainer(rig, config, CPU)
+    events = train(trainer, Inbox(arriving()), [])
+    frames_seen = [event.frames_seen for event in events if isinstance(event, Stepped)]
+    return frames_seen, trainer.avatar.field.parameters()
+
+
+def test_counted_steps_give_one_avatar_however_fast_frames_come(rig, ready):
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    try:
+        config = dataclasses.replace(QUICK, steps=12)
+        at_once, slowly = (taught_at_a_pace(rig, ready, config, pause_s=s) for s in (0.0, 0.03))
+    finally:
+        numba.set_num_threads(threads[0])
+        torch.set_num_threads(threads[1])
+    assert at_once[0] == slowly[0] == [1, 2, 3, 4] + [5] * 8
+    for a, b in zip(at_once[1], slowly[1], strict=True):
+        assert torch.equal(a, b)
+
+
+def test_each_frame_is_learnt_from_even_if_there_are_fewer_steps(rig, ready):
+    trainer, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=2))
+    assert trainer.frames_seen == trainer.steps == 5
+    assert isinstance(events[-1], Finished)
+
+
+def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
+    config = dataclasses.replace(QUICK, steps=25)
+    assert config.seconds == 25 / NOMINAL_STEPS_PER_S
+    trainer = Trainer(rig, config, CPU)
+    events = train(trainer, Inbox(ready), [])
+    group = trainer.optimizer.param_groups[0]
+    rates = [group["lr"] for event in events if isinstance(event, Stepped)]
+    assert rates[:5] == [config.learning_rate] * 5
+    assert (np.diff(rates[5:]) <= 0.0).all()
+    assert rates[-1] < 0.1 * config.learning_rate

@@ -1,0 +1,151 @@
+"""The step's hand-written gradient against autograd of its meaning, and against differences."""
+
+import math
+
+import pytest
+import torch
+
+from avatar.config import TrainConfig
+from avatar.field import field_priors
+from avatar.kernels import torch_reference
+from avatar.kernels.backend_protocol import MarchSettings, RaySamples
+from avatar.kernels.torch_backend import TorchBackend
+from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import prepare_frame
+from avatar.training.training_step import OccupancySampler, compute_gradients, cosine_decay
+
+FIRM_SHARE = 0.25
+"""Far from 0 and 1, so that no term may be left out."""
+CONFIG = TrainConfig(
+    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=32,
+    empty_space_weight=0.3, hard_surface_weight=0.1, density_tv_weight=0.2, density_tv_pairs=16,
+    initial_density_tv_factor=3.0, double_well_weight=0.4, interior_weight=0.1, interior_points=24, max_samples=256,
+    density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40, inner_leg_weight=0.5, inner_leg_points=20,
+)  # fmt: skip
+
+
+@pytest.fixture
+def trainer(rig, clip):
+    trainer = Trainer(rig, CONFIG, torch.device("cpu"))
+    for observation in clip.observations[:4]:
+        trainer.add_frame(prepare_frame(observation, rig))
+    for _ in range(40):
+        trainer.step(rate=1.0, hard_surface_share=1.0)
+    return trainer
+
+
+def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, batch, background):
+    """The whole loss of a step, differentiable, in whatever precision the parameters have."""
+    table, first, first_bias, second, second_bias = parameters
+    points = torch.cat([samples.points, empty, pairs, solid, close, gaps]).to(table.dtype)
+    features = torch_reference.encode(points, table, trainer.avatar.field.levels)
+    hidden = torch.relu(features @ first + first_bias)
+    raw = hidden @ second + second_bias
+    count = len(samples.points)
+    rendered = torch_reference.composite(
+        raw[:count], samples.first, samples.count, CONFIG.sample_step_m
+    )
+    loss = torch_reference.loss_per_ray(
+        rendered, batch.target.to(table.dtype), background.to(table.dtype),
+        CONFIG.alpha_weight, CONFIG.hard_surface_weight,
+    ).mean()  # fmt: skip
+    parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
+    loss = loss + FIRM_SHARE * of_close_pairs(raw[count:].split(parts)[3], close)
+    density = torch.exp(raw[count:, 3].clamp(max=torch_reference.MAX_LOG_DENSITY))
+    opacity = 1.0 - torch.exp(-density * field_priors.OPACITY_LENGTH_M)
+    of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
+    loss = loss + CONFIG.empty_space_weight * of_empty.mean()
+    if len(gaps):
+        loss = loss + CONFIG.inner_leg_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
+    loss = loss - CONFIG.interior_weight * of_solid.log().mean()
+    if len(pairs) == 0:
+        return loss
+    one, other = of_pairs.chunk(2)
+    variation = 0.2 * 3.0**0.75 * (one - other).abs().mean()
+    return loss + variation + 0.4 * FIRM_SHARE * (of_pairs * (1.0 - of_pairs)).mean()
+
+
+def of_close_pairs(raw, points):
+    """What is asked of pairs of close points: gentle edges, no needless density, even colours."""
+    (one, other), (here, there) = raw.chunk(2), points.to(raw.dtype).chunk(2)
+    steep = (one[:, 3] - other[:, 3]).abs() - (here - there).norm(dim=1) * 4.0 / CONFIG.finest_m
+    densest = torch.maximum(one[:, 3], other[:, 3])
+    loss = 0.2 * (steep.clamp(min=0.0) * (densest > 0.0)).mean()
+    loss = loss + 0.2 * 0.4 * (raw[:, 3] - 6.0).clamp(min=0.0).mean()
+    uneven = (torch.sigmoid(one[:, :3]) - torch.sigmoid(other[:, :3])).abs().sum(dim=1)
+    return loss + 0.3 * (uneven * (densest > 2.0)).mean()
+
+
+def one_step(trainer, backend):
+    """Gradients of a step, and everything random that went into it."""
+    field, occupancy = trainer.avatar.field, trainer.avatar.occupancy
+    field.backend = backend
+    batch = trainer.replay.draw(CONFIG.rays, torch.Generator().manual_seed(3))
+    generator = torch.Generator().manual_seed(4)
+    field.table_grad.zero_()
+    compute_gradients(
+        field, OccupancySampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
+        hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(4)
+    how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
+    samples = backend.march(batch.rays, trainer.replay.cells, occupancy.grid, how)
+    empty = occupancy.empty_points(CONFIG.empty_space_points, generator)
+    drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
+    chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
+    apart = field_priors.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
+    pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
+    solid = occupancy.solid_points(CONFIG.interior_points, generator)
+    close = field_priors.sample_smoothness_pairs(samples.points, CONFIG, generator)
+    gaps = occupancy.gap_points(CONFIG.inner_leg_points, generator)
+    background = torch.rand(len(batch.target), 3, generator=generator)
+    grads = [parameter.grad.clone() for parameter in field.parameters()]
+    return grads, (samples, empty, pairs, solid, close, gaps, batch, background)
+
+
+@pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
+def test_the_steps_gradient_is_that_of_autograd(trainer, backend):
+    grads, drawn = one_step(trainer, backend)
+    parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
+    expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
+    for ours, theirs in zip(grads, expected, strict=True):
+        assert float((ours - theirs).abs().max()) <= 1e-5 * float(theirs.abs().max())
+
+
+def test_the_whole_loss_changes_as_its_gradient_says(trainer):
+    """Central differences in double precision, along random directions in every parameter."""
+    grads, drawn = one_step(trainer, NumbaBackend())
+    parameters = [p.detach().double() for p in trainer.avatar.field.parameters()]
+    generator = torch.Generator().manual_seed(5)
+    for place in range(len(parameters)):
+        direction = torch.randn(parameters[place].shape, generator=generator).double()
+        size = 1e-5 / float(direction.norm())
+        sides = []
+        for sign in (1.0, -1.0):
+            moved = list(parameters)
+            moved[place] = parameters[place] + sign * size * direction
+            sides.append(float(mean_loss(trainer, moved, *drawn)))
+        measured = (sides[0] - sides[1]) / (2.0 * size)
+        predicted = float((grads[place].double() * direction).sum())
+        scale = float(grads[place].norm() * direction.norm()) / math.sqrt(direction.numel())
+        assert measured == pytest.approx(predicted, abs=2e-2 * scale)
+
+
+def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
+    """Rays that miss everything: no crash, and no gradient but those of the priors."""
+    trainer.avatar.occupancy.grid.occupied.zero_()
+    (_, first, *_), drawn = one_step(trainer, NumbaBackend())
+    samples, empty, pairs, _, close, _, batch, background = drawn
+    assert isinstance(samples, RaySamples)
+    assert len(samples.points) == 0
+    assert torch.isfinite(first).all()
+    assert len(batch.target) == CONFIG.rays == len(background)
+    assert len(empty) == CONFIG.empty_space_points
+    assert len(pairs) == len(close) == 0
+
+
+def test_the_learning_rate_falls_from_one_to_a_twentieth():
+    assert cosine_decay(-1.0) == cosine_decay(0.0) == 1.0
+    assert cosine_decay(0.5) == pytest.approx(0.5)
+    assert cosine_decay(1.0) == cosine_decay(2.0) == 0.05

@@ -1,0 +1,142 @@
+"""The paper's schemes learn, and learn alike on every device."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.config import TrainConfig
+from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.training.replay_buffer import ReplayBuffer
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import prepare_frame
+from avatar.training.training_step import compute_gradients
+from baselines.instant_avatar.samplers import sampler_for
+
+CPU = torch.device("cpu")
+
+
+SMALL = TrainConfig(
+    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=64,
+    occupancy_interval=8, refine_poses=False, replay_capacity=4,
+)  # fmt: skip
+VARIANTS = {
+    "union": {"skipping": "union"},
+    "frame": {"skipping": "frame"},
+    "none": {"skipping": "none", "empty_space_weight": 0.0},
+    "broyden": {"roots": "broyden"},
+    "union, broyden": {"skipping": "union", "roots": "broyden"},
+    "global": {"empty_term": "global"},
+    "no alpha": {"alpha_weight": 0.0},
+    "no hard surface": {"hard_weight": 0.0},
+}
+SCHEMES = {name: choices for name, choices in VARIANTS.items() if not name.startswith("no ")}
+"""Where samples lie, what warps them, where density is asked; losses are our own, tested there."""
+QUICK = ("none", "union, broyden")
+"""No scheme, and the paper's own."""
+
+
+def trainer_of(rig, clip, **choices):
+    trainer = Trainer(rig, dataclasses.replace(SMALL, **choices), CPU)
+    for observation in clip.observations[:8:2]:
+        trainer.add_frame(prepare_frame(observation, rig))
+    return trainer
+
+
+@pytest.mark.parametrize("choices", VARIANTS.values(), ids=VARIANTS.keys())
+def test_every_variant_learns(rig, clip, choices):
+    trainer = trainer_of(rig, clip, **choices)
+    color = []
+    for _ in range(30):
+        result = trainer.step(rate=1.0, hard_surface_share=0.0)
+        assert result.sample_count > 200
+        color.append(float(result.loss.mean()))
+    assert np.mean(color[-5:]) < 0.5 * np.mean(color[:5])
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        pytest.param(choices, id=name, marks=() if name in QUICK else pytest.mark.slow)
+        for name, choices in SCHEMES.items()
+    ],
+)
+def test_every_scheme_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
+    """The reference path, on any device that torch knows."""
+    samples, losses = [], []
+    for backend in ("numba", "torch"):
+        monkeypatch.setenv("IA_BACKEND", backend)
+        result = trainer_of(rig, clip, rays=60, **choices).step(rate=1.0, hard_surface_share=0.0)
+        samples.append(result.sample_count)
+        losses.append(result.loss)
+    assert samples[0] == pytest.approx(samples[1], rel=0.03)
+    assert float((losses[0] - losses[1]).abs().median()) < 1e-4
+
+
+@pytest.mark.parametrize("skipping", ["union", "frame", "none"])
+def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping):
+    """What rays ask of a pose; the samples that ours leaves out carry no light."""
+    avatar = learnt.trainer.avatar
+    replay = ReplayBuffer(1, CPU)
+    frame = prepare_frame(clip.observations[3], rig)
+    slot = replay.add(frame)
+    config = dataclasses.replace(learnt.trainer.config, empty_space_weight=0.0)
+    found = []
+    for choice in ("canonical", skipping):
+        chosen = dataclasses.replace(config, skipping=choice)
+        poses = PoseOptimizer(rig, 1, CPU)
+        poses.set_pose(slot, frame.pose)
+        sampler = sampler_for(chosen, avatar)
+        sampler.add_frame(0, replay.correspondences, poses.bones[0])
+        sampler.update(0, replay.correspondences, torch.Generator().manual_seed(0))
+        batch = replay.sample_rays(2000, torch.Generator().manual_seed(1))
+        compute_gradients(
+            avatar.field, sampler, replay.correspondences, batch, chosen,
+            hard_surface_share=0.0, poses=poses, generator=torch.Generator().manual_seed(2),
+        )  # fmt: skip
+        avatar.field.table_grad.zero_()
+        found.append(torch.from_numpy(poses.pose_gradients(slot).ravel()))
+    assert float(torch.cosine_similarity(*found, dim=0)) > 0.97
+
+
+def test_global_sparsity_is_asked_for_in_the_whole_box(rig, clip):
+    trainer = trainer_of(rig, clip, empty_term="global")
+    points = trainer.sampler.sample_empty(4000, torch.Generator().manual_seed(2))
+    low, high = torch.from_numpy(rig.box_low), torch.from_numpy(rig.box_high)
+    assert (points >= low).all()
+    assert (points <= high).all()
+    torch.testing.assert_close(points.mean(dim=0), (low + high) / 2, atol=0.05, rtol=0)
+    # uniform on each axis: its spread is that of a uniform distribution
+    torch.testing.assert_close(points.std(dim=0), (high - low) / 12**0.5, atol=0.02, rtol=0)
+
+
+def test_global_sparsity_pulls_as_the_opacity_of_its_points_does(rig, clip):
+    """Its gradient for the network's last bias, against central differences in double."""
+    trainer = trainer_of(rig, clip, empty_term="global")
+    for _ in range(10):
+        trainer.step(rate=1.0, hard_surface_share=0.0)
+    field, config = trainer.avatar.field, trainer.config
+    batch = trainer.replay.sample_rays(config.rays, torch.Generator().manual_seed(1))
+    pulls = []
+    for weight in (
+        1e-12,
+        config.empty_space_weight,
+    ):  # not 0: the points must be drawn all the same
+        field.table_grad.zero_()
+        compute_gradients(
+            field, trainer.sampler, trainer.replay.correspondences, batch,
+            dataclasses.replace(config, empty_space_weight=weight),
+            hard_surface_share=0.0, generator=torch.Generator().manual_seed(2),
+        )  # fmt: skip
+        pulls.append(float(field.layers[3].grad[3]))
+    points = trainer.sampler.sample_empty(
+        config.empty_space_points, torch.Generator().manual_seed(2)
+    )
+    raw = field.raw_outputs_at(points)[:, 3].double()
+
+    def mean_opacity(shift):
+        return float((1.0 - torch.exp(-torch.exp(raw + shift) * 0.01)).mean())
+
+    measured = (mean_opacity(1e-4) - mean_opacity(-1e-4)) / 2e-4
+    assert pulls[1] - pulls[0] == pytest.approx(config.empty_space_weight * measured, rel=1e-3)

@@ -1,0 +1,86 @@
+"""The paper's warp beside ours: which root counts, and who asks for one."""
+
+import torch
+
+from avatar.kernels.backend_protocol import MarchSettings
+from avatar.render import correspondence_tables
+from baselines.instant_avatar.posed_field import BroydenWarp, CorrespondenceWarp
+from baselines.instant_avatar.posed_occupancy import NoSkipping
+from baselines.instant_avatar.samplers import PosedSampler
+
+CPU = torch.device("cpu")
+
+
+def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bones_of):
+    """The paper's maximum over all roots, asked of the field one by one."""
+    _, seen, cells = novel
+    warp = BroydenWarp(avatar.field, rig, 1)
+    warp.set_pose(0, bones_of(rig, seen.pose))
+    low = torch.from_numpy(cells.low)
+    size = torch.tensor(cells.index.shape) * cells.cell_m
+    points = low + torch.rand(4000, 3, generator=generator) * size
+    slots = torch.zeros(4000, dtype=torch.int32)
+    warped = warp(points, slots, correspondence_tables(cells, CPU))
+    roots, valid = avatar.field.backend.find_roots(points, slots, warp.poses)
+    box = [torch.from_numpy(corner) for corner in (rig.box_low, rig.box_high)]
+    valid &= ((roots >= box[0]) & (roots <= box[1])).all(dim=-1)
+    score = torch.full(valid.shape, -torch.inf)
+    score[valid] = avatar.field.raw_at(roots[valid])[:, 3]
+    assert torch.equal(warped.has_root, valid.any(dim=1))
+    assert (valid.sum(dim=1) > 1).sum() > 40
+    chosen = avatar.field.raw_at(warped.points)[:, 3]
+    torch.testing.assert_close(chosen, score.amax(dim=1)[warped.has_root], atol=1e-5, rtol=0)
+
+
+def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
+    _, seen, cells = novel
+    points = solid_in(avatar, seen.pose)
+    slots = torch.zeros(len(points), dtype=torch.int32)
+    broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.grid)
+    broyden.set_pose(0, bones_of(rig, seen.pose))
+    tables = correspondence_tables(cells, CPU)
+    exact, ours = (warp(points, slots, tables)
+                   for warp in (broyden, CorrespondenceWarp(avatar.field, avatar.occupancy)))  # fmt: skip
+    both = exact.has_root & ours.has_root
+    assert float(both.float().mean()) > 0.99
+    places = [torch.zeros_like(points) for _ in range(2)]
+    places[0][exact.has_root], places[1][ours.has_root] = exact.points, ours.points
+    gap = (places[0] - places[1])[both].norm(dim=1)
+    assert float((gap < 2e-3).float().mean()) > 0.97
+
+
+def test_samples_know_which_root_warped_them(avatar, learnt, generator):
+    """Through its row each sample leads back into its cell: x = x* + J⁻¹ (p - center)."""
+    replay, backend = learnt.trainer.replay, avatar.field.backend
+    rays = replay.draw(200, generator).rays
+    sampler = PosedSampler(
+        backend, NoSkipping(), CorrespondenceWarp(avatar.field, avatar.occupancy), avatar.step_m
+    )
+    samples = sampler.sample_rays(rays, replay.cells)
+    slot = rays.slots.long().repeat_interleave(samples.counts)
+    root = replay.cells.roots[slot, samples.root_rows.long()]
+    inverse = root[:, 3:].unflatten(1, (3, 3))
+    offset = torch.linalg.solve(inverse, samples.points - root[:, :3])
+    assert (
+        float((offset.abs().amax(dim=1) < 0.5 * replay.cells.cell_m + 1e-3).float().mean()) > 0.99
+    )
+
+
+def test_ours_asks_no_point_that_no_skipping_leaves_out(avatar, learnt, generator):
+    replay, backend = learnt.trainer.replay, avatar.field.backend
+    rays = replay.draw(300, generator).rays
+    everything = PosedSampler(
+        backend, NoSkipping(), CorrespondenceWarp(avatar.field, avatar.occupancy), avatar.step_m
+    ).sample_rays(rays, replay.cells)
+    how = MarchSettings(avatar.step_m, torch.inf, 512)
+    ours = backend.march(rays, replay.cells, avatar.occupancy.grid, how)
+    assert (everything.counts >= ours.count).all()
+    assert int(everything.counts.sum()) > 1.5 * int(ours.count.sum())
+    for ray in range(0, 300, 10):
+        mine, all_of_them = (
+            s.points[int(s.offsets[ray]) : int(s.offsets[ray]) + int(s.counts[ray])]
+            for s in (ours, everything)
+        )
+        if len(mine):
+            gap = torch.cdist(mine.double(), all_of_them.double()).amin(dim=1)
+            assert float((gap < 1e-4).float().mean()) > 0.9

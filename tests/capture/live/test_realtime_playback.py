@@ -1,0 +1,159 @@
+"""Recordings played as live captures: when frames come, and that none is lost."""
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture.frame import Frame
+from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import RealtimePlayback
+from capture.source import FrameSelection
+from capture.source_opening import open_source
+
+UNEVEN_S = [5.0, 5.04, 5.1, 5.1, 5.7, 5.733]
+"""Timestamps of no fixed rate; one comes twice, and the first is not 0."""
+
+
+class Time:
+    """A clock that only stands still or jumps."""
+
+    def __init__(self):
+        self.now_s = 100.0
+        self.waits = []
+
+    def __call__(self):
+        return self.now_s
+
+    def wait(self, seconds):
+        self.waits.append(seconds)
+        self.now_s += seconds
+
+
+class Recorded:
+    """A source of tiny frames at given times."""
+
+    path, size_px, selection = Path("uneven.mp4"), (2, 2), FrameSelection()
+    has_alpha = live = paced = False
+    quarter_turns = 0
+    started_at = 0.0
+    frames_in_file = frame_count = len(UNEVEN_S)
+    duration_s, waited_s, dropped = 0.77, 0.0, 0
+
+    def __init__(self, times=UNEVEN_S):
+        self.times, self.warnings, self.closed = times, ["a gap"], False
+
+    def frames(self):
+        for index, time_s in enumerate(self.times):
+            yield Frame(index=index, time_s=time_s, rgb=np.full((2, 2, 3), index, np.uint8))
+
+    def count_frames(self):
+        return len(self.times)
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def clock():
+    return Time()
+
+
+def played(source, clock):
+    return RealtimePlayback(source, PacingClock(clock=clock, wait=clock.wait))
+
+
+def test_each_frame_comes_at_its_own_time_and_the_first_at_once(clock):
+    came = [(frame.index, clock()) for frame in played(Recorded(), clock).frames()]
+    assert [index for index, _ in came] == [0, 1, 2, 3, 4, 5]
+    moments = np.array([moment for _, moment in came])
+    np.testing.assert_allclose(moments - moments[0], np.array(UNEVEN_S) - 5.0, atol=1e-9)
+
+
+def test_frames_say_when_they_were_due_and_keep_their_timestamps(clock):
+    frames = list(played(Recorded(), clock).frames())
+    assert [frame.time_s for frame in frames] == UNEVEN_S
+    due = np.array([frame.due_s for frame in frames])
+    np.testing.assert_allclose(due, 100.0 + np.array(UNEVEN_S) - 5.0)
+
+
+def test_who_takes_frames_late_loses_none_and_catches_up(clock):
+    lateness = []
+    for frame in played(Recorded(), clock).frames():
+        lateness.append(clock() - frame.due_s)
+        clock.now_s += 0.1 if frame.index < 3 else 0.0
+    np.testing.assert_allclose(lateness, [0.0, 0.06, 0.1, 0.2, 0.0, 0.0], atol=1e-9)
+
+
+def test_waiting_is_counted_and_nothing_else_is(clock):
+    playback = played(Recorded(), clock)
+    for _ in playback.frames():
+        clock.now_s += 0.01  # work
+    assert playback.waited_s == pytest.approx(sum(clock.waits))
+    assert clock.now_s - 100.0 == pytest.approx(playback.waited_s + 0.06)
+
+
+def test_a_timestamp_that_runs_backwards_is_played_at_once(clock):
+    came = [clock() for _ in played(Recorded([0.0, 1.0, 0.2, 1.5]), clock).frames()]
+    np.testing.assert_allclose(np.array(came) - 100.0, [0.0, 1.0, 1.0, 1.5])
+
+
+def test_what_was_seen_before_comes_at_once_and_the_rest_at_its_own_time_from_there(clock):
+    playback, came = played(Recorded([0.0, 1.0, 2.0, 3.0, 4.5]), clock), []
+    playback.rushed = True
+    for frame in playback.frames():
+        came.append(clock() - 100.0)
+        assert frame.due_s == clock()
+        playback.rushed = frame.index < 2
+    np.testing.assert_allclose(came, [0.0, 0.0, 0.0, 1.0, 2.5])
+
+
+def test_what_is_known_of_the_recording_is_known_of_its_playback(clock):
+    source = Recorded()
+    playback = played(source, clock)
+    assert playback.paced
+    assert not playback.live
+    for name in ("path", "size_px", "frame_count", "duration_s", "warnings", "has_alpha"):
+        assert getattr(playback, name) == getattr(source, name)
+    assert playback.count_frames() == 6
+    playback.close()
+    assert source.closed
+
+
+def test_closing_ends_a_wait_at_once():
+    playback = RealtimePlayback(Recorded([0.0, 3600.0]), PacingClock())
+    taken = []
+    thread = threading.Thread(target=lambda: taken.extend(playback.frames()))
+    thread.start()
+    while not taken:
+        time.sleep(0.002)
+    began = time.monotonic()
+    playback.close()
+    thread.join(timeout=5.0)
+    assert not thread.is_alive()
+    assert time.monotonic() - began < 1.0
+    assert [frame.index for frame in taken] == [0]
+
+
+def test_a_file_of_no_fixed_rate_is_played_at_its_containers_timestamps(tmp_path, clock):
+    pictures = [Image.new("RGB", (16, 12), (40 * i, 0, 255 - 40 * i)) for i in range(5)]
+    shown_ms = [40, 200, 60, 500, 40]
+    pictures[0].save(
+        tmp_path / "uneven.gif", save_all=True, append_images=pictures[1:], duration=shown_ms
+    )
+    came = [clock() for _ in played(open_source(tmp_path / "uneven.gif"), clock).frames()]
+    expected = np.cumsum([0, *shown_ms[:-1]]) / 1000.0
+    np.testing.assert_allclose(np.array(came) - 100.0, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "seconds"), [(None, 0.8), (slice(5, None), 0.6), (slice(0, 10, 3), 0.4)]
+)
+def test_the_clip_lasts_as_long_as_its_wanted_frames(write_video, write_images, chosen, seconds):
+    video = open_source(write_video(frames=20), frames=chosen)
+    assert video.duration_s == pytest.approx(seconds)
+    images = open_source(write_images(20), frames=chosen)
+    assert images.duration_s == pytest.approx(seconds * 25.0 / 30.0)

@@ -1,0 +1,152 @@
+"""HDR: seen in a file's index, and brought to the colours of other pictures."""
+
+import numpy as np
+import pytest
+
+from capture.hdr_video import HLG, PEAK_NITS, PQ, WHITE_NITS, read_hdr_transfer, tone_map_hdr
+from capture.source_opening import open_source
+from capture.video_decoder import OpenCvDecoder
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return (len(content) + 8).to_bytes(4, "big") + kind + content
+
+
+def colour(transfer: int, kind: bytes = b"nclx") -> bytes:
+    return box(b"colr", kind + (9).to_bytes(2, "big") + transfer.to_bytes(2, "big") + b"\0\x09\0")
+
+
+def movie(*boxes: bytes, wide: bool = False) -> bytes:
+    head, media = box(b"ftyp", b"isom" * 4), bytes(5000) + b"colrnclx\0\x09\0\x10"
+    mdat = box(b"mdat", media)
+    if wide:
+        mdat = b"\0\0\0\x01mdat" + (len(media) + 16).to_bytes(8, "big") + media
+    return head + mdat + box(b"moov", box(b"trak", b"".join(boxes)))
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize(
+    ("boxes", "curve"),
+    [
+        ([colour(HLG)], HLG),
+        ([colour(PQ, b"nclc")], PQ),
+        ([colour(1)], None),
+        ([box(b"colr", b"prof" + bytes(40)), colour(HLG)], HLG),
+        ([], None),
+    ],
+)
+def test_a_files_index_tells_its_curve_and_its_pictures_do_not(tmp_path, boxes, curve, wide):
+    path = tmp_path / "video.mov"
+    path.write_bytes(movie(*boxes, wide=wide))
+    assert read_hdr_transfer(path) == curve
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"abc", bytes(64), b"\xff\xff\xff\xffmdat", b"\0\0\0\x01moov"]
+)
+def test_what_is_no_movie_has_no_curve(tmp_path, data):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(data)
+    assert read_hdr_transfer(path) is None
+
+
+def code_of(nits: float, curve: int) -> int:
+    """The 16-bit code of grey light, by the curves' own definitions (ITU-R BT.2100)."""
+    if curve == PQ:
+        y = (nits / 10000.0) ** 0.1593017578125
+        code = ((0.8359375 + 18.8515625 * y) / (1.0 + 18.6875 * y)) ** 78.84375
+    else:
+        scene = (nits / PEAK_NITS) ** (1.0 / 1.2)
+        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        code = np.sqrt(3 * scene) if scene <= 1 / 12 else a * np.log(12 * scene - b) + c
+    return round(65535 * code)
+
+
+def grey(nits: float, curve: int) -> np.ndarray:
+    code = np.full((2, 3, 3), code_of(nits, curve), np.uint16)
+    return tone_map_hdr(code, curve)[0, 0].astype(int)
+
+
+@pytest.mark.parametrize("curve", [PQ, HLG])
+@pytest.mark.parametrize("share", [0.02, 0.18, 0.5, 0.7])
+def test_light_below_the_knee_keeps_its_share_of_white(curve, share):
+    srgb = 1.055 * share ** (1 / 2.4) - 0.055
+    assert np.abs(grey(share * WHITE_NITS, curve) - 255 * srgb).max() <= 2
+
+
+@pytest.mark.parametrize("curve", [PQ, HLG])
+def test_highlights_are_compressed_and_not_cut_off(curve):
+    levels = [int(grey(nits, curve)[0]) for nits in (0.75 * 203, 203, 400, 700, 1000)]
+    assert levels == sorted(set(levels))  # each brighter than the one before
+    assert levels[-1] >= 254
+    assert 220 < levels[1] < 245
+
+
+def test_a_grey_stays_grey_and_a_skin_tone_stays_its_hue():
+    assert np.ptp(grey(100.0, PQ)) <= 1
+    wide = np.array([[1.0, 0.6, 0.45]]) * 120.0
+    codes = np.array([[[code_of(n, PQ) for n in wide[0]]]], np.uint16)
+    low = tone_map_hdr(codes, PQ)[0, 0].astype(float)
+    bright = np.array([[[code_of(4 * n, PQ) for n in wide[0]]]], np.uint16)
+    high = tone_map_hdr(bright, PQ)[0, 0].astype(float)
+
+    def hue(rgb):
+        linear = (rgb / 255) ** 2.2
+        return linear / linear.max()
+
+    np.testing.assert_allclose(hue(low), hue(high), atol=0.02)
+
+
+# --- a real file, where its writer is installed --------------------------------------------------
+
+
+@pytest.fixture
+def write_hdr(tmp_path):
+    av = pytest.importorskip("av", reason="PyAV (extra [video]) writes the test's HDR video")
+
+    def write(curve: int, name: str = "hdr.mp4"):
+        path = tmp_path / name
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx265", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p10le"
+            context = stream.codec_context
+            context.color_trc, context.color_primaries, context.colorspace = curve, 9, 9
+            context.color_range = 1
+            context.options = {"x265-params": "log-level=none", "preset": "ultrafast"}
+            for index in range(6):
+                frame = av.VideoFrame(128, 96, "yuv420p10le")
+                for plane, level in zip(frame.planes, (700, 512, 512), strict=True):
+                    rows = np.full((plane.height, plane.line_size // 2), level, np.uint16)
+                    plane.update(rows.tobytes())
+                frame.pts = index
+                frame.color_trc, frame.color_primaries, frame.colorspace = curve, 9, 9
+                for packet in stream.encode(frame):
+                    container.mux(packet)
+            for packet in stream.encode(None):
+                container.mux(packet)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("curve", [PQ, HLG])
+def test_an_hdr_video_comes_in_sdr_and_without_a_warning(write_hdr, curve):
+    source = open_source(write_hdr(curve))
+    frames = list(source.frames())
+    expected = tone_map_hdr(np.full((1, 1, 3), round((700 - 64) / 876 * 65535), np.uint16), curve)
+    assert len(frames) == 6
+    assert np.abs(frames[0].rgb.astype(int) - expected.astype(int)).max() <= 3
+    assert not source.warnings
+
+
+def test_without_pyav_an_hdr_video_is_read_and_warned_of(write_hdr, monkeypatch):
+    path = write_hdr(HLG)
+    monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
+    source = open_source(path)
+    assert len(list(source.frames())) == 6
+    assert "HDR video" in source.warnings[0]
+    assert "[video]" in source.warnings[0]
+
+
+def test_an_ordinary_video_is_not_warned_of(write_video):
+    assert not open_source(write_video(frames=3)).warnings

@@ -1,0 +1,237 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from export.bake.bake_tables import FINER_VOXEL_FACTOR
+from export.bake.fine_tuning import DEEPER_SETTINGS, fine_tune
+from export.bake.render_targets import VoxelCodes
+from export.build import export_field
+from export.package.package_file import read_package
+from export.package.player_tables import BRICK_SIZE
+from export.package.render_settings import QUALITY_TIERS
+from export.reference.ray_segments import RaySegments
+from export.reference.reference_player import PlayerInputs, draw_reference, trace_picture
+from export.reference.sirt_kernels import back_project, composite_segments
+
+RULES = QUALITY_TIERS["hq"]
+
+
+def shot_of(rig, pose, camera) -> PlayerInputs:
+    bones = camera.camera_from_world @ rig.world_from_body(pose)
+    bones = bones @ rig.body_from_canonical(pose.joint_rotations)
+    return PlayerInputs(
+        bones=bones[:, :3].astype(np.float32),
+        focal=np.array(camera.focal_px, dtype=np.float32),
+        center=np.array(camera.center_px, dtype=np.float32),
+        size_px=camera.size_px,
+        samples=RULES.samples,
+    )
+
+
+def codes_of(tables) -> VoxelCodes:
+    core = (
+        tables.bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE]
+        .reshape(-1, 4)
+        .astype(np.float32)
+    )
+    return VoxelCodes(core[:, 3].copy(), core[:, :3].copy())
+
+
+@pytest.fixture(scope="module")
+def renderer(stand_in, tables):
+    """The player itself, by the tables as they were baked: what it shows can be reached."""
+    return lambda pose, camera: draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
+
+
+@pytest.fixture(scope="module")
+def traced(stand_in, tables, views):
+    look = trace_picture(tables, RULES, shot_of(stand_in.rig, *views["bent"]))
+    first = RaySegments.of_first_layer(look.first_rays, look.nodes, tables.bricks, RULES)
+    return look, first.append_layer(RaySegments.of_further_layer(look, 1, tables.bricks, RULES))
+
+
+@pytest.fixture(scope="module")
+def spoilt(tables):
+    """The tables, redder and less dense than they were baked."""
+    voxels = tables.bricks.voxels.astype(int)
+    voxels[..., 0] = np.minimum(voxels[..., 0] + 24, 248)
+    voxels[..., 3] = np.where(voxels[..., 3] > 0, np.maximum(voxels[..., 3] - 16, 16), 0)
+    voxels[0] = 0
+    return replace(tables, bricks=replace(tables.bricks, voxels=voxels.astype(np.uint8)))
+
+
+@pytest.fixture(scope="module")
+def tune(stand_in, views):
+    def call(tables, renderer, **more):
+        with ThreadPoolExecutor(1) as beside:
+            return fine_tune(
+                tables, stand_in.rig, RULES, renderer,
+                views=list(views.values()), max_pictures=6, executor=beside, **more,
+            )  # fmt: skip
+
+    return call
+
+
+def test_what_tuning_thinks_is_shown_is_what_the_player_shows(stand_in, tables, views, traced):
+    look, pieces = traced
+    assert len(look.behind[0].again) > 20
+    assert pieces.layer.max() == 1
+    drawn = draw_reference(tables, RULES, shot_of(stand_in.rig, *views["bent"])).reshape(-1, 4)[
+        look.pixel
+    ]
+    out = composite_segments(pieces, RULES, tables.bricks.index, *codes_of(tables))
+    assert np.abs(out - drawn).max() < 2e-3
+
+
+def test_colours_are_pushed_against_the_error_s_gradient(tables, traced):
+    pieces = traced[1]
+    generator = np.random.default_rng(2)
+    density, color = codes_of(tables)
+    wanted = generator.random((pieces.rays, 4)).astype(np.float32)
+    push = back_project(pieces, RULES, tables.bricks.index, density, color, wanted)
+    way = generator.normal(size=color.shape).astype(np.float32)
+
+    def loss(size):
+        out = composite_segments(
+            pieces, RULES, tables.bricks.index, density, color + np.float32(size) * way
+        )
+        return squares(out - wanted)
+
+    slope = (loss(1.0) - loss(-1.0)) / 2.0  # exact: the error is quadratic in colours
+    assert (push.color * way).sum() * 4.0 / 255.0**2 == pytest.approx(slope, rel=1e-2)
+
+
+def test_densities_are_pushed_against_the_error_s_gradient(tables, traced):
+    pieces = traced[1]
+    generator = np.random.default_rng(3)
+    density, color = codes_of(tables)
+    color[:] = [40.0, 120.0, 200.0]  # one colour: it does not matter where it is read
+    density = np.where(density > 0, density - 30.0, 0.0).astype(np.float32)
+    patient = replace(RULES, min_transmittance=-1.0)  # no ray ends, or else what is seen would jump
+    wanted = np.zeros((pieces.rays, 4), dtype=np.float32)
+    push = back_project(pieces, patient, tables.bricks.index, density, color, wanted)
+    way = generator.random(density.shape).astype(np.float32) * (density > 0)
+
+    def loss(size):
+        moved = density + np.float32(size) * way
+        return squares(
+            composite_segments(pieces, patient, tables.bricks.index, moved, color) - wanted
+        )
+
+    slope = (loss(0.25) - loss(-0.25)) / 0.5
+    assert (push.density * way).sum() * 2.0 == pytest.approx(slope, rel=2e-2)
+
+
+def squares(error) -> float:
+    """On black and on white."""
+    on_white = error[:, :3] - error[:, 3:]
+    return float((error[:, :3].astype(float) ** 2).sum() + (on_white.astype(float) ** 2).sum())
+
+
+def test_tuning_lowers_the_error_on_a_view_that_it_did_not_see(
+    stand_in, tune, renderer, spoilt, bent, camera
+):
+    after = tune(spoilt, renderer)
+    assert after.psnr[1] > after.psnr[0] + 1.0
+    pose = replace(bent, joint_rotations=0.6 * bent.joint_rotations)
+    unseen = shot_of(stand_in.rig, pose, camera(96, 120, distance_m=2.6))
+    exact = renderer(pose, camera(96, 120, distance_m=2.6))
+    errors = [
+        ((draw_reference(t, RULES, unseen) - exact) ** 2).mean() for t in (spoilt, after.tables)
+    ]
+    assert errors[1] < 0.8 * errors[0]
+    assert after.tables.surfels is spoilt.surfels
+    assert not after.tables.bricks.voxels[0].any()
+
+
+def test_what_is_exact_already_stays(tune, renderer, tables):
+    after = tune(tables, renderer)
+    assert after.tables is tables
+    assert after.psnr[0] == after.psnr[1] > 60.0
+
+
+def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
+    def lies(pose, camera):
+        """The truth to whoever judges, who comes first; something else to whoever learns."""
+        lies.asked += 1
+        picture = renderer(pose, camera)
+        return picture if lies.asked <= 4 else picture[..., [2, 1, 0, 3]]
+
+    lies.asked = 0
+    assert tune(spoilt, lies).tables is spoilt
+    assert lies.asked == 10
+
+
+def test_progress_is_told_and_only_grows(tune, renderer, spoilt):
+    told = []
+    tune(spoilt, renderer, progress=told.append)
+    assert told == sorted(told)
+    assert 0 < told[0] < told[-1] <= 1
+    assert len(told) >= 11  # four judge, six are learnt from, and at least one round
+
+
+def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
+    stand_in, renderer, coarse, views, tables, tmp_path
+):
+    def interrupted(share):
+        raise KeyboardInterrupt
+
+    report = export_field(
+        stand_in.field_at,
+        stand_in.rig,
+        stand_in.occupied,
+        tmp_path / "avatar.iavatar",
+        views=list(views.values()),
+        metrics={},
+        renderer=renderer,
+        config=replace(coarse, fine_tuning_pictures=4),
+        progress=interrupted,
+    )
+    assert report.fine_tuning_psnr is None
+    assert any("interrupted" in warning for warning in report.warnings)
+    package = read_package(report.path)
+    assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
+
+
+@pytest.mark.slow
+def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
+    more = replace(RULES, **DEEPER_SETTINGS)
+
+    def deeper(pose, camera):
+        return draw_reference(tables, more, shot_of(stand_in.rig, pose, camera))
+
+    def as_asked(pose, camera):
+        return draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
+
+    assert tune(tables, deeper).rules == RULES
+    assert tune(tables, deeper, deepens=True).rules == more
+    assert tune(tables, as_asked, deepens=True).rules == RULES
+
+
+@pytest.mark.slow
+def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
+    stand_in, renderer, coarse, views, tables, tmp_path
+):
+    def paler(pose, camera):
+        picture = renderer(pose, camera).copy()
+        picture[..., :3] += 0.08 * (picture[..., 3:] - picture[..., :3])
+        return picture
+
+    def exported(exact):
+        report = export_field(
+            stand_in.field_at,
+            stand_in.rig,
+            stand_in.occupied,
+            tmp_path / "avatar.iavatar",
+            views=list(views.values()),
+            metrics={},
+            renderer=exact,
+            config=replace(coarse, fine_tuning_pictures=2),
+        )
+        return read_package(report.path).tables["hq"].bricks.voxel_m
+
+    usual = tables.bricks.voxel_m
+    assert exported(renderer) == pytest.approx(usual)
+    assert exported(paler) == pytest.approx(FINER_VOXEL_FACTOR * usual)

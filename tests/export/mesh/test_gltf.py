@@ -1,0 +1,208 @@
+"""The mesh and its .glb, read again by independent hands."""
+
+import io
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from export.mesh.gltf import SkeletonAnimation, encode_glb
+from export.mesh.skinned_mesh import extract_mesh
+from export.package.package_file import read_package
+from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
+from tests.export.mesh.test_isosurface import is_closed, volume
+
+TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
+SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+@pytest.fixture(scope="module")
+def package(exported):
+    return read_package(exported.path)
+
+
+@pytest.fixture(scope="module")
+def mesh(package):
+    return extract_mesh(package.tables["hq"])
+
+
+@pytest.fixture(scope="module")
+def motion(bent):
+    """Bent more and more, in a tracker's world that hangs upside down and turns."""
+    share = np.array([0.3, 0.7, 1.0])
+    flip = Rotation.from_euler("xyz", [np.pi - 0.2, 0.3, 0.1])
+    yaw = Rotation.from_rotvec(share[:, None] * [0.0, 1.2, 0.0])
+    return Motion(
+        root_rotations=(flip * yaw).as_rotvec(),
+        root_translations=share[:, None] * [0.5, -0.2, 3.0] + 1.0,
+        joint_rotations=share[:, None, None] * bent.joint_rotations,
+        valid=np.ones(3, dtype=bool),
+        betas=np.zeros(10),
+        body_model="body24",
+    )
+
+
+@pytest.fixture(scope="module")
+def file(mesh, package, motion):
+    rest = package.manifest.rest_joints
+    return encode_glb(
+        mesh, package.manifest, SkeletonAnimation.of(motion, (0, 1, 2), 25.0, rest[0]), name="x"
+    )
+
+
+class Read:
+    """A .glb as its specification says it is read."""
+
+    def __init__(self, content):
+        magic, version, length = struct.unpack_from("<4sII", content)
+        assert (magic, version, length) == (b"glTF", 2, len(content))
+        size, kind = struct.unpack_from("<I4s", content, 12)
+        assert kind == b"JSON"
+        self.json = json.loads(content[20 : 20 + size])
+        rest, kind = struct.unpack_from("<I4s", content, 20 + size)
+        assert kind == b"BIN\0"
+        self.binary = content[28 + size :]
+        assert len(self.binary) == rest == self.json["buffers"][0]["byteLength"]
+
+    def array(self, number):
+        accessor = self.json["accessors"][number]
+        view = self.json["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        width = SIZES[accessor["type"]]
+        array = np.frombuffer(
+            self.binary, TYPES[accessor["componentType"]], accessor["count"] * width,
+            view["byteOffset"],
+        ).reshape(-1, width)  # fmt: skip
+        assert array.nbytes == view["byteLength"]
+        if accessor.get("normalized"):
+            return array / float(np.iinfo(array.dtype).max)
+        return array
+
+    def attribute(self, name):
+        return self.array(self.json["meshes"][0]["primitives"][0]["attributes"][name])
+
+    def skinned(self, key=None):
+        """World positions at a key of the animation; without one, as the skeleton rests."""
+        nodes = [dict(node) for node in self.json["nodes"]]
+        clip = self.json["animations"][0]
+        for channel in clip["channels"] if key is not None else []:
+            values = self.array(clip["samplers"][channel["sampler"]]["output"])
+            nodes[channel["target"]["node"]][channel["target"]["path"]] = values[key]
+        world = {}
+
+        def place(number, parent):
+            node, local = nodes[number], np.eye(4)
+            local[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+            local[:3, 3] = node.get("translation", [0, 0, 0])
+            world[number] = parent @ local
+            for child in node.get("children", []):
+                place(child, world[number])
+
+        for root in self.json["scenes"][0]["nodes"]:
+            place(root, np.eye(4))
+        skin = self.json["skins"][0]
+        inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+        joints = np.stack([world[joint] for joint in skin["joints"]]) @ inverse
+        blended = np.einsum(
+            "vi,viab->vab", self.attribute("WEIGHTS_0"), joints[self.attribute("JOINTS_0")]
+        )
+        points = self.attribute("POSITION")
+        return np.einsum("vab,vb->va", blended[:, :3, :3], points) + blended[:, :3, 3]
+
+
+def test_the_mesh_is_one_closed_body_at_the_hull(mesh, tables):
+    assert is_closed(mesh.faces)
+    assert volume(mesh.positions, mesh.faces) > 0.01
+    hull = KDTree(tables.surfels.positions)
+    assert hull.query(mesh.positions)[0].max() < 0.03  # nothing inside, though bricks are hollow
+    assert KDTree(mesh.positions).query(tables.surfels.positions)[0].max() < 0.03
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_vertices_are_coloured_and_moved_as_the_avatar_is(mesh, stand_in):
+    import torch
+
+    inside = torch.from_numpy(mesh.positions - 0.004 * mesh.normals)
+    expected = stand_in.field_at(inside)[0].numpy() * 255.0
+    difference = np.abs(mesh.colors - expected).mean(axis=1)
+    assert np.median(difference) < 6.0
+    weights = np.zeros((len(mesh.positions), 24))
+    np.put_along_axis(weights, mesh.joints.astype(int), 0.0, axis=1)
+    for column in range(4):
+        np.add.at(
+            weights,
+            (np.arange(len(weights)), mesh.joints[:, column]),
+            mesh.weights[:, column] / 255.0,
+        )
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    from_rig = stand_in.rig.weights_at(mesh.positions)
+    assert np.abs(weights - from_rig).mean() < 0.005
+
+
+def test_the_skeleton_rests_in_the_canonical_pose_on_the_floor(file, mesh):
+    resting = Read(file).skinned()
+    floor = mesh.positions[:, 1].min()
+    np.testing.assert_allclose(resting, mesh.positions - [0.0, floor, 0.0], atol=1e-5)
+
+
+def test_every_key_of_the_animation_is_the_pose_turned_upright(file, mesh, package, motion):
+    manifest, read = package.manifest, Read(file)
+    rest, parents = manifest.rest_joints, manifest.parents
+    canonical = body_from_rest(rest, parents, manifest.canonical_rotations)
+    weights = mesh.weights / 255.0
+    first = motion[0]
+    upright = rotation_matrices(first.root_rotation).T
+    middle = rest[0] + first.root_translation
+    floor = mesh.positions[:, 1].min()
+    for row in range(3):
+        pose = motion[row]
+        root = world_from_body(rest[0], pose.root_rotation, pose.root_translation)
+        bones = body_from_rest(rest, parents, pose.joint_rotations) @ np.linalg.inv(canonical)
+        blended = np.einsum("vi,viab->vab", weights, (root @ bones)[mesh.joints])
+        world = np.einsum("vab,vb->va", blended[:, :3, :3], mesh.positions) + blended[:, :3, 3]
+        expected = (world - middle) @ upright.T + rest[0] - [0.0, floor, 0.0]
+        np.testing.assert_allclose(read.skinned(row), expected, atol=2e-5)
+    times = read.array(read.json["animations"][0]["samplers"][0]["input"])
+    np.testing.assert_allclose(times[:, 0], [0.0, 0.04, 0.08], atol=1e-6)
+
+
+def test_quaternions_take_the_short_way(package):
+    turns = np.linspace(0.0, 4.0 * np.pi, 60)
+    spin = Motion(
+        root_rotations=np.stack([0 * turns, (turns + np.pi) % (2 * np.pi) - np.pi, 0 * turns], 1),
+        root_translations=np.zeros((60, 3)),
+        joint_rotations=np.zeros((60, 23, 3)),
+        valid=np.ones(60, dtype=bool),
+        betas=np.zeros(10),
+        body_model="body24",
+    )
+    animation = SkeletonAnimation.of(spin, tuple(range(60)), 30.0, package.manifest.rest_joints[0])
+    steps = np.sum(animation.rotations[:, 1:] * animation.rotations[:, :-1], axis=-1)
+    assert (steps > 0.9).all()
+
+
+def test_another_reader_opens_it(file, mesh):
+    scene = trimesh.load(io.BytesIO(file), file_type="glb")
+    (found,) = scene.geometry.values()
+    np.testing.assert_allclose(found.vertices, mesh.positions, atol=1e-6)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    assert {"pelvis", "left_hand", "floor"} <= set(scene.graph.nodes)
+
+
+def test_colours_are_linear_light(file, mesh):
+    light = Read(file).attribute("COLOR_0")
+    back = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(back[:, :3] * 255.0, mesh.colors, atol=0.1)
+    assert (light[:, 3] == 1.0).all()
+
+
+def test_a_still_pose_is_a_motion_too(mesh, package, motion):
+    one = SkeletonAnimation.of(motion, (1,), 30.0, package.manifest.rest_joints[0])
+    read = Read(encode_glb(replace(mesh), package.manifest, one, name="x"))
+    assert read.skinned(0).shape == mesh.positions.shape

@@ -1,0 +1,382 @@
+import json
+import os
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+
+from avatar.config import TrainConfig
+from avatar.training.trainer import Trainer
+from capture.input_error import InputError
+from export import build
+from export.bake.bake_tables import MAX_VOXEL_M, MIN_VOXEL_M, BakeConfig, ExportRefused
+from export.build import export_avatar, export_field
+from export.package.manifest import OPTIONAL_SETTINGS, Manifest
+from export.package.package_file import read_package, write_package
+from export.package_checks import GOOD_PSNR, POOR_PSNR, quality_warnings
+from export.player import Player
+
+
+def rewritten(source, target, change):
+    """A copy of a package whose entries went through `change(name, content)`; None drops one."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            changed = change(name, old.read(name))
+            if changed is not None:
+                new.writestr(name, changed)
+    return target
+
+
+def with_manifest(**changes):
+    def change(name, content):
+        if name != "manifest.json":
+            return content
+        return json.dumps(json.loads(content) | changes).encode()
+
+    return change
+
+
+def test_a_package_comes_back_byte_by_byte(exported, tmp_path):
+    package = read_package(exported.path, tier=None)
+    again = tmp_path / "again.iavatar"
+    assert write_package(package, again) == exported.bytes
+    assert again.read_bytes() == exported.path.read_bytes()
+
+
+def test_the_manifest_says_what_the_package_is(exported):
+    with zipfile.ZipFile(exported.path) as archive:
+        content = json.loads(archive.read("manifest.json"))
+        assert set(archive.namelist()) - {"manifest.json"} == set(content["sha256"])
+    assert content["format"] == 3
+    assert len(content["joints"]) == len(content["rest_joints"]) == 24
+    assert "metres" in content["units"]
+    assert content["metrics"] == {"psnr": 30.0, "warnings": list(exported.warnings)}
+    note = content["tiers"]["hq"]
+    assert note["psnr_to_renderer"] == exported.psnr_to_renderer["hq"] > 30
+    assert max(side for frame in content["golden"] for side in frame["size_px"]) <= 128
+
+
+def test_every_altered_byte_of_a_stream_is_noticed(exported, tmp_path):
+    content = bytearray(exported.path.read_bytes())
+    whole, noticed = read_package(exported.path).manifest.to_json(), []
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(content) - 1, 12):
+        damaged = content.copy()
+        damaged[place] ^= 0x55
+        path = tmp_path / "damaged.iavatar"
+        path.write_bytes(damaged)
+        try:
+            package = read_package(path)
+        except InputError as error:
+            noticed.append(str(error))
+        else:  # a byte that carries no content, such as a time stamp
+            assert package.manifest.to_json() == whole
+    assert len(noticed) > 6
+    assert all("damaged.iavatar" in message for message in noticed)
+
+
+def test_metrics_without_a_value_are_null(exported):
+    manifest = replace(
+        read_package(exported.path).manifest, metrics={"psnr": [float("nan"), 1.5], "n": 3}
+    )
+    assert json.loads(manifest.to_json())["metrics"] == {"psnr": [None, 1.5], "n": 3}
+
+
+def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
+    def change(name, content):
+        return content[:-1] + b"x" if name == "hq/skin_weights.bin" else content
+
+    path = rewritten(exported.path, tmp_path / "x.iavatar", change)
+    with pytest.raises(InputError, match=r"altered: hq/skin_weights\.bin"):
+        read_package(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_package_is_refused(exported, tmp_path, share):
+    content = exported.path.read_bytes()
+    path = tmp_path / "short.iavatar"
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match="truncated"):
+        read_package(path)
+
+
+def test_a_missing_file_and_a_missing_entry_are_named(exported, tmp_path):
+    with pytest.raises(InputError, match="no package"):
+        read_package(tmp_path / "none.iavatar")
+    path = rewritten(
+        exported.path,
+        tmp_path / "x.iavatar",
+        lambda name, content: None if name == "player.onnx" else content,
+    )
+    with pytest.raises(InputError, match=r"player\.onnx is missing"):
+        read_package(path)
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "..\\evil", "C:evil"])
+def test_paths_out_of_the_archive_are_refused(exported, tmp_path, name):
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(exported.path.read_bytes())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(name, b"evil")
+    with pytest.raises(InputError, match="outside"):
+        read_package(path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.iavatar"]
+
+
+def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path):
+    def change(name, content):
+        return bytes(200 << 20) if name == "hq/thickness.bin" else content
+
+    path = rewritten(exported.path, tmp_path / "bomb.iavatar", change)
+    with pytest.raises(InputError, match=r"thickness\.bin claims 209715200 bytes"):
+        read_package(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"surfels": 10**9},
+        {"brick_counts": [10**6, 10**6, 10**6]},
+        {"bricks": -1},
+        {"skin_nodes": 10**7},
+        {"skin_counts": [10**6, 10**6, 1]},
+    ],
+)
+def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported, tmp_path, change):
+    with zipfile.ZipFile(exported.path) as archive:
+        tiers = json.loads(archive.read("manifest.json"))["tiers"]
+    tiers["hq"]["layout"] |= change
+    path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(tiers=tiers))
+    with pytest.raises(InputError, match="claims"):
+        read_package(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 1}, "format 1.*Export the avatar again"),
+        ({"format": 4}, "x.iavatar: .*format 4.*Update instant-avatar-stream"),
+        ({"tiers": {"hq": {}}}, "x.iavatar: .*damaged: it has no 'layout'"),
+        ({"rest_joints": [[0.0]]}, "damaged"),
+        ({"rest_joints": [[float("nan")] * 3] * 24}, "damaged"),
+        ({"parents": [-1] + [23] * 23}, "damaged"),
+        ({"tiers": []}, "damaged"),
+        ({"tiers": {}}, "damaged"),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_refused(exported, tmp_path, change, message):
+    path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(**change))
+    with pytest.raises(InputError, match=message):
+        read_package(path)
+
+
+def test_a_tier_that_is_not_there_is_named(exported):
+    with pytest.raises(InputError, match=r"no tier 'best'; it has: hq, lite"):
+        Player.load(exported.path, tier="best")
+
+
+@pytest.fixture
+def export(stand_in, views, truth, coarse, tmp_path):
+    """Exports the bent stand-in, or something else in its place."""
+
+    def run(**changes):
+        arguments = {
+            "occupied": stand_in.occupied,
+            "path": tmp_path / "a.iavatar",
+            "views": [views["bent"]],
+            "metrics": {},
+            "renderer": lambda pose, camera: truth["bent"],
+            "config": coarse,
+        }
+        return export_field(stand_in.field_at, stand_in.rig, **(arguments | changes))
+
+    return run
+
+
+def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(export, truth):
+    report = export(renderer=lambda pose, camera: np.roll(truth["bent"], 12, axis=1))
+    assert report.psnr_to_renderer["hq"] < POOR_PSNR
+    (warning,) = report.warnings
+    assert "shows the avatar poorly" in warning
+    assert read_package(report.path).manifest.metrics["warnings"] == [warning]
+
+
+@pytest.mark.parametrize(
+    ("score", "said"), [(GOOD_PSNR, None), (37.9, "simplifies"), (29.9, "poorly"), (8.0, "poorly")]
+)
+def test_what_is_said_of_a_package(score, said):
+    warnings = quality_warnings(score)
+    assert [said in warning for warning in warnings] == ([] if said is None else [True])
+
+
+def test_a_graph_that_differs_from_its_twin_is_refused_and_leaves_nothing(
+    export, tmp_path, monkeypatch
+):
+    right = build.build_graph
+    monkeypatch.setattr(
+        build,
+        "build_graph",
+        lambda tables, rules: right(tables, replace(rules, max_segment_m=0.01)),
+    )
+    with pytest.raises(ExportRefused, match="2/255"):
+        export()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_avatar_of_nothing_is_refused(export, stand_in, tmp_path):
+    with pytest.raises(ExportRefused, match="empty"):
+        export(occupied=np.zeros_like(stand_in.occupied))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_fog_of_an_untrained_avatar_is_written_with_a_warning(
+    stand_in, views, coarse, tmp_path
+):
+    config = TrainConfig(table_size=1 << 10, finest_m=0.03)
+    avatar = Trainer(stand_in.rig, config, torch.device("cpu")).avatar
+    pose, camera = views["canonical"]
+    report = export_avatar(
+        avatar, tmp_path / "a.iavatar", views=[(pose, camera)], metrics={}, config=coarse
+    )
+    assert any("poorly" in warning for warning in report.warnings)
+    assert Player(read_package(report.path)).render(pose, camera)[..., 3].max() > 0
+
+
+def test_voxels_follow_the_field_within_bounds():
+    assert BakeConfig.for_cell_size(0.001).voxel_m == MIN_VOXEL_M
+    assert MIN_VOXEL_M < BakeConfig.for_cell_size(0.009).voxel_m < MAX_VOXEL_M
+    assert BakeConfig.for_cell_size(0.1).voxel_m == MAX_VOXEL_M
+
+
+def test_a_hasty_package_is_coarser_and_plays_the_best_quality_alone(export, coarse, views):
+    report = export(config=coarse.hasty())
+    package = read_package(report.path)
+    assert list(package.manifest.tiers) == list(report.psnr_to_renderer) == ["hq"]
+    assert len(package.tables["hq"].surfels.positions) < 0.7 * len(
+        read_package(export(config=coarse).path).tables["hq"].surfels.positions
+    )
+    assert Player(package).render(*views["bent"])[..., 3].max() > 200
+    assert BakeConfig.for_cell_size(0.1).quick().voxel_m == MAX_VOXEL_M
+
+
+def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
+    path = tmp_path / "a.iavatar"
+    path.write_bytes(b"older")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    package = read_package(exported.path)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="space"):
+        write_package(package, path)
+    assert path.read_bytes() == b"older"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.iavatar"]
+
+
+def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
+    text = (Path(__file__).parents[2] / "docs" / "package-format.md").read_text()
+    room: dict = {}
+    exec(text.split("```python\n")[1].split("```")[0], room)
+    manifest, bricks, weights, places = room["read"](exported.path)
+    tables = read_package(exported.path).tables["hq"]
+    assert manifest["format"] == 3
+    np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
+    np.testing.assert_allclose(weights, tables.skinning.weights[1:], atol=1e-6)
+    np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)
+
+
+def with_flag(path, name, offset, value):
+    """Writes two bytes of an entry's line in the zip's list of entries."""
+    content = bytearray(path.read_bytes())
+    place = content.rfind(name.encode()) - 46
+    assert content[place : place + 4] == b"PK\1\2"
+    content[place + offset : place + offset + 2] = value.to_bytes(2, "little")
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 1), (10, zipfile.ZIP_LZMA), (10, 99)])
+def test_encrypted_and_strangely_compressed_entries_are_refused(exported, tmp_path, offset, value):
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(exported.path.read_bytes())
+    with_flag(path, "preview.png", offset, value)
+    with pytest.raises(InputError, match="encrypted or compressed in a way"):
+        read_package(path)
+
+
+def test_a_list_of_a_million_entries_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    line = b"PK\1\2" + bytes(24) + (1).to_bytes(2, "little") + bytes(16) + b"a"
+    directory = line * (1 << 20)
+    end = b"PK\5\6" + bytes(4) + b"\xff\xff" * 2 + len(directory).to_bytes(4, "little") + bytes(6)
+    path = tmp_path / "x.iavatar"
+    path.write_bytes(directory + end)
+    built = []
+    monkeypatch.setattr(zipfile, "ZipInfo", lambda *a: built.append(a))
+    with pytest.raises(InputError, match="longer than any package's"):
+        read_package(path)
+    assert not built
+
+
+def test_a_file_that_is_far_too_large_is_not_opened_as_a_zip(tmp_path):
+    path = tmp_path / "x.iavatar"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # a hole: it takes no room
+    with pytest.raises(InputError, match="no package has"):
+        read_package(path)
+
+
+def graph_of(nodes, tensors=()):
+    output = helper.make_tensor_value_info("rgba", TensorProto.INT32, None)
+    kinds = {"bones": (1, [24, 12]), "camera": (1, [4])}
+    kinds |= dict.fromkeys(("height", "width", "samples"), (7, []))
+    inputs = [helper.make_tensor_value_info(n, kind, shape) for n, (kind, shape) in kinds.items()]
+    graph = helper.make_graph(nodes, "g", inputs, [output], tensors)
+    imports = [helper.make_opsetid("", 18)]
+    return helper.make_model(graph, opset_imports=imports, ir_version=9).SerializeToString()
+
+
+def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
+    exported, views, tmp_path, monkeypatch
+):
+    (tmp_path / "secret").write_bytes(bytes(range(16)))
+    monkeypatch.chdir(tmp_path)
+    for place in ("secret", f"../{tmp_path.name}/secret", str(tmp_path / "secret")):
+        stolen = TensorProto(name="stolen", data_type=TensorProto.INT32, dims=[4])
+        stolen.data_location = TensorProto.EXTERNAL
+        for key, value in (("location", place), ("offset", "0"), ("length", "16")):
+            stolen.external_data.add(key=key, value=value)
+        graph = graph_of([helper.make_node("Identity", ["stolen"], ["rgba"])], [stolen])
+        with pytest.raises(InputError, match="does not run"):
+            Player(replace(read_package(exported.path), graphs={"hq": graph}))
+
+
+def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, views):
+    size = numpy_helper.from_array(np.array([1 << 20, 1 << 20, 4]), "size")
+    endless = helper.make_node(
+        "ConstantOfShape", ["size"], ["rgba"], value=helper.make_tensor("v", 6, [1], [7])
+    )
+    one = numpy_helper.from_array(np.zeros(1, dtype=np.int32), "one")
+    small = helper.make_node("Identity", ["one"], ["rgba"])
+    for graph, message in ((graph_of([endless], [size]), "cannot draw"),
+                           (graph_of([small], [one]), "instead of one 32-bit number")):  # fmt: skip
+        player = Player(replace(read_package(exported.path), graphs={"hq": graph}))
+        with pytest.raises(InputError, match=message):
+            player.render(*views["bent"])
+
+
+def test_a_package_from_before_later_rules_is_read_and_drawn_without_them(exported):
+    text = json.loads(read_package(exported.path).manifest.to_json())
+    rules = text["tiers"]["hq"]["settings"]
+    for name in OPTIONAL_SETTINGS:
+        del rules[name]
+    known = Manifest.from_json(json.dumps(text).encode()).tiers["hq"].settings
+    assert known.other_sheet_gap_m == known.layer_gap_m
+    assert known.fold_depth_offset_m == 0.0
+    assert known.max_compression > 1e6
+    del rules["layer_gap_m"]
+    with pytest.raises(InputError, match="damaged"):
+        Manifest.from_json(json.dumps(text).encode())

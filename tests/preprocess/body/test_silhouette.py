@@ -1,0 +1,94 @@
+"""Tests for small silhouettes: area, place, agreement."""
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.silhouette import SkinPoints, soft_iou, splat_silhouette
+
+
+@pytest.fixture(scope="module")
+def skin(shaped) -> SkinPoints:
+    return SkinPoints.of(shaped)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    """Upright, 3 m in front of the body, which is about 96 px high."""
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    camera_from_world[:3, 3] = [0.0, -0.1, 3.0]
+    return Camera(
+        focal_px=(160.0, 160.0),
+        center_px=(64.0, 64.0),
+        size_px=(128, 128),
+        camera_from_world=camera_from_world,
+    )
+
+
+def test_points_are_spread_evenly_over_the_skin(skin, shaped):
+    corners = shaped.vertices[shaped.body.faces]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(sides, axis=1)
+    center = (corners.mean(axis=1) * area[:, None]).sum(axis=0) / area.sum()
+    np.testing.assert_allclose(skin.rest.mean(axis=0), center, atol=2e-3)
+
+
+def test_points_move_with_the_skin(skin, shaped, rng):
+    pose = BodyPose(
+        root_rotation=rng.normal(size=3),
+        root_translation=rng.normal(size=3),
+        joint_rotations=0.4 * rng.normal(size=(23, 3)),
+    )
+    posed = shaped.with_pose(pose).vertices()
+    points = skin.posed(pose)
+    nearest = min(np.linalg.norm(points[:50, None] - posed[None], axis=-1).min(axis=1).max(), 1.0)
+    assert nearest < 0.04
+
+
+def test_a_silhouette_is_the_meshs_own(skin, shaped, camera):
+    drawn = splat_silhouette(skin.posed(BodyPose.rest()), camera)
+    exact = np.zeros((128 * 8, 128 * 8), np.uint8)
+    pixels = (camera.project(shaped.vertices) * 8).astype(np.int32)
+    for face in shaped.body.faces:
+        cv2.fillConvexPoly(exact, pixels[face], 1)
+    alpha = cv2.resize(exact.astype(np.float32), (128, 128), interpolation=cv2.INTER_AREA)
+    assert soft_iou(drawn, alpha) > 0.88  # the rim's pixels are drawn whole
+    assert soft_iou(drawn, (alpha > 0).astype(np.float32)) > 0.95
+
+
+def test_nothing_is_drawn_of_somebody_behind_the_camera(skin, camera):
+    behind = skin.posed(BodyPose.rest()) + np.array([0.0, 0.0, 10.0], dtype=np.float32)
+    assert not splat_silhouette(behind, camera).any()
+
+
+def test_a_lens_bends_the_silhouette_as_it_bends_points(skin, camera):
+    bent = Camera(**{**vars(camera), "distortion": (-0.2, 0.0, 0.0, 0.0)})
+    points = skin.posed(BodyPose.rest())
+    pixels = bent.project(points.astype(np.float64))
+    drawn = splat_silhouette(points, bent)
+    assert drawn[tuple(np.floor(pixels[:, ::-1]).astype(int).T)].all()
+
+
+def test_agreement_is_that_of_two_sets(rng):
+    a, b = rng.random((40, 40)) > 0.5, rng.random((40, 40)) > 0.5
+    assert soft_iou(a, b.astype(np.float32)) == pytest.approx((a & b).sum() / (a | b).sum())
+    assert soft_iou(a, a.astype(np.float32)) == 1.0
+    assert soft_iou(a & False, np.zeros((40, 40), np.float32)) == 0.0
+
+
+def test_turning_world_and_camera_together_changes_nothing(skin, camera):
+    points = skin.posed(BodyPose.rest())
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_matrices(np.array([0.3, 1.0, -0.4]))
+    turned = Camera(
+        **{**vars(camera), "camera_from_world": camera.camera_from_world @ np.linalg.inv(turn)}
+    )
+    before, after = (
+        splat_silhouette(points, camera),
+        splat_silhouette((points @ turn[:3, :3].T).astype(np.float32), turned),
+    )
+    assert soft_iou(before, after.astype(np.float32)) > 0.98

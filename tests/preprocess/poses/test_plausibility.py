@@ -1,0 +1,124 @@
+"""Poses in other units than radians and metres, and poses that only look as if they were."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.input_error import InputError
+from preprocess.body.body_pose import Motion, RelativeFocalLength
+from preprocess.poses.plausibility import (
+    implausibility_reason,
+    plausibility_warnings,
+    require_plausible,
+)
+
+POSES = 30
+
+
+@pytest.fixture
+def walk() -> Motion:
+    """A person who walks past at 1.2 m/s, 3 m away, with swinging arms and legs."""
+    phase = np.linspace(0.0, 4.0 * np.pi, POSES)
+    joints = np.zeros((POSES, 23, 3))
+    joints[:, [0, 1, 15, 16], 0] = 0.5 * np.sin(phase)[:, None]
+    joints[:, [15, 16], 2] = -1.0, 1.0
+    places = np.zeros((POSES, 3))
+    places[:, 0], places[:, 2] = 0.04 * np.arange(POSES), 3.0
+    return Motion(
+        root_rotations=np.tile([np.pi, 0.0, 0.1], (POSES, 1)),
+        root_translations=places,
+        joint_rotations=joints,
+        valid=np.ones(POSES, dtype=bool),
+        betas=np.zeros(10),
+        body_model="smpl",
+    )
+
+
+def spun(walk, turns_a_pose: float) -> Motion:
+    """The walk with a root whose angle counts on."""
+    roots = np.zeros((POSES, 3))
+    roots[:, 1] = 2.0 * np.pi * turns_a_pose * np.arange(POSES)
+    return replace(walk, root_rotations=roots)
+
+
+def test_radians_and_metres_pass_without_a_word(walk):
+    assert implausibility_reason(walk) is None
+    assert list(plausibility_warnings(walk)) == []
+    np.testing.assert_array_equal(require_plausible(walk, "walk.npz").valid, True)
+
+
+@pytest.mark.parametrize("turns_a_pose", [0.02, 0.1, 0.4])
+def test_a_spin_may_count_on_beyond_a_turn(walk, turns_a_pose):
+    """Also one of 144° from pose to pose, as few photographs of a turning person show it."""
+    spin = spun(walk, turns_a_pose)
+    assert implausibility_reason(spin) is None
+    assert list(plausibility_warnings(spin)) == []
+
+
+@pytest.mark.parametrize("rows", [1, POSES])
+def test_degrees_are_refused(walk, rows):
+    degrees = replace(walk, joint_rotations=np.rad2deg(walk.joint_rotations))
+    with pytest.raises(InputError, match=r"walk\.npz: A joint is bent by 3\d\d\d°.*degrees given"):
+        require_plausible(degrees.taken(np.arange(rows)), "walk.npz")
+
+
+def test_one_damaged_pose_is_left_out_and_named(walk):
+    joints = walk.joint_rotations.copy()
+    joints[4, 7] = 0.0, 25.0, 0.0
+    damaged = replace(walk, joint_rotations=joints)
+    np.testing.assert_array_equal(
+        require_plausible(damaged, "walk.npz").valid, np.arange(POSES) != 4
+    )
+    assert [sentence[:7] for sentence in plausibility_warnings(damaged)] == ["1 of 30"]
+
+
+def test_an_odd_bend_is_kept_and_named(walk):
+    joints = walk.joint_rotations.copy()
+    joints[4, 7] = 0.0, 5.0, 0.0
+    odd = replace(walk, joint_rotations=joints)
+    assert require_plausible(odd, "walk.npz").valid.all()
+    (sentence,) = plausibility_warnings(odd)
+    assert "A joint is bent by 286°" in sentence
+
+
+def test_a_root_in_degrees_is_named(walk):
+    for roots in (walk, spun(walk, 0.02)):
+        degrees = replace(walk, root_rotations=np.rad2deg(roots.root_rotations))
+        (sentence,) = plausibility_warnings(degrees)
+        assert "The root is turned" in sentence
+
+
+@pytest.mark.parametrize("unit", [1000.0, 100.0])
+def test_places_in_other_units_are_refused_or_named(walk, unit):
+    scaled = replace(walk, root_translations=unit * walk.root_translations)
+    if unit == 1000.0:
+        with pytest.raises(InputError, match="millimetres or centimetres given"):
+            require_plausible(scaled, "walk.npz")
+    else:
+        (sentence,) = plausibility_warnings(scaled)
+        assert "are they in metres?" in sentence
+
+
+def test_poses_of_frames_far_apart_may_be_far_apart(walk):
+    """One frame in ten seconds of a long walk."""
+    far = replace(walk, root_translations=300.0 * walk.root_translations)
+    assert implausibility_reason(far) is not None
+    assert implausibility_reason(replace(far, frames=300 * np.arange(POSES))) is None
+    assert implausibility_reason(replace(far, times_s=10.0 * np.arange(POSES))) is None
+
+
+def test_depths_for_a_trackers_own_lens_are_not_judged(walk):
+    """4D-Humans takes a focal length of 5000 px for a crop, and puts people far away."""
+    far = replace(walk, root_translations=25.0 * walk.root_translations, space="camera")
+    assert list(plausibility_warnings(far)) != []
+    assert (
+        list(plausibility_warnings(replace(far, assumed_focal=RelativeFocalLength(ratio=19.5))))
+        == []
+    )
+
+
+def test_poses_that_are_all_lost_are_left_to_others(walk):
+    lost = replace(walk, valid=np.zeros(POSES, dtype=bool))
+    assert implausibility_reason(lost) is None
+    assert list(plausibility_warnings(lost)) == []

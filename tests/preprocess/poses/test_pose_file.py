@@ -1,0 +1,158 @@
+"""Pose files in every spelling that is read, and in those that are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.input_error import InputError
+from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.poses.pose_file import read_motion, write_motion
+
+
+@pytest.fixture
+def write(tmp_path, motion):
+    """Writes the motion in InstantAvatar's keys, with changes; None leaves a key out."""
+
+    def write(**changes):
+        arrays = {
+            "betas": motion.betas[None],
+            "global_orient": motion.root_rotations,
+            "body_pose": motion.joint_rotations.reshape(6, 69),
+            "transl": motion.root_translations,
+            **changes,
+        }
+        path = tmp_path / "poses.npz"
+        np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
+        return path
+
+    return write
+
+
+def assert_same(a, b):
+    np.testing.assert_array_equal(a.root_rotations, b.root_rotations)
+    np.testing.assert_array_equal(a.root_translations, b.root_translations)
+    np.testing.assert_array_equal(a.joint_rotations, b.joint_rotations)
+    np.testing.assert_array_equal(a.valid, b.valid)
+    np.testing.assert_array_equal(a.betas, b.betas)
+    assert a.model == b.model
+    for one, other in ((a.frames, b.frames), (a.times_s, b.times_s), (a.intrinsic, b.intrinsic)):
+        assert (one is None) == (other is None)
+        if one is not None:
+            np.testing.assert_array_equal(one, other)
+
+
+def test_what_is_written_is_read(tmp_path, motion):
+    rich = replace(
+        motion,
+        valid=np.arange(6) != 3,
+        frames=np.array([0, 2, 4, 7, 8, 9]),
+        times_s=np.arange(6) / 25,
+        intrinsic=np.diag([500.0, 510.0, 1.0]),
+        body_model="smpl",
+    )
+    for number, wanted in enumerate((motion, rich)):
+        path = tmp_path / f"{number}.npz"
+        write_motion(path, wanted)
+        assert_same(read_motion(path), wanted)
+
+
+def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
+    """Also their cameras: a file with one of six would not be read."""
+    cameras = np.tile(np.eye(4), (6, 1, 1))
+    cameras[:, 0, 3] = np.arange(6)
+    whole = replace(motion, camera_from_world=cameras, interpolated=np.arange(6) == 4)
+    some = whole.taken(np.array([4, 2]), np.array([10, 11]))
+    write_motion(tmp_path / "some.npz", some)
+    again = read_motion(tmp_path / "some.npz")
+    assert_same(again, some)
+    assert again.camera_from_world[:, 0, 3].tolist() == [4.0, 2.0]
+    assert some.bridged.tolist() == [True, False]
+
+
+def test_the_three_spellings_are_one(write, motion):
+    poses = np.column_stack([motion.root_rotations, motion.joint_rotations.reshape(6, 69)])
+    nothing = {"global_orient": None, "body_pose": None}
+    assert_same(read_motion(write()), motion)
+    assert_same(read_motion(write(**nothing, thetas=poses)), motion)
+    trans = motion.root_translations
+    assert_same(read_motion(write(**nothing, transl=None, poses=poses, trans=trans)), motion)
+
+
+def test_betas_of_one_row_many_rows_or_none(write, motion):
+    np.testing.assert_array_equal(read_motion(write(betas=motion.betas)).betas, motion.betas)
+    many = np.stack([motion.betas + 1, motion.betas - 1, np.full(10, np.nan)])
+    np.testing.assert_allclose(read_motion(write(betas=many)).betas, motion.betas)
+    assert read_motion(write(betas=None)).betas.shape == (0,)
+
+
+def test_the_model_is_what_the_file_says_or_else_the_readers(write):
+    assert read_motion(write()).body_model == "body24"
+    assert read_motion(write(), default_model="smpl").body_model == "smpl"
+    assert read_motion(write(model=np.array("smpl"))).body_model == "smpl"
+
+
+def test_rows_with_nan_or_marked_as_lost_are_not_valid(write, motion):
+    turned, shifted = motion.root_rotations.copy(), motion.root_translations.copy()
+    turned[1, 2], shifted[4, 0], shifted[3, 1] = np.nan, np.inf, 1e200
+    marked = np.array([True, True, False, True, True, True])
+    motion = read_motion(write(global_orient=turned, transl=shifted, valid=marked))
+    assert motion.valid.tolist() == [True, False, False, False, False, True]
+
+
+def test_a_camera_matrix_per_row_becomes_their_median(write):
+    matrices = np.stack([np.diag([f, f, 1.0]) for f in (500.0, 520.0, 510.0, np.nan, 510.0, 510.0)])
+    np.testing.assert_array_equal(read_motion(write(K=matrices)).intrinsic, np.diag([510, 510, 1]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transl": None}, "expected global_orient and body_pose and transl"),
+        ({"body_pose": np.zeros((6, 60))}, r"\(N, 72\)"),
+        ({"global_orient": np.zeros((5, 3))}, "5 rows of `global_orient` but 6"),
+        ({"body_pose": np.full((6, 69), "a")}, "no numbers"),
+        ({"global_orient": np.array([{}])}, "plain arrays"),
+        ({"betas": np.full((1, 10), np.nan)}, "`betas`"),
+        ({"betas": np.zeros((1, 1, 10))}, "`betas`"),
+        ({"frame": np.arange(5)}, "5 numbers in `frame` for 6 poses"),
+        ({"frame": np.zeros(6)}, "twice"),
+        ({"frame": np.arange(6) + 0.5}, "no frame numbers"),
+        ({"time": np.arange(7.0)}, "`time`"),
+        ({"valid": np.ones(2)}, "`valid`"),
+        ({"K": np.zeros((3, 3))}, "`K`"),
+    ],
+)
+def test_what_is_no_motion_is_refused_by_name(write, changes, message):
+    with pytest.raises(InputError, match=message):
+        read_motion(write(**changes))
+
+
+def test_no_rows_are_no_motion(write):
+    with pytest.raises(InputError):
+        read_motion(
+            write(
+                global_orient=np.zeros((0, 3)),
+                body_pose=np.zeros((0, 69)),
+                transl=np.zeros((0, 3)),
+            )
+        )
+
+
+def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_motion(tmp_path / "poses.npz")
+    (tmp_path / "poses.npz").write_bytes(b"PK\x03\x04 and no more")
+    with pytest.raises(InputError, match="readable"):
+        read_motion(tmp_path / "poses.npz")
+    (tmp_path / "poses.pkl").write_bytes(b"")
+    with pytest.raises(InputError, match=r"\.npz"):
+        read_motion(tmp_path / "poses.pkl")
+
+
+def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
+    folder = tmp_path / "capture"
+    (folder / "truth").mkdir(parents=True)
+    for name, wanted in (("poses.npz", motion), ("dance.npz", motion.taken(np.arange(2)))):
+        write_motion(folder / name, wanted)
+    assert_same(read_poses(folder), read_poses(folder / "poses.npz"))

@@ -1,0 +1,145 @@
+"""Tests for placing one camera by known points, and for following points between key frames."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.source_opening import open_source
+from preprocess.sfm.point_tracking import detect_corners, detect_static_camera, track_points
+from preprocess.sfm.resection import resect_camera, resect_intermediate_frames
+from preprocess.sfm.sfm_keyframes import SfmKeyframe
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Millimetres between two cameras' centres, and degrees between their rotations."""
+    centers = [-view[:3, :3].T @ view[:3, 3] for view in (a, b)]
+    turn = Rotation.from_matrix(a[:3, :3] @ b[:3, :3].T).magnitude()
+    return 1000.0 * float(np.linalg.norm(centers[0] - centers[1])), float(np.degrees(turn))
+
+
+@pytest.mark.parametrize("bend", [0.0, -0.08])
+def test_a_camera_is_placed_exactly_though_a_third_of_the_points_is_wrong(
+    cameras, room_points, rng, bend
+):
+    lens = replace(cameras[3], distortion=(bend, 0.0, 0.0, 0.0) if bend else ())
+    view = lens.camera_from_world
+    ahead = room_points @ view[2, :3] + view[2, 3] > 0.5
+    straight = cameras[3].project(room_points[ahead])  # far outside, the lens folds
+    inside = ((straight > 0.0) & (straight < lens.size_px)).all(axis=1)
+    pixels = lens.project(room_points[ahead])
+    points, pixels = room_points[ahead][inside], pixels[inside]
+    wrong = rng.random(len(points)) < 0.33
+    pixels[wrong] += rng.normal(size=(wrong.sum(), 2)) * 60.0
+    millimetres, degrees = apart(resect_camera(points, pixels, lens), view)
+    assert millimetres < 0.1
+    assert degrees < 0.01
+
+
+def test_points_that_contradict_each_other_place_nothing(cameras, room_points, rng):
+    pixels = rng.uniform(0.0, 400.0, (len(room_points), 2))
+    assert resect_camera(room_points, pixels, cameras[0]) is None
+    assert resect_camera(room_points[:10], cameras[0].project(room_points[:10]), cameras[0]) is None
+
+
+def test_points_are_followed_to_a_fraction_of_a_pixel(room, cameras):
+    picture = cv2.cvtColor(room.seen(cameras[0]), cv2.COLOR_RGB2GRAY)
+    shift = np.array([[1.0, 0.0, 3.25], [0.0, 1.0, -1.5]])
+    moved = cv2.warpAffine(picture, shift, picture.shape[::-1], flags=cv2.INTER_CUBIC)
+    pixels = detect_corners(picture, np.ones(picture.shape, dtype=bool), 200)
+    inner = ((pixels > 30.0) & (pixels < np.array(picture.shape[::-1]) - 30.0)).all(axis=1)
+    there, found = track_points(picture, moved, pixels[inner])
+    assert found.mean() > 0.9
+    off = there[found] - pixels[inner][found] - shift[:, 2]
+    assert np.median(np.abs(off)) < 0.05
+
+
+def test_points_that_are_covered_are_lost(room, cameras):
+    picture = cv2.cvtColor(room.seen(cameras[0]), cv2.COLOR_RGB2GRAY)
+    covered = picture.copy()
+    covered[:, :320] = 90
+    pixels = detect_corners(picture, np.ones(picture.shape, dtype=bool), 300)
+    _, found = track_points(picture, covered, pixels)
+    right = pixels[:, 0] > 400.0
+    assert found[right].mean() > 0.9
+    assert not found[pixels[:, 0] < 300.0].any()
+
+
+def shown(room, cameras) -> list[SfmKeyframe]:
+    """Pictures with a person that goes from left to right."""
+    keys = []
+    for index, camera in enumerate(cameras):
+        grey = cv2.cvtColor(room.seen(camera), cv2.COLOR_RGB2GRAY)
+        person = np.zeros(grey.shape, dtype=bool)
+        left = 20 + 5 * index
+        person[60:200, left : left + 60] = True
+        texture = np.random.default_rng(5).integers(0, 255, (140, 60), dtype=np.uint8)
+        grey[60:200, left : left + 60] = texture
+        keys.append(SfmKeyframe(index=index, gray=grey, person_mask=person))
+    return keys
+
+
+def test_a_tripod_is_known_though_the_person_moves(room, walked):
+    camera = walked(2, degrees=0.0, size_px=(320, 240), focal_px=260.0)[0]
+    rest = detect_static_camera(shown(room, [camera] * 12))
+    assert rest.is_static
+    assert rest.background_motion < 1e-3
+
+
+def test_a_camera_that_walks_or_trembles_is_no_tripod(room, walked):
+    for degrees in (100.0, 0.0):  # round the room; on the spot, by 2 cm each way
+        cameras = walked(12, degrees=degrees, size_px=(320, 240), focal_px=260.0)
+        assert not detect_static_camera(shown(room, cameras)).is_static
+
+
+@pytest.fixture
+def film(room, walked, tmp_path):
+    cameras = walked(31, degrees=30, size_px=(320, 240), focal_px=260.0)
+    for index, camera in enumerate(cameras):
+        cv2.imwrite(str(tmp_path / f"{index:04d}.png"), room.seen(camera)[..., ::-1])
+    return cameras, open_source(tmp_path)
+
+
+def keyed(film, cameras, room_points, exact_model, rows):
+    """Every fifth frame is known exactly, with the corners of its picture as points."""
+    keys, seen = [], []
+    for frame in film.frames():
+        if frame.index in rows:
+            grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+            keys.append(
+                SfmKeyframe(index=frame.index, gray=grey, person_mask=np.zeros(grey.shape, bool))
+            )
+            seen.append(cameras[frame.index])
+    model = exact_model(seen, room_points)
+    return keys, replace(model, frames=np.array(rows))
+
+
+def test_frames_between_key_frames_are_placed_to_millimetres(film, room_points, exact_model):
+    cameras, source = film
+    rows = [0, 6, 12, 18, 24]
+    keys, model = keyed(source, cameras, room_points, exact_model, rows)
+    found = resect_intermediate_frames(source, model, keys, lambda share: None)
+    assert sorted(found.cameras) == [i for i in range(31) if i not in rows]  # those at the end, too
+    off = np.array([apart(found.cameras[i], cameras[i].camera_from_world) for i in found.cameras])
+    assert np.median(off[:, 0]) < 4.0
+    assert off[:, 0].max() < 20.0
+    assert np.median(off[:, 1]) < 0.1
+    assert sorted(found.keyframe_errors_px) == rows[1:]
+    assert max(found.keyframe_errors_px.values()) < 0.6
+
+
+def test_a_key_frame_in_the_wrong_place_is_betrayed_by_what_is_followed(
+    film, room_points, exact_model
+):
+    cameras, source = film
+    rows = [0, 6, 12, 18, 24]
+    keys, model = keyed(source, cameras, room_points, exact_model, rows)
+    views = model.camera_from_world.copy()
+    views[2, :3, 3] += [0.12, 0.0, 0.0]
+    found = resect_intermediate_frames(
+        source, replace(model, camera_from_world=views), keys, lambda s: None
+    )
+    assert found.keyframe_errors_px[12] > 3.0
+    assert found.keyframe_errors_px[6] < 0.6
