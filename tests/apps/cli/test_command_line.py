@@ -9,7 +9,7 @@ import pytest
 
 from apps.cli import command_line
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 COMMANDS = {**SCRIPTS, "python -m apps.fetch_runtime": "apps.fetch_runtime:main"}
 

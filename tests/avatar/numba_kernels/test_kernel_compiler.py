@@ -31,7 +31,7 @@ print(twice(1.0), sum(twice.stats.cache_hits.values()))
 
 
 def run(folder: Path) -> list[str]:
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     code = f"import sys; sys.path[:0] = [{str(root)!r}, {str(folder)!r}]; import caller"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return done.stdout.split()

@@ -115,7 +115,7 @@ def test_its_steps_are_those_of_torch():
 
 
 def test_a_first_step_loads_no_compiler():
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_COMPILER],
         cwd=root, capture_output=True, text=True, check=True,

@@ -279,7 +279,7 @@ def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
 
 
 def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
-    text = (Path(__file__).parents[2] / "docs" / "package-format.md").read_text()
+    text = (Path(__file__).parents[3] / "docs" / "package-format.md").read_text()
     room: dict = {}
     exec(text.split("```python\n")[1].split("```")[0], room)
     manifest, bricks, weights, places = room["read"](exported.path)
