@@ -107,7 +107,7 @@ class GraphValue:
 
     def floor(self) -> "GraphValue":
         """Next integer below, as a float."""
-        return self._with("FloorPlane")
+        return self._with("Floor")
 
     def exp(self) -> "GraphValue":
         """Exponential."""

@@ -119,7 +119,7 @@ class RaySegments:
         return cls(ray_offsets=np.concatenate([*starts, offsets[-1:]]), **columns)
 
 
-_SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "first"]
+_SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "ray_offsets"]
 """What there is one of for each piece."""
 
 

@@ -26,7 +26,7 @@ export class Engine {
 
   /** Straight-alpha RGBA of width × height, and the milliseconds it took. */
   async draw(tier, shot) {
-    const samples = shot.samples ?? this.avatar.tiers[tier].rules.samples;
+    const samples = shot.samples ?? this.avatar.tiers[tier].settings.samples;
     const { rgba, ms } = await this.ask("draw", { tier, ...shot, samples });
     return { rgba: new Uint8ClampedArray(rgba), ms };
   }
