@@ -152,7 +152,7 @@ CORRUPTED = (
         capture="small", corruptions=(("frame_offset", capture_corruptions.keep_last_poses(30)),)
     ),
     CorruptedCapture(
-        capture="dance", corruptions=(("add_second_person", capture_corruptions.add_second_person),)
+        capture="dance", corruptions=(("second_person", capture_corruptions.add_second_person),)
     ),
     CorruptedCapture(
         capture="turn", corruptions=(("video_rotation", capture_corruptions.rotate_video(1)),)
@@ -164,10 +164,10 @@ CORRUPTED = (
         capture="dance", corruptions=(("video_rotation", capture_corruptions.rotate_video(3)),)
     ),
     CorruptedCapture(
-        capture="turn", corruptions=(("undo_video_mirroring", capture_corruptions.mirror_video),)
+        capture="turn", corruptions=(("video_mirrored", capture_corruptions.mirror_video),)
     ),
     CorruptedCapture(
-        capture="noisy", corruptions=(("undo_video_mirroring", capture_corruptions.mirror_video),)
+        capture="noisy", corruptions=(("video_mirrored", capture_corruptions.mirror_video),)
     ),
     CorruptedCapture(
         capture="dance",
@@ -190,7 +190,7 @@ CORRUPTED = (
         capture="dance",
         corruptions=(
             ("frame_offset", capture_corruptions.delay_poses(5)),
-            ("undo_video_mirroring", capture_corruptions.mirror_video),
+            ("video_mirrored", capture_corruptions.mirror_video),
         ),
     ),
 )

@@ -10,8 +10,9 @@ from jaxtyping import Float, Float32, Int, Int32, UInt8
 from capture.camera import Camera
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.parametric_body import ShapedBody
-from studio.clothing_layers import all_template_points, build_layers, vertex_normals
+from studio.clothing_layers import all_template_points, build_layers
 from studio.lighting import bake_light, composite_over, shade_pixels
 from studio.outfit import OUTFITS, SHOE, Outfit
 from studio.zbuffer import rasterize

@@ -9,6 +9,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree
 
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.parametric_body import BodyModel
 from studio.outfit import EYE, HAIR, SHIRT, SHOE, SKIN, TROUSERS, Outfit
 
@@ -139,22 +140,6 @@ def _neighbor_mean_operator(
     inner = np.ones(count, dtype=bool)
     inner[unique[used == 1].ravel()] = False
     return csr_matrix(links.multiply(1.0 / degree[:, None])), inner
-
-
-def vertex_normals(
-    points: Float[np.ndarray, "vertices 3"], faces: Int32[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
-    """Unit normals, area-weighted over the triangles around each vertex."""
-    a, b, c = (points[faces[:, corner]] for corner in range(3))
-    across = np.cross(b - a, c - a)
-    normals = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(across[:, axis], 3), minlength=len(points))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
 
 
 def _shirt(body: BodyModel, outfit: Outfit) -> ClothingLayer:

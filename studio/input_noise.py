@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
+from preprocess.body.silhouette import signed_distance_px
 from preprocess.poses.root_placement import transform_motion
 
 BORDER_NOISE_SCALE_PX = 6.0
@@ -27,17 +28,13 @@ def add_mask_noise(
     """
     if noise_px == 0.0:
         return alpha
-    inside = (alpha >= 0.5).astype(np.uint8)
-    away = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(
-        1 - inside, cv2.DIST_L2, 5
-    )
-    away -= np.where(inside > 0, 0.5, -0.5)  # from pixel centres to the border between them
+    inside_px = -signed_distance_px(alpha >= 0.5)
     white = generator.standard_normal(alpha.shape).astype(np.float32)
     wander = cv2.GaussianBlur(
         white, (0, 0), BORDER_NOISE_SCALE_PX, borderType=cv2.BORDER_REFLECT_101
     )
     wander *= noise_px * 2.0 * np.sqrt(np.pi) * BORDER_NOISE_SCALE_PX  # a blur leaves 1 / (2 √π σ)
-    return np.clip(away + wander + 0.5, 0.0, 1.0).astype(np.float32)
+    return np.clip(inside_px + wander + 0.5, 0.0, 1.0).astype(np.float32)
 
 
 NOISE_FRAMES = 3.0

@@ -14,7 +14,6 @@ from preprocess.alignment.correction_search import (
     USABLE_IOU,
     CorrectionResult,
     find_corrections,
-    mean_score,
     needs_video_correction,
 )
 from preprocess.alignment.corrections import undo_pose_delay

@@ -14,8 +14,7 @@ from capture.camera import same_aspect_ratio
 from capture.frame import Frame
 from capture.output_file_list import OutputFileList
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.correction_search import mean_score
-from preprocess.alignment.silhouette_objective import spaced_indices
+from preprocess.alignment.silhouette_objective import mean_score, spaced_indices
 from preprocess.body.silhouette import SkinPoints, splat_silhouette
 
 COLUMNS = 6

@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from avatar.deformation.rig import canonical_rotations
 from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage, pose_patches
-from avatar.evaluation.skin_patches import visible_points
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import visible_points
 from preprocess.body.parametric_body import ShapedBody
 
 VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (2, 1.0)}

@@ -1,7 +1,4 @@
-"""What moves the avatar: one person's joints, canonical pose, box and skinning volume.
-
-Which way the skin looks: unit outward normals at its vertices, and each one's share of it.
-"""
+"""What moves the avatar: one person's joints, canonical pose, box and skinning volume."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +10,7 @@ from scipy.ndimage import maximum_filter
 
 from avatar.deformation.skinning_volume import skin_distance_volume, skinning_weight_volume
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.kinematics import body_from_rest, world_from_body
 from preprocess.body.parametric_body import ShapedBody
 
@@ -96,7 +94,7 @@ class Rig:
         low = (vertices.min(axis=0) - margin_m).astype(np.float32)
         high = (vertices.max(axis=0) + margin_m).astype(np.float32)
         seeds = _seed_vertices(vertices, body.weights)
-        normals, _ = vertex_normals(vertices, body.faces)
+        normals = vertex_normals(vertices, body.faces)
         distance, inside = skin_distance_volume(
             vertices, normals, low, high, DISTANCE_CELL_M, margin_m + 0.02
         )
@@ -176,17 +174,3 @@ def _seed_vertices(
     voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
     keys = np.column_stack([voxels, PART_OF_JOINT[weights.argmax(axis=1)]])
     return np.unique(keys, axis=0, return_index=True)[1]
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices"]]:
-    """Outward unit normals, and each vertex's share of the surface in square metres."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    doubled = np.cross(b - a, c - a)
-    normals, areas = np.zeros_like(vertices), np.zeros(len(vertices))
-    for k in range(3):
-        np.add.at(normals, faces[:, k], doubled)
-        np.add.at(areas, faces[:, k], np.linalg.norm(doubled, axis=1) / 6.0)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return normals, areas

@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, visible_points
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches
+from preprocess.body.body_surface import visible_points
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 

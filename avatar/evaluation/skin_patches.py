@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from avatar.deformation.rig import PART_OF_JOINT, vertex_normals
+from avatar.deformation.rig import PART_OF_JOINT
+from preprocess.body.body_surface import vertex_areas, vertex_normals, visible_points
 from preprocess.body.parametric_body import ShapedBody
 
 PART_NAMES = (
@@ -55,7 +56,8 @@ class SkinPatches:
         Left out is what nobody sees: the mouth's inside, and the soles.
         """
         weights = shaped.body.weights
-        normals, areas = vertex_normals(shaped.vertices, shaped.body.faces)
+        surface = shaped.vertices, shaped.body.faces
+        normals, areas = vertex_normals(*surface), vertex_areas(*surface)
         parts = PART_OF_JOINT[weights.argmax(axis=1)]
         sides = _side_of_vertex(normals, parts)
         voxels = np.floor(shaped.vertices / PATCH_M).astype(np.int64)
@@ -90,35 +92,6 @@ class SkinPatches:
         pairs = KDTree(self.points).query_pairs(ADJACENT_M, output_type="ndarray")
         along = np.einsum("na,na->n", *self.normals[pairs.T])
         return pairs[along > 0.0]
-
-
-def visible_points(
-    image_points: Float[np.ndarray, "points 2"],
-    depth: Float[np.ndarray, "points"],
-    cosine: Float[np.ndarray, "points"],
-    *,
-    cell_m: float,
-    tolerance_m: float,
-) -> Bool[np.ndarray, "points"]:
-    """Which points nothing else stands before: a depth buffer of coarse cells.
-
-    Args:
-        plane: Where they are seen, scaled to metres at the body.
-        depth: How far away they are, metres.
-        cosine: Of the angle between their normal and the direction to the eye; points that look
-            away hide nothing.
-        cell_m: Edge of a cell: no less than the points' spacing.
-        slack_m: How far a point may lie behind the nearest of its cell, beyond its own slope.
-    """
-    cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
-    columns = int(cell[:, 1].max()) + 1
-    flat = cell[:, 0] * columns + cell[:, 1]
-    nearest = np.full(int(flat.max()) + 1, np.inf)
-    faces = cosine > 0.0
-    np.minimum.at(nearest, flat[faces], depth[faces])
-    steep = np.clip(cosine, 0.1, 1.0)
-    slope = cell_m * np.sqrt(1.0 - steep**2) / steep
-    return faces & (depth <= nearest[flat] + tolerance_m + slope)
 
 
 def _side_of_vertex(

@@ -1,5 +1,6 @@
 """Where a camera that nobody described must have stood, found from masks alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.corrections import Correction, shift_principal_point
-from preprocess.alignment.silhouette_objective import SilhouetteObjective
+from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
 from preprocess.body.silhouette import soft_iou, splat_silhouette
 
 CAMERA_SAMPLES = 6
@@ -76,6 +77,34 @@ class _CameraProblem:
             extrinsic[:2, 3] += off * far / np.array(camera.focal_px)
             extrinsic[2, 3] = far - depth
         return extrinsic
+
+
+def fit_factor(
+    make: Callable[[float], Correction],
+    geometry: CaptureGeometry,
+    objective: SilhouetteObjective,
+    *,
+    near_one: bool = False,
+) -> Correction:
+    """Fit the one factor of a correction: a coarse grid, then a bounded scalar search.
+
+    Args:
+        make: Makes the correction of a factor (`scale_focal_length`, `divide_distances`).
+        geometry: The capture that the correction is applied to.
+        objective: Masks of a few frames.
+        near_one: Skips the grid: the factor is within 20 % of 1.
+    """
+    from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
+
+    logs = np.zeros(1) if near_one else np.linspace(-0.8, 0.8, 9)
+
+    def loss(log: float) -> float:
+        return -mean_with_missing(objective.frame_scores(make(float(np.exp(log))).apply(geometry)))
+
+    center = float(logs[int(np.argmin([loss(log) for log in logs]))])
+    bounds = (center - 0.2, center + 0.2)
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"maxiter": 10})
+    return make(float(np.exp(found.x)))
 
 
 def fit_principal_point(

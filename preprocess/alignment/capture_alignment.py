@@ -15,13 +15,12 @@ import numpy as np
 
 from capture.input_error import InputError
 from capture.source import FrameSource
+from preprocess.alignment.camera_from_masks import fit_factor
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
     GOOD_IOU,
     MIN_FITTED_CHANGE,
     MIN_FITTED_IOU_GAIN,
-    fit_factor,
-    mean_score,
 )
 from preprocess.alignment.corrections import scale_focal_length
 from preprocess.alignment.image_alignment import edge_contrast, place_body_on_images, sample_video
@@ -33,7 +32,11 @@ from preprocess.alignment.mask_alignment import (
     place_body_on_masks,
     rescale_motion,
 )
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, sample_masks
+from preprocess.alignment.silhouette_objective import (
+    SilhouetteObjective,
+    mean_score,
+    sample_masks,
+)
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody, shape_for_motion
 from preprocess.body.silhouette import SkinPoints

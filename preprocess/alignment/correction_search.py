@@ -7,7 +7,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.alignment.camera_from_masks import fit_extrinsics, fit_principal_point
+from preprocess.alignment.camera_from_masks import (
+    fit_extrinsics,
+    fit_factor,
+    fit_principal_point,
+)
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_catalog import body_corrections, video_corrections
 from preprocess.alignment.corrections import (  # fmt: skip
@@ -21,7 +25,11 @@ from preprocess.alignment.corrections import (  # fmt: skip
 )
 from preprocess.alignment.edge_objective import EdgeObjective
 from preprocess.alignment.sanity_checks import find_jumps
-from preprocess.alignment.silhouette_objective import SilhouetteObjective
+from preprocess.alignment.silhouette_objective import (
+    SilhouetteObjective,
+    mean_score,
+    mean_with_missing,
+)
 
 GOOD_IOU, USABLE_IOU = 0.7, 0.5
 """Agreement from which a capture is well, and below which nothing can be learnt from it."""
@@ -142,12 +150,6 @@ class VideoEdgeResult:
     score_before: float
     score_after: float
     candidates: tuple[CorrectionCandidate, ...]
-
-
-def mean_score(scores: Float[np.ndarray, "witnesses"]) -> float:
-    """Mean agreement of the frames that have a pose; 0 if none has."""
-    known = scores[np.isfinite(scores)]
-    return float(known.mean()) if len(known) else 0.0
 
 
 def find_corrections(
@@ -337,17 +339,10 @@ def _evaluate(
     looked = [(cure, evidence.frame_scores(cure.apply(claim))) for cure in corrections]
     return [
         CorrectionCandidate(
-            correction=cure, mean_score=_mean_with_missing(scores), frame_scores=scores
+            correction=cure, mean_score=mean_with_missing(scores), frame_scores=scores
         )
         for cure, scores in looked
     ]
-
-
-def _mean_with_missing(scores: Float[np.ndarray, "witnesses"]) -> float:
-    """Mean agreement; frames without a pose count as missed where they are more than half."""
-    if 2 * np.isfinite(scores).sum() >= len(scores):
-        return mean_score(scores)
-    return float(np.nansum(scores)) / len(scores)
 
 
 def _refine_shifts(
@@ -370,37 +365,6 @@ def _fit_continuous(claim: CaptureGeometry, evidence: SilhouetteObjective) -> li
     return [
         fit_factor(_correction_factory(cause, pelvis), claim, evidence) for cause in FITTED_CAUSES
     ]
-
-
-def fit_factor(
-    make: Callable[[float], Correction],
-    geometry: CaptureGeometry,
-    objective: SilhouetteObjective,
-    *,
-    near_one: bool = False,
-) -> Correction:
-    """The factor that agrees best: a coarse look (unless it is near 1), then a narrow one.
-
-    Args:
-        make: What makes a cure of a factor: `refocused`, `divide_distances`.
-        claim: What the cure is applied to.
-        evidence: Masks of a few frames.
-        near: Whether the factor is within 20 % of 1.
-    """
-    from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
-
-    logs = np.zeros(1) if near_one else np.linspace(-0.8, 0.8, 9)
-
-    def loss(log: float) -> float:
-        return -_mean_with_missing(objective.frame_scores(make(float(np.exp(log))).apply(geometry)))
-
-    coarse = [loss(log) for log in logs]
-    center = float(logs[int(np.argmin(coarse))])
-    found = minimize_scalar(
-        loss,
-        bounds=(center - 0.2, center + 0.2), method="bounded", options={"maxiter": 10},
-    )  # fmt: skip
-    return make(float(np.exp(found.x)))
 
 
 def _best_per_cause(guesses: list[CorrectionCandidate]) -> tuple[CorrectionCandidate, ...]:

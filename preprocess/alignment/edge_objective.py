@@ -17,18 +17,9 @@ from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry, VideoTransform
 from preprocess.alignment.silhouette_objective import spaced_indices
+from preprocess.body.silhouette import signed_distance_px
 
 EDGE_BLUR_PX = 1.0
-
-
-def signed_distance_px(
-    mask: Bool[np.ndarray, "height width"],
-) -> Float32[np.ndarray, "height width"]:
-    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
-    hard = mask.astype(np.uint8)
-    away = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
-    away -= cv2.distanceTransform(hard, cv2.DIST_L2, 5)
-    return np.asarray(away + np.where(mask, 0.5, -0.5), dtype=np.float32)
 
 
 def outward_normals(

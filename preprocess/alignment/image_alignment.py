@@ -14,22 +14,28 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.edge_objective import gradient_along, outward_normals, signed_distance_px
+from preprocess.alignment.edge_objective import gradient_along, outward_normals
 from preprocess.alignment.mask_alignment import BodyPlacement, place_body_on_masks
 from preprocess.alignment.silhouette_objective import (
     MaskSample,
     SilhouetteObjective,
+    mean_score,
     spaced_indices,
 )
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.silhouette import NEAR_PLANE_M, SkinPoints, splat_silhouette
+from preprocess.body.silhouette import (
+    NEAR_PLANE_M,
+    SkinPoints,
+    signed_distance_px,
+    splat_silhouette,
+)
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.observe import associate_cameras
 
@@ -221,20 +227,18 @@ def place_body_on_images(
         )
         if number + 1 >= len(UNCERTAIN_BANDS_M) and stands:
             break
+
+    def scores_of(moved: CaptureGeometry) -> Float[np.ndarray, "samples"]:
+        return np.zeros(0) if evidence is None else evidence.frame_scores(moved)
+
     return BodyPlacement(
         motion=now.motion,
-        iou_before=_mean_iou(geometry, evidence),
-        iou_after=_mean_iou(now, evidence),
+        iou_before=mean_score(scores_of(geometry)),
+        iou_after=mean_score(scores_of(now)),
         distance_divisor=nearer,
         pelvis_shift_m=shift_m,
         edge_contrast=(edge_contrast(geometry, skin, samples), edge_contrast(now, skin, samples)),
     )
-
-
-def _mean_iou(claim: CaptureGeometry, evidence: SilhouetteObjective | None) -> float:
-    scores = np.zeros(0) if evidence is None else evidence.frame_scores(claim)
-    known = scores[np.isfinite(scores)]
-    return float(known.mean()) if len(known) else 0.0
 
 
 def _estimate_masks(

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.correction_search import mean_score
-from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective
+from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody

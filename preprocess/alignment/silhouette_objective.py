@@ -108,20 +108,6 @@ class SilhouetteObjective:
         large = cv2.resize(drawn, alpha.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         return components_touching(alpha, large > 0)
 
-    def area_ratios(self, geometry: CaptureGeometry) -> Float[np.ndarray, "samples"]:
-        """Area of each mask over that of the posed body; NaN where there is no body."""
-        found = []
-        for witness in self.samples:
-            row = geometry.row_for_frame(witness.index)
-            alpha = np.float32(1.0) - witness.alpha if geometry.masks_inverted else witness.alpha
-            if row is None:
-                found.append(np.nan)
-                continue
-            camera = geometry.camera_at(witness.camera_row, self.size_px)
-            drawn = int(splat_silhouette(self.posed_points(geometry.motion, row), camera).sum())
-            found.append(float(alpha.sum()) / drawn if drawn else np.nan)
-        return np.array(found)
-
     def posed_points(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
         """The skin in one of a motion's poses; the last ones are kept, as guesses share them."""
         if (motion, row) not in self._posed_cache:
@@ -129,6 +115,19 @@ class SilhouetteObjective:
                 self._posed_cache.clear()
             self._posed_cache[motion, row] = self.skin.posed(motion[row])
         return self._posed_cache[motion, row]
+
+
+def mean_score(scores: Float[np.ndarray, "samples"]) -> float:
+    """Mean agreement of the frames that have a pose; 0 if none has."""
+    known = scores[np.isfinite(scores)]
+    return float(known.mean()) if len(known) else 0.0
+
+
+def mean_with_missing(scores: Float[np.ndarray, "samples"]) -> float:
+    """Mean agreement; where more than half of the frames lack a pose, those count as 0."""
+    if 2 * np.isfinite(scores).sum() >= len(scores):
+        return mean_score(scores)
+    return float(np.nansum(scores)) / len(scores)
 
 
 def components_touching(

@@ -17,6 +17,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.silhouette import NEAR_PLANE_M, MeshSilhouette
 
@@ -143,7 +144,7 @@ class ClothingOffset:
         depth = skin @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
         if depth.min() < NEAR_PLANE_M:
             return None
-        normals = _vertex_normals(skin, self._shaped.body.faces)
+        normals = vertex_normals(skin, self._shaped.body.faces)
         rays = skin - camera.center_world
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rim = np.flatnonzero(np.abs(np.einsum("va,va->v", normals, rays)) < RIM_COSINE)
@@ -269,16 +270,3 @@ def _smoothing_matrix(faces: Int[np.ndarray, "faces 3"], count: int) -> csr_matr
     links = csr_matrix(coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)))
     degree = np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1.0)
     return csr_matrix(0.5 * identity(count) + 0.5 * (diags(1.0 / degree) @ links))
-
-
-def _vertex_normals(
-    points: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
-    """Unit normals, area-weighted over the triangles around each vertex."""
-    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
-    across = np.cross(b - a, c - a)
-    flat, count = faces.ravel(), len(points)
-    normals = np.column_stack(
-        [np.bincount(flat, np.repeat(across[:, axis], 3), minlength=count) for axis in range(3)]
-    )
-    return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)

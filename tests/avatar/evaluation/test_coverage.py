@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from avatar.evaluation.coverage import Coverage, VisibilityStage, pose_patches
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, visible_points
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches
+from preprocess.body.body_surface import visible_points
 
 L_SHOULDER, R_SHOULDER = 15, 16
 

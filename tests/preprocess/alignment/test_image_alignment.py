@@ -132,8 +132,8 @@ def elsewhere(own) -> BodyPlacement:
 
 def test_where_nobody_stands_nobody_is_found(elsewhere):
     """Masks that were found around the body agree with it all the same; edges do not."""
-    assert elsewhere.after > 0.6
-    assert not elsewhere.believed
+    assert elsewhere.iou_after > 0.6
+    assert not elsewhere.is_reliable
     assert not elsewhere.is_improvement
     assert "no person was found" in elsewhere.describe()
 

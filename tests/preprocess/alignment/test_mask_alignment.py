@@ -103,13 +103,13 @@ def test_the_height_is_found_in_the_masks(filmed):
     person, _, evidence, refit = filmed
     factor = np.ptp(person.joints[:, 1]) / np.ptp(evidence.skin.shaped.joints[:, 1])
     assert refit.is_improvement
-    assert refit.nearer == pytest.approx(factor, rel=0.02)
-    assert refit.after > 0.93 > refit.before + 0.1
+    assert refit.distance_divisor == pytest.approx(factor, rel=0.02)
+    assert refit.iou_after > 0.93 > refit.iou_before + 0.1
 
 
 def test_joints_land_where_the_person_has_them(filmed):
     person, claim, evidence, refit = filmed
-    camera: Camera = claim.camera(0, SIZE)
+    camera: Camera = claim.camera_at(0, SIZE)
     for row in range(FRAMES):
         pose, fitted = claim.motion[row], refit.motion[row]
         true = camera.project(person.with_pose(pose).joints())

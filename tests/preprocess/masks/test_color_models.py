@@ -43,9 +43,9 @@ def test_what_is_seen_faces_the_camera_and_is_not_behind_something(shaped, turne
     depth = around.skin[:, 2]  # the camera looks down the z axis
     trunk = (np.abs(shaped.vertices[:, 0]) < 0.1) & (np.abs(shaped.vertices[:, 1]) < 0.2)
     np.testing.assert_allclose(sight.facing, around.normals[:, 2], atol=0.4)
-    assert sight.seen[trunk & (sight.facing > 0.8)].mean() > 0.98
-    assert sight.seen[trunk & (sight.facing < -0.8)].mean() < 0.1
-    assert depth[sight.seen].mean() > depth[~sight.seen].mean()
+    assert sight.visible[trunk & (sight.facing > 0.8)].mean() > 0.98
+    assert sight.visible[trunk & (sight.facing < -0.8)].mean() < 0.1
+    assert depth[sight.visible].mean() > depth[~sight.visible].mean()
 
 
 def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
@@ -66,7 +66,7 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
         _, sight = turned(yaw)
         told, spread = colours.predict(sight, SIZE)
         # now the one half is before the other
-        rim = sight.seen & (sight.facing > 0.2) & (sight.facing < 0.6) & (left == (yaw < 0))
+        rim = sight.visible & (sight.facing > 0.2) & (sight.facing < 0.6) & (left == (yaw < 0))
         column, row = sight.pixels[rim].astype(int).T
         known = spread[row, column] < 1.2 * MIN_COLOR_SPREAD
         assert known.mean() > 0.2
@@ -76,7 +76,7 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
 
 def test_nothing_is_learnt_so_near_to_the_border_that_it_may_be_background(turned, camera):
     _, sight = turned(0.0)
-    colours = AppearanceModel(len(sight.seen))
+    colours = AppearanceModel(len(sight.visible))
     rgb = np.full((*SIZE[::-1], 3), 99, np.uint8)
     colours.update(sight, rgb, np.full(SIZE[::-1], 1.0, np.float32))
     _, spread = colours.predict(sight, SIZE)

@@ -203,7 +203,7 @@ def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_w
 @pytest.mark.parametrize("thick_m", [0.0, 0.04])
 def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
     """Masks of a body that is thicker by so much all over; the person turns once."""
-    large = camera.resized((480, 600))
+    large = camera.resize((480, 600))
     outline, shell = MeshSilhouette(shaped), ClothingOffset(shaped)
     for yaw in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
         pose = standing(shaped, float(yaw))
@@ -230,13 +230,13 @@ def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
 
 def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, camera, rng):
     """Every other vertex, at random, is 4 mm thicker: the outline is theirs."""
-    large, shell = camera.resized((480, 600)), ClothingOffset(shaped)
+    large, shell = camera.resize((480, 600)), ClothingOffset(shaped)
     around = shell.clothe(standing(shaped), large)
     assert around is not None
     head = around.skin[around.rim_vertices, 1] > 1.5
 
     def beyond(thickness: np.ndarray, known: float) -> np.ndarray:
-        now = around._replace(thickness=thickness, known_fraction=known)
+        now = around._replace(offset_m=thickness, known_fraction=known)
         fine = shell.draw(now, large)
         covered = cv2.resize(fine, large.size_px, interpolation=cv2.INTER_AREA)
         return shell._overshoot_m(now, large, signed_distance_px(covered > 0.5))[head]
@@ -277,7 +277,7 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
 
 def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
     """Of five masks two reach 3 cm beyond the skin, the others end at it."""
-    large, shell, pose = camera.resized((480, 600)), ClothingOffset(shaped), standing(shaped)
+    large, shell, pose = camera.resize((480, 600)), ClothingOffset(shaped), standing(shaped)
     for thick_m in (0.03, 0.0, 0.0, 0.03, 0.0) * 4:
         around = shell.clothe(pose, large)
         assert around is not None
@@ -381,7 +381,7 @@ def test_the_same_frames_give_the_same_masks(shaped, camera, film):
 def test_large_pictures_are_cut_small_and_come_back_large(shaped, camera, film):
     frame, pose, true = film(0.3)
     large = replace(frame, rgb=cv2.resize(frame.rgb, (480, 600), interpolation=cv2.INTER_NEAREST))
-    mask = GrabCutSegmenter(shaped)(large, pose, camera.resized((480, 600)))
+    mask = GrabCutSegmenter(shaped)(large, pose, camera.resize((480, 600)))
     assert mask.shape == (600, 480)
     assert agreement(cv2.resize(mask, SIZE, interpolation=cv2.INTER_AREA), true) > 0.93
 
