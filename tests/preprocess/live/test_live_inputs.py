@@ -24,7 +24,7 @@ def moving(rows, **changes) -> Motion:
     parts = {
         "root_rotations": np.zeros((rows, 3)), "root_translations": places,
         "joint_rotations": np.zeros((rows, 23, 3)), "valid": np.ones(rows, dtype=bool),
-        "betas": np.zeros(10), "model": "body24",
+        "betas": np.zeros(10), "body_model": "body24",
     }  # fmt: skip
     return Motion(**{**parts, **changes})
 
