@@ -95,7 +95,7 @@ class AblationPage:
             f"Here ours is {number(unskipped.late_ms / ours.late_ms)} times faster with skipping "
             "than without, by the last fifth of the time; the paper's own scheme "
             f"{number(none.late_ms / paper.late_ms)} times, by the last fifth of {paper.steps} "
-            "steps. Every row also keeps the canonical occupancy with which its avatar is scored: "
+            "steps. Every row also keeps the canonical occupancy that its avatar is scored with: "
             f"{self.occupancy_ms:.1f} ms of each step, which only ours needs. Broyden is compiled, "
             "and searches nine times for each sample.",
             "",
