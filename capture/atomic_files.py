@@ -46,13 +46,13 @@ class AtomicFile:
         self._check_replaceable()
         real = Path(os.path.realpath(path))
         real.parent.mkdir(parents=True, exist_ok=True)
-        self._real, self.part = (
+        self._real_path, self.temporary_path = (
             real,
             real.with_name(_temporary_name(path.stem, "part") + path.suffix),
         )
         if self._list.exists() and real.parent == Path(os.path.realpath(path.parent)):
-            self._list.add_temporary(self.part.name)
-        os.close(os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            self._list.add_temporary(self.temporary_path.name)
+        os.close(os.open(self.temporary_path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
 
     def commit(self) -> None:
         """Flushes the file to the disk and gives it its name.
@@ -61,18 +61,18 @@ class AtomicFile:
             InputError: If a file that must stay has come there meanwhile.
             OSError: If the disk is full.
         """
-        with self.part.open("rb") as file:
+        with self.temporary_path.open("rb") as file:
             os.fsync(file.fileno())
         self._check_replaceable()
         if self._list.exists():
-            self._list.add(self._path.name, self.part)
-        self.part.replace(self._real)
+            self._list.add(self._path.name, self.temporary_path)
+        self.temporary_path.replace(self._real_path)
         self._finished = True
 
     def discard(self) -> None:
         """Removes what was not finished."""
         if not self._finished:
-            self.part.unlink(missing_ok=True)
+            self.temporary_path.unlink(missing_ok=True)
 
     def _check_replaceable(self) -> None:
         if not is_replaceable(self._path, self._replace):
@@ -108,7 +108,7 @@ def atomic_file(path: Path, *, replace: bool | None = None) -> Iterator[Path]:
     """
     draft = AtomicFile(path, replace=replace)
     try:
-        yield draft.part
+        yield draft.temporary_path
         draft.commit()
     finally:
         draft.discard()

@@ -28,7 +28,7 @@ class VideoFile:
 
     Attributes:
         quarter_turns: How often its stored pictures are turned by 90° against the clock.
-        leaves_alpha: Whether it has an alpha channel; it is not read (pictures' are).
+        has_unread_alpha: Whether it has an alpha channel; it is not read (pictures' are).
     """
 
     has_alpha = False
@@ -49,17 +49,17 @@ class VideoFile:
         self.warnings: list[str] = []
         self._decoder = open_decoder(path)
         self.quarter_turns = self._decoder.quarter_turns
-        self.leaves_alpha = self._decoder.leaves_alpha
-        self._rate = self._decoder.rate
+        self.has_unread_alpha = self._decoder.has_unread_alpha
+        self._fps = self._decoder.fps
         picture = next((shot.rgb() for shot in self._decoder.decode()), None)
         if picture is None:
             raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
         self.size_px = (int(picture.shape[1]), int(picture.shape[0]))
-        claimed = self._decoder.claimed
+        claimed = self._decoder.claimed_frames
         self.frames_in_file = claimed if claimed > 0 else self.count_frames()
         self.frame_count: int | None = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)
-        self.duration_s: float | None = span / self._rate if self._rate > 0.0 else None
+        self.duration_s: float | None = span / self._fps if self._fps > 0.0 else None
         if not self.frame_count:
             raise InputError(
                 f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "
@@ -95,7 +95,7 @@ class VideoFile:
             if self.selection.is_past_end(index):
                 return
             time_s = shot.time_s
-            place = time_s * self._rate
+            place = time_s * self._fps
             if shot.after_gap and even:
                 index = max(index, round(place))
             even = even and abs(place - index) < 0.3
@@ -110,7 +110,7 @@ class VideoFile:
     def _compare_with_claim(self, got: int, end_s: float) -> None:
         """Warns if the container promised more than came."""
         counted = self.path.suffix.lower() in CONTAINERS_WITH_FRAME_COUNT
-        duration_s = self.frames_in_file / max(self._rate, 1e-6)
+        duration_s = self.frames_in_file / max(self._fps, 1e-6)
         if counted and got < self.frames_in_file:
             came = f"only {got} of {self.frames_in_file} frames could be decoded"
         elif not counted and end_s < 0.95 * duration_s - 0.5:
@@ -121,7 +121,7 @@ class VideoFile:
 
     def _warn_of_hdr(self) -> None:
         """HDR without PyAV comes slowly, and its highlights are cut off."""
-        if not self._decoder.deep or self._decoder.knows_hdr:
+        if not self._decoder.is_high_bit_depth or self._decoder.supports_hdr:
             return
         tells = self.path.suffix.lower() in CONTAINERS_WITH_FRAME_COUNT
         if tells and read_hdr_transfer(self.path) is None:

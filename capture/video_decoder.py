@@ -44,21 +44,21 @@ class VideoDecoder(Protocol):
     """An open video.
 
     Attributes:
-        rate: Frames a second, as the container claims; 0 if it does not.
-        claimed: How many frames there are, as the container claims; 0 or less if it does not.
+        fps: Frames per second, as the container claims; 0 if it does not.
+        claimed_frames: How many frames there are, as the container claims; 0 or less if it does not.
         quarter_turns: How often its pictures are turned by 90° against the clock to stand upright.
-        deep: Whether its pictures have more than 8 bits.
-        knows_hdr: Whether HDR's highlights are kept.
-        leaves_alpha: Whether its pictures have an alpha channel, as far as is known one that is not
+        is_high_bit_depth: Whether its pictures have more than 8 bits.
+        supports_hdr: Whether HDR's highlights are kept.
+        has_unread_alpha: Whether its pictures have an alpha channel, as far as is known one that is not
             opaque; it is not read.
     """
 
-    rate: float
-    claimed: int
+    fps: float
+    claimed_frames: int
     quarter_turns: int
-    deep: bool
-    knows_hdr: bool
-    leaves_alpha: bool
+    is_high_bit_depth: bool
+    supports_hdr: bool
+    has_unread_alpha: bool
 
     def decode(self) -> Iterator[DecoderFrame]:
         """The pictures in order; every call starts anew."""
@@ -83,7 +83,7 @@ def import_pyav() -> Any:
 class PyAvDecoder:
     """FFmpeg by PyAV; for 8 bits the same pixels as OpenCV's."""
 
-    knows_hdr = True
+    supports_hdr = True
 
     def __init__(self, path: Path) -> None:
         """Opens the file once, to look at it, and decodes a picture.
@@ -96,12 +96,12 @@ class PyAvDecoder:
         try:
             with av.open(str(path)) as container:
                 stream = container.streams.video[0]
-                self.rate = float(stream.average_rate or 0.0)
+                self.fps = float(stream.average_rate or 0.0)
                 lasts_s = (container.duration or 0) / import_pyav().time_base
-                self.claimed = int(stream.frames) or round(lasts_s * self.rate)
-                self.deep = stream.codec_context.pix_fmt in HIGH_BIT_DEPTH_FORMATS
+                self.claimed_frames = int(stream.frames) or round(lasts_s * self.fps)
+                self.is_high_bit_depth = stream.codec_context.pix_fmt in HIGH_BIT_DEPTH_FORMATS
                 first = next(self._frames(container, stream), None)
-                self.leaves_alpha = first is not None and _has_transparency(first[0])
+                self.has_unread_alpha = first is not None and _has_transparency(first[0])
         except (av.FFmpegError, IndexError, ValueError, OSError) as cause:
             raise unreadable_video_error(path) from cause
         self.quarter_turns = 0 if first is None else int(first[0].rotation) // 90 % 4
@@ -189,7 +189,7 @@ def has_alpha_plane(tag: int) -> bool:
 class OpenCvDecoder:
     """OpenCV's FFmpeg. It applies rotation flags, and does not tell which pictures are damaged."""
 
-    knows_hdr = False
+    supports_hdr = False
 
     def __init__(self, path: Path) -> None:
         """Opens the file once, to look at it.
@@ -199,13 +199,15 @@ class OpenCvDecoder:
         """
         self._path = path
         capture = self._open()
-        self.rate = capture.get(cv2.CAP_PROP_FPS)
-        self.claimed = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.fps = capture.get(cv2.CAP_PROP_FPS)
+        self.claimed_frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         clockwise = round(capture.get(cv2.CAP_PROP_ORIENTATION_META) / 90.0)
         self.quarter_turns = -clockwise % 4
         kind = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT))
-        self.deep = (kind & 0xFFFF) == int.from_bytes(b"Y3", "little") and kind >> 24 in (10, 12)
-        self.leaves_alpha = has_alpha_plane(kind)
+        self.is_high_bit_depth = (kind & 0xFFFF) == int.from_bytes(
+            b"Y3", "little"
+        ) and kind >> 24 in (10, 12)
+        self.has_unread_alpha = has_alpha_plane(kind)
         capture.release()
 
     def decode(self) -> Iterator[DecoderFrame]:

@@ -315,7 +315,7 @@ def _make_segmenter(choice: MaskOrigin, shaped: ShapedBody) -> Segmenter | None:
 
 def _unread_alpha(source: FrameSource) -> Path | None:
     """The video, if it has an alpha channel, which is not read."""
-    return source.path if isinstance(source, VideoFile) and source.leaves_alpha else None
+    return source.path if isinstance(source, VideoFile) and source.has_unread_alpha else None
 
 
 def _open_masks(

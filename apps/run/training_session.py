@@ -208,7 +208,7 @@ class TrainingSession:
     def _set_unpaced(self, unpaced: bool) -> None:
         """What a run has seen before is not played again at its own speed."""
         if isinstance(self._recording.source, RealtimePlayback):
-            self._recording.source.rushed = unpaced
+            self._recording.source.catch_up = unpaced
 
     def _frame_stream(self) -> Iterator[StreamItem]:
         """Frames as they become ready; runs on the inbox's thread."""

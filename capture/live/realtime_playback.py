@@ -18,7 +18,7 @@ class RealtimePlayback:
     catches up as soon as it can.
 
     Attributes:
-        rushed: Whether frames come as fast as they are taken, as those do that an interrupted run
+        catch_up: Whether frames come as fast as they are taken, as those do that an interrupted run
             has seen before. Where it ends, the video plays on from there at its own speed.
     """
 
@@ -33,7 +33,7 @@ class RealtimePlayback:
             pace: Its clock; ending it ends the playback, also in the middle of a wait.
         """
         self._source, self._pace = source, pace
-        self.rushed = False
+        self.catch_up = False
         self.path = source.path
         self.size_px = source.size_px
         self.selection = source.selection
@@ -59,7 +59,7 @@ class RealtimePlayback:
         """The frames when they are due, read one ahead; every call plays anew."""
         began = due = None
         for frame in self._source.frames():
-            if began is None or due is None or self.rushed:
+            if began is None or due is None or self.catch_up:
                 due = self._pace.now()
                 began = due - frame.time_s
             due = max(due, began + frame.time_s)

@@ -147,7 +147,7 @@ class GrabCutSegmenter:
             expected; 0 of none.
     """
 
-    name = "GrabCutSegmenter"
+    name = "GrabCut"
 
     def __init__(self, shaped: ShapedBody) -> None:
         """Nothing is known about clothes and background yet."""

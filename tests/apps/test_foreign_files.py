@@ -204,7 +204,7 @@ def work():
     for _ in range(2):
         write_text_atomically(run.checkpoint / "state.pt", "learnt")
     package = AtomicFile(run.package)
-    package.part.write_bytes(b"avatar")
+    package.temporary_path.write_bytes(b"avatar")
     package.finish()
     write_text_atomically(run.report, "{}")
     with atomic_folder(folder / "frames") as part:

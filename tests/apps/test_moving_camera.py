@@ -53,7 +53,7 @@ def test_each_frame_is_seen_by_its_own_camera(walk):
     folder, still = walk
     moving = open_capture(CaptureInputs(video=folder))
     assert moving.cameras.is_moving
-    assert moving.pixel_footprint_m() == pytest.approx(still.footprint_m(), rel=1e-6)
+    assert moving.pixel_footprint_m() == pytest.approx(still.pixel_footprint_m(), rel=1e-6)
     assert passes_quick_check(moving)
     for then, now in zip(still.observations(), moving.observations(), strict=True):
         if not isinstance(now, Observation):

@@ -103,11 +103,11 @@ def listing(tmp_path):
 def test_a_listed_file_is_ours_until_somebody_changes_it(tmp_path, listing):
     path = tmp_path / "report.json"
     write_text_atomically(path, "one")
-    assert listing.holds("report.json")
+    assert listing.owns("report.json")
     write_text_atomically(path, "two")
     assert path.read_text() == "two"
     path.write_text("mine now")
-    assert not listing.holds("report.json")
+    assert not listing.owns("report.json")
     with pytest.raises(InputError, match=r"report\.json is there already"):
         write_text_atomically(path, "three")
     assert not listing.remove("report.json")
@@ -203,15 +203,15 @@ def test_a_line_that_was_cut_short_costs_only_itself(tmp_path, listing):
     with listing.path.open("ab") as file:
         file.write(b'\n{"name": "b.js')
     write_text_atomically(tmp_path / "c.json", "{}")
-    assert listing.holds("a.json")
-    assert listing.holds("c.json")
+    assert listing.owns("a.json")
+    assert listing.owns("c.json")
     assert listing.path.read_bytes().startswith(HEADER)
 
 
 def test_what_a_killed_process_left_half_written_goes(tmp_path, listing):
     code = (
-        "import os, pathlib, sys; from capture.atomic_files import whole_file\n"
-        "with whole_file(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+        "import os, pathlib, sys; from capture.atomic_files import atomic_file\n"
+        "with atomic_file(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.iavatar")], check=False)
     (tmp_path / ".a.mine.part.iavatar").write_bytes(b"mine")
@@ -224,8 +224,8 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path, listing):
 
 def test_a_list_alone_goes_and_with_it_nothing_else(tmp_path, listing):
     (tmp_path / "mine.txt").write_text("mine")
-    listing.tidy()
+    listing.remove_if_empty()
     assert listing.exists()
     (tmp_path / "mine.txt").unlink()
-    listing.tidy()
+    listing.remove_if_empty()
     assert list(tmp_path.iterdir()) == []

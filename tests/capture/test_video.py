@@ -188,5 +188,5 @@ def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaqu
         stream.pix_fmt = "argb"
         frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format="argb")
         container.mux([*stream.encode(frame), *stream.encode(None)])
-    found = decoder(tmp_path / "cut.mov").leaves_alpha
+    found = decoder(tmp_path / "cut.mov").has_unread_alpha
     assert found == (decoder is OpenCvDecoder or not opaque)

@@ -29,7 +29,7 @@ def test_an_archive_that_unpacks_to_too_much_is_not_unpacked(tmp_path, monkeypat
     path = tmp_path / "a.npz"
     np.savez_compressed(path, a=np.zeros(100_000))
     assert path.stat().st_size < 10_000
-    monkeypatch.setattr(file_content, "MAX_BYTES", 10_000)
+    monkeypatch.setattr(file_content, "MAX_UNPACKED_BYTES", 10_000)
     with pytest.raises(InputError, match="are not read"):
         read_npz(path)
 

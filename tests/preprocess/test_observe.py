@@ -29,7 +29,7 @@ def moving(rows: int, **changes) -> Motion:
         "joint_rotations": np.zeros((rows, 23, 3)),
         "valid": np.ones(rows, dtype=bool),
         "betas": np.zeros(10),
-        "model": "body24",
+        "body_model": "body24",
     }
     return Motion(**{**parts, **changes})
 

@@ -304,7 +304,7 @@ def test_cameras_that_were_solved_by_then_outlive_any_end(
     recording, run = open_capture(job_of(walkaround).paths), RunFolder(path=tmp_path / "run")
     begun = attempt(solved_of(solved_run) if finished else None, beside=True)
     with pytest.raises(type(end)):
-        fails_in(begun.kept(recording, run, quiet()), end)
+        fails_in(begun.save_on_exit(recording, run, quiet()), end)
     assert run.cameras.exists() == run.poses.exists() == finished
 
 
@@ -313,7 +313,7 @@ def test_cameras_that_are_solved_first_are_written_before_anything_is_learnt(
 ):
     found = apply_camera_solution(open_capture(job_of(walkaround).paths), solved_of(solved_run))
     run = RunFolder(path=tmp_path / "run")
-    with attempt(None, beside=False).kept(found, run, quiet()):
+    with attempt(None, beside=False).save_on_exit(found, run, quiet()):
         assert len(read_motion(run.poses)) == len(read_cameras(run.cameras, (256, 144)).cameras)
 
 

@@ -75,7 +75,7 @@ def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
 
 
 def test_who_comes_late_gets_the_latest_and_is_told_what_was_lost(monkeypatch):
-    monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(500))
+    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(500))
     source = CameraDevice("0", FrameSelection(), PacingClock())
     frames = source.frames()
     first = next(frames)
@@ -89,7 +89,7 @@ def test_who_comes_late_gets_the_latest_and_is_told_what_was_lost(monkeypatch):
 
 
 def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
-    monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(5))
+    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(5))
     source = CameraDevice("0", FrameSelection(), PacingClock())
     assert [frame.index for frame in source.frames()] == [0, 1, 2, 3, 4]
     (warning,) = source.warnings
@@ -98,7 +98,7 @@ def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
 
 
 def test_a_selection_ends_a_camera_too(monkeypatch):
-    monkeypatch.setattr(camera_device, "_opened", lambda address: Quick(12))
+    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(12))
     source = CameraDevice("0", FrameSelection(start=2, stop=9, step=3), PacingClock())
     assert [frame.index for frame in source.frames()] == [2, 5, 8]
     source.close()
@@ -112,7 +112,7 @@ def test_closing_wakes_who_waits_and_lets_the_camera_go(monkeypatch):
             return super().grab()
 
     device, pace = Slow(1000), PacingClock()
-    monkeypatch.setattr(camera_device, "_opened", lambda address: device)
+    monkeypatch.setattr(camera_device, "_open_device", lambda address: device)
     source = CameraDevice("0", FrameSelection(), pace)
     frames = source.frames()
     next(frames)
@@ -132,7 +132,7 @@ def test_a_camera_that_is_not_there_is_refused_with_those_that_are(capfd):
 
 def test_a_camera_that_gives_no_picture_is_busy(monkeypatch):
     device = Quick(0)
-    monkeypatch.setattr(camera_device, "_opened", lambda address: device)
+    monkeypatch.setattr(camera_device, "_open_device", lambda address: device)
     with pytest.raises(OSError, match="no picture") as caught:
         CameraDevice("0", FrameSelection(), PacingClock())
     assert caught.value.errno == errno.EBUSY

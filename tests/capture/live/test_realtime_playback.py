@@ -103,11 +103,11 @@ def test_a_timestamp_that_runs_backwards_is_played_at_once(clock):
 
 def test_what_was_seen_before_comes_at_once_and_the_rest_at_its_own_time_from_there(clock):
     playback, came = played(Recorded([0.0, 1.0, 2.0, 3.0, 4.5]), clock), []
-    playback.rushed = True
+    playback.catch_up = True
     for frame in playback.frames():
         came.append(clock() - 100.0)
         assert frame.due_s == clock()
-        playback.rushed = frame.index < 2
+        playback.catch_up = frame.index < 2
     np.testing.assert_allclose(came, [0.0, 0.0, 0.0, 1.0, 2.5])
 
 

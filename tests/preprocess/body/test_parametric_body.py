@@ -104,5 +104,5 @@ def test_bending_the_elbow_moves_the_forearm_alone(body):
 def test_betas_count_only_where_model_and_body_agree(body, motion):
     np.testing.assert_array_equal(betas_for_motion(body, motion), motion.betas)
     np.testing.assert_array_equal(
-        betas_for_motion(body, replace(motion, model="smpl")), np.zeros(10)
+        betas_for_motion(body, replace(motion, body_model="smpl")), np.zeros(10)
     )

@@ -60,7 +60,7 @@ def test_a_spin_may_count_on_beyond_a_turn(walk, turns_a_pose):
 def test_degrees_are_refused(walk, rows):
     degrees = replace(walk, joint_rotations=np.rad2deg(walk.joint_rotations))
     with pytest.raises(InputError, match=r"walk\.npz: A joint is bent by 3\d\d\d°.*degrees given"):
-        require_plausible(degrees.taken(np.arange(rows)), "walk.npz")
+        require_plausible(degrees.select_rows(np.arange(rows)), "walk.npz")
 
 
 def test_one_damaged_pose_is_left_out_and_named(walk):

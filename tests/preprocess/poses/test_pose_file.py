@@ -35,7 +35,7 @@ def assert_same(a, b):
     np.testing.assert_array_equal(a.joint_rotations, b.joint_rotations)
     np.testing.assert_array_equal(a.valid, b.valid)
     np.testing.assert_array_equal(a.betas, b.betas)
-    assert a.model == b.model
+    assert a.body_model == b.body_model
     for one, other in ((a.frames, b.frames), (a.times_s, b.times_s), (a.intrinsic, b.intrinsic)):
         assert (one is None) == (other is None)
         if one is not None:
@@ -62,12 +62,12 @@ def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
     cameras = np.tile(np.eye(4), (6, 1, 1))
     cameras[:, 0, 3] = np.arange(6)
     whole = replace(motion, camera_from_world=cameras, interpolated=np.arange(6) == 4)
-    some = whole.taken(np.array([4, 2]), np.array([10, 11]))
+    some = whole.select_rows(np.array([4, 2]), np.array([10, 11]))
     write_motion(tmp_path / "some.npz", some)
     again = read_motion(tmp_path / "some.npz")
     assert_same(again, some)
     assert again.camera_from_world[:, 0, 3].tolist() == [4.0, 2.0]
-    assert some.bridged.tolist() == [True, False]
+    assert some.interpolated.tolist() == [True, False]
 
 
 def test_the_three_spellings_are_one(write, motion):
@@ -153,6 +153,6 @@ def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
 def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
     folder = tmp_path / "capture"
     (folder / "truth").mkdir(parents=True)
-    for name, wanted in (("poses.npz", motion), ("dance.npz", motion.taken(np.arange(2)))):
+    for name, wanted in (("poses.npz", motion), ("dance.npz", motion.select_rows(np.arange(2)))):
         write_motion(folder / name, wanted)
     assert_same(read_poses(folder), read_poses(folder / "poses.npz"))

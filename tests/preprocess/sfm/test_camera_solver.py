@@ -49,7 +49,9 @@ def walk(room, walked, tmp_path_factory):
 def test_cameras_of_a_walk_are_solved_to_millimetres(walk):
     cameras, _, solved, _, _ = walk
     assert not solved.still
-    assert (np.bincount(solved.marks, minlength=4)[[PLACED, KEY]] == [FRAMES - KEYS, KEYS]).all()
+    assert (
+        np.bincount(solved.frame_status, minlength=4)[[PLACED, KEY]] == [FRAMES - KEYS, KEYS]
+    ).all()
     views = solved.camera_from_solved
     centers = -np.einsum("cba,cb->ca", views[:, :3, :3], views[:, :3, 3])
     true = np.stack([camera.center_world for camera in cameras])
@@ -105,8 +107,10 @@ def test_a_solution_is_read_as_it_was_written(walk, tmp_path):
     solved.save(tmp_path)
     again = CameraSolution.load(tmp_path)
     np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
-    np.testing.assert_array_equal(again.frame_status, solved.marks)
-    np.testing.assert_array_equal(again.model.reprojection_errors_px(), solved.model.residuals())
+    np.testing.assert_array_equal(again.frame_status, solved.frame_status)
+    np.testing.assert_array_equal(
+        again.model.reprojection_errors_px(), solved.model.reprojection_errors_px()
+    )
     assert again.gates == solved.gates
     assert again.costs == solved.costs
 
@@ -114,7 +118,7 @@ def test_a_solution_is_read_as_it_was_written(walk, tmp_path):
 def test_a_frame_that_shows_nothing_is_interpolated(walk, tmp_path):
     _, source, solved, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
-    lost = int(np.flatnonzero(solved.marks == PLACED)[4])
+    lost = int(np.flatnonzero(solved.frame_status == PLACED)[4])
     pictures = [frame.rgb for frame in source.frames()]
     pictures[lost] = np.full_like(pictures[lost], 90)
     spoilt = filmed(tmp_path / "film", pictures)
@@ -171,7 +175,9 @@ def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch
             model.save(tmp_path / "work" / name / "model.npz")
             costs[name] = costs["matches"]
     (tmp_path / "work" / "stages.json").write_text(json.dumps(costs))
-    monkeypatch.setattr(camera_solver, "judged", lambda model, keys: [])  # each passes by itself
+    monkeypatch.setattr(
+        camera_solver, "evaluate_gates", lambda model, keys: []
+    )  # each passes by itself
     with pytest.raises(InputError, match="contradict each other"):
         solve_cameras(
             source,
@@ -183,7 +189,7 @@ def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch
 
 
 def test_a_tripod_needs_no_solution(room, walked, tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap_mapping, "extract", None)
+    monkeypatch.setattr(colmap_mapping, "extract_features", None)
     camera = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
     source = filmed(tmp_path / "film", [room.seen(camera)] * 9)
     solved = solve_cameras(source, nobody, tmp_path / "work", SolverSettings(), lambda *what: None)

@@ -23,7 +23,7 @@ def failed(gates) -> list[str]:
 def transformed(model, *, scale=0.37, turn=(0.3, -0.8, 0.2), shift=(1.0, 2.0, -3.0)):
     """The same solution in a world of another size, turned and shifted."""
     rotation, shift = Rotation.from_rotvec(turn).as_matrix(), np.array(shift)
-    centers = scale * model.centers() @ rotation.T + shift
+    centers = scale * model.camera_centers() @ rotation.T + shift
     cameras = model.camera_from_world.copy()
     cameras[:, :3, :3] = cameras[:, :3, :3] @ rotation.T
     cameras[:, :3, 3] = -np.einsum("cab,cb->ca", cameras[:, :3, :3], centers)
@@ -89,13 +89,13 @@ def test_a_camera_placed_by_a_few_points_is_found(model):
     few = model.observations_of_camera(7)[20:]
     kept = np.setdiff1d(np.arange(len(model.pixels)), few)
     thinned = replace(
-        model, observation_camera=model.seen_by[kept], observation_point=model.seen_point[kept],
+        model, observation_camera=model.observation_camera[kept], observation_point=model.observation_point[kept],
         pixels=model.pixels[kept],
     )  # fmt: skip
     assert find_outlier_cameras(thinned).nonzero()[0].tolist() == [7]
-    rest = thinned.without(find_outlier_cameras(thinned))
+    rest = thinned.without_cameras(find_outlier_cameras(thinned))
     assert rest.frames.tolist() == [i for i in range(24) if i != 7]
-    assert rest.residuals().max() < 1e-9
+    assert rest.reprojection_errors_px().max() < 1e-9
 
 
 def test_two_solutions_agree_if_they_differ_by_a_similarity(model):
@@ -106,13 +106,13 @@ def test_two_solutions_agree_if_they_differ_by_a_similarity(model):
 
 def test_two_solutions_contradict_each_other(model):
     bent = model.camera_from_world.copy()
-    path = np.linalg.norm(np.diff(model.centers(), axis=0), axis=1).sum()
+    path = np.linalg.norm(np.diff(model.camera_centers(), axis=0), axis=1).sum()
     bent[12:, :3, 3] += bent[12:, :3, :3] @ [0.0, 0.06 * path, 0.0]
     assert not compare_models(model, replace(model, camera_from_world=bent)).passed
     assert not compare_models(
         model, turned(model, 5, 1.5)
     ).passed  # the centres stay where they were
-    half = model.without(np.arange(24) % 2 == 0)
+    half = model.without_cameras(np.arange(24) % 2 == 0)
     assert not compare_models(model, half).passed
 
 
