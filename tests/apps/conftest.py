@@ -96,7 +96,7 @@ def capture(film, tmp_path) -> Path:
 @pytest.fixture
 def call_ingest(capsys, monkeypatch, rig) -> Command:
     """Runs ia-ingest, for a few steps unless the test says otherwise."""
-    monkeypatch.setattr(training_session.Rig, "of", lambda shaped: rig)
+    monkeypatch.setattr(training_session.Rig, "from_shaped_body", lambda shaped: rig)
     monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:

@@ -44,7 +44,7 @@ def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsy
     example = load("1_learn_from_python.py")
     monkeypatch.setattr(example, "STEPS", 150)
     monkeypatch.setattr(example, "shoot", lambda out, config, overwrite: shutil.copytree(film, out))
-    monkeypatch.setattr(training_session.Rig, "of", lambda shaped: rig)
+    monkeypatch.setattr(training_session.Rig, "from_shaped_body", lambda shaped: rig)
     example.main(tmp_path)
     said = capsys.readouterr().out
     assert (tmp_path / "avatar.iavatar").exists()

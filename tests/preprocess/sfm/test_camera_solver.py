@@ -82,7 +82,7 @@ def test_every_stage_is_told_and_paid_for(walk):
 def test_what_is_finished_is_not_done_again(walk, tmp_path, monkeypatch):
     _, source, solved, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
-    for name in ("extract", "match", "map_global", "map_incremental"):
+    for name in ("extract_features", "match_features", "map_global", "map_incremental"):
         monkeypatch.setattr(colmap_mapping, name, None)  # calling it would be an error
     monkeypatch.setattr(camera_solver, "resect_intermediate_frames", None)
     again = solve_cameras(
