@@ -121,7 +121,7 @@ def failing_operation(backend: Backend) -> str | None:
             "encode": of.encode(points, table, levels),
             "encode_backward": grad_table,
             "encode_points_backward": of.encode_points_backward(points, slope, table, levels),
-            "build_cells": _march_to_seeds(
+            "solve_correspondences": _march_to_seeds(
                 TorchBackend(), _solve_tables(of, rig, bones), rig, bones, canonical
             ),
             "march": _march_to_seeds(of, cells, rig, bones, canonical),

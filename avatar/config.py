@@ -124,7 +124,7 @@ class TrainConfig:
         if self.skipping == "none" and self.empty_term == "occupancy" and self.empty_space_weight:
             raise ValueError(
                 "skipping='none' knows no empty cells that could be kept empty: set "
-                "empty_weight=0 or empty_term='global'."
+                "empty_space_weight=0 or empty_term='global'."
             )
 
     @property

@@ -46,7 +46,7 @@ POSES_AS_GIVEN = {"refine_poses": False}
 LOSS_VARIANTS = [
     Variant(name="full", changes=POSES_AS_GIVEN),
     Variant(name="w/o alpha loss", changes={**POSES_AS_GIVEN, "alpha_weight": 0.0}),
-    Variant(name="w/o hard surface", changes={**POSES_AS_GIVEN, "hard_weight": 0.0}),
+    Variant(name="w/o hard surface", changes={**POSES_AS_GIVEN, "hard_surface_weight": 0.0}),
     Variant(
         name="w/o occupancy-based regulariser",
         changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0},

@@ -128,7 +128,7 @@ def train_variants(
         runs.append(VariantRun(variant=variant, trainer=trainer))
     while under_way := [run for run in runs if run.progress(budget) < 1.0]:
         for run in under_way:
-            run.go_on(budget)
+            run.train_slice(budget)
     return runs
 
 

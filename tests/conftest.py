@@ -13,6 +13,8 @@ from hypothesis import settings
 from preprocess.body.body_file import load_body_model
 from preprocess.body.parametric_body import ShapedBody
 
+pytest_plugins = ["tests.avatar_fixtures"]
+
 settings.register_profile("busy", deadline=None)  # a machine may be busy with something else
 settings.load_profile("busy")
 

@@ -1,7 +1,4 @@
-"""What training has learnt, on disk: written whole or not at all, read as plain data.
-
-Tensors on disk, whole or not at all.
-"""
+"""Checkpoints: the trainer's state on disk, written atomically and read as plain data."""
 
 import dataclasses
 import pickle
@@ -17,9 +14,12 @@ from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
+"""Version of the checkpoint's layout; another version is refused."""
 CHECKPOINT_FILE = "state.pt"
+"""File name of the checkpoint in its folder."""
 COUNTERS = ("steps", "rays", "samples", "frames_seen", "wall_seconds", "cpu_seconds")
+"""Attributes of `Trainer` that the checkpoint saves as plain numbers."""
 
 
 def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None) -> Path:
@@ -77,8 +77,8 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if state["format"] != CHECKPOINT_FORMAT:
             raise InputError(
-                f"The checkpoint {path} has format {state['format']}; this version reads {CHECKPOINT_FORMAT}. "
-                "Train again with --overwrite."
+                f"The checkpoint {path} has format {state['format']}; this version reads "
+                f"{CHECKPOINT_FORMAT}. Train again with --overwrite."
             )
         return _restored(state, device), state["notes"]
     except InputError:
@@ -96,15 +96,11 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
 
 
 def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
-    known = state["rig"]
-    # checkpoints of old know of nothing that is inside
-    known.setdefault("inside", torch.zeros(known["distance"].shape, dtype=torch.bool))
-    rig = Rig(**{name: tensor.numpy() for name, tensor in known.items()})
+    rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
     trainer = Trainer(rig, TrainConfig(**state["config"]), device)
     with torch.no_grad():
         for field, name in ((trainer.field, "field"), (trainer.avatar.field, "mean")):
-            known = state.get(name, state["field"])  # checkpoints of old have no mean
-            for parameter, values in zip(field.parameters(), known, strict=True):
+            for parameter, values in zip(field.parameters(), state[name], strict=True):
                 parameter.copy_(values)
     trainer.optimizer.load_state_dict(state["optimizer"])
     grid = trainer.avatar.occupancy.density_grid

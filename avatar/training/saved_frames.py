@@ -24,7 +24,8 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 
-REPLAY_FILE_FORMAT = 1
+REPLAY_FILE_FORMAT = 2
+"""Version of the saved frames' layout; another version is refused."""
 LAST_RUN_FILE, EARLIER_VIDEOS_FILE = "frames.tensors", "earlier.tensors"
 """Of the run that ended last; of the runs before the video that is being learnt now."""
 INDEX_SHIFT_PER_VIDEO = 1 << 32

@@ -46,7 +46,7 @@ def test_the_compiled_backend_is_sound():
 @pytest.mark.parametrize(
     "operation",
     [
-        "encode", "encode_backward", "encode_points_backward", "build_cells", "march",
+        "encode", "encode_backward", "encode_points_backward", "solve_correspondences", "march",
         "composite", "composite_loss",
     ],
 )  # fmt: skip
@@ -57,7 +57,7 @@ def test_an_operation_that_is_off_is_named(operation, factor):
 
 def test_a_straying_backend_is_replaced_with_one_warning(monkeypatch):
     monkeypatch.delenv("IA_BACKEND", raising=False)
-    monkeypatch.setattr(backends, "_numba", lambda: Spoiled("encode", 1.01))
+    monkeypatch.setattr(backends, "_numba_backend", lambda: Spoiled("encode", 1.01))
     backends._numba_passes_self_test.cache_clear()
     cpu = torch.device("cpu")
     try:

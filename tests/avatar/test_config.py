@@ -36,7 +36,7 @@ def test_few_frames_determine_less_detail():
     ("choices", "advice"),
     [
         ({"roots": "broyden"}, "refine_poses=False"),
-        ({"skipping": "none"}, "empty_weight=0 or empty_term='global'"),
+        ({"skipping": "none"}, "empty_space_weight=0 or empty_term='global'"),
     ],
 )
 def test_what_contradicts_itself_is_refused_with_advice(choices, advice):

@@ -19,7 +19,7 @@ from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
 
 sys.path.insert(0, str(Path(__file__).parent))
-from elsewhere import ELSEWHERE, DeviceMixUpError, Elsewhere, elsewhere
+from fake_device import FAKE_DEVICE, DeviceMixUpError, FakeDeviceTensor, fake_device
 
 CONFIG = TrainConfig(
     rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_space_points=16,
@@ -29,7 +29,7 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def device():
-    with elsewhere() as place:
+    with fake_device() as place:
         yield place
 
 
@@ -42,7 +42,7 @@ def test_a_mix_up_of_devices_shows(device):
         there.numpy()
     with pytest.raises(DeviceMixUpError):
         torch.rand(3, device=device, generator=torch.Generator())
-    assert isinstance(there + 1.0, Elsewhere)
+    assert isinstance(there + 1.0, FakeDeviceTensor)
     assert np.isfinite((there + 1.0).cpu().numpy()).all()
 
 
@@ -57,7 +57,7 @@ def trainer(device, rig, clip):
         patch.setattr(
             gauss_newton, "MIN_EVIDENCE", -1.0
         )  # these poses are exact, and would not move
-        patch.setattr(gauss_newton, "CERTAIN", 0.0)
+        patch.setattr(gauss_newton, "FULL_EVIDENCE", 0.0)
         for _ in range(12):
             trainer.step(rate=1.0, hard_surface_share=1.0)
     return trainer
@@ -69,8 +69,8 @@ def held_out(clip, rig) -> list[HeldOutFrame]:
 
 def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig, monkeypatch):
     assert trainer.backend.name == "torch"
-    assert all(parameter.device == ELSEWHERE for parameter in trainer.avatar.field.parameters())
-    assert trainer.corrections  # poses were refined, too
+    assert all(parameter.device == FAKE_DEVICE for parameter in trainer.avatar.field.parameters())
+    assert trainer.pose_corrections  # poses were refined, too
     held = held_out(clip, rig)
     assert np.isfinite(score_frame(trainer.avatar, held[0]).psnr)
     monkeypatch.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
@@ -91,13 +91,13 @@ def test_the_papers_schemes_stay_on_their_device(device, scheme, rig, clip):
     trainer.add_frame(next(prepare_stream(iter(clip.observations[:1]), rig, stride=0, total=None)))
     for _ in range(2):
         result = trainer.step(rate=1.0, hard_surface_share=1.0)
-    assert result.loss.device == ELSEWHERE
+    assert result.loss.device == FAKE_DEVICE
     assert torch.isfinite(trainer.avatar.field.table.cpu()).all()
 
 
 def test_a_checkpoint_goes_from_one_device_to_another(trainer, tmp_path):
     checkpoint.save(trainer, tmp_path)
-    for device in (ELSEWHERE, torch.device("cpu")):
+    for device in (FAKE_DEVICE, torch.device("cpu")):
         loaded, _ = checkpoint.load(tmp_path, device)
         tables = [one.avatar.field.table.detach().cpu() for one in (trainer, loaded)]
         assert torch.equal(*tables)
@@ -116,6 +116,6 @@ def test_the_stream_of_training_runs_on_a_device(device, clip, rig):
 
 
 def test_a_field_is_read_out_on_its_device(trainer):
-    points = torch.from_numpy(trainer.avatar.rig.seeds[:50]).to(ELSEWHERE)
-    color, density = trainer.avatar.field_at(points)
-    assert color.device == density.device == ELSEWHERE
+    points = torch.from_numpy(trainer.avatar.rig.seeds[:50]).to(FAKE_DEVICE)
+    color, density = trainer.avatar.color_and_density_at(points)
+    assert color.device == density.device == FAKE_DEVICE

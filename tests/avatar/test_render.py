@@ -116,7 +116,7 @@ def test_the_person_has_no_holes(learnt, avatar):
     for held in [*learnt.held, learnt.novel]:
         seen = held.observation
         inside = cv2.erode((seen.alpha > 0.99).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        alpha = render(avatar, seen.pose, seen.camera, cells=held.cells)[..., 3]
+        alpha = render(avatar, seen.pose, seen.camera, cells=held.correspondences)[..., 3]
         assert inside.sum() > 80
         assert alpha[inside].min() > 0.9
 
@@ -126,7 +126,7 @@ def test_nothing_floats_beside_the_person(learnt, avatar):
     for held in [*learnt.held, learnt.novel]:
         seen = held.observation
         near = cv2.dilate((seen.alpha > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        alpha = render(avatar, seen.pose, seen.camera, cells=held.cells)[..., 3]
+        alpha = render(avatar, seen.pose, seen.camera, cells=held.correspondences)[..., 3]
         assert alpha[~near].max() < 0.1
 
 
@@ -145,16 +145,18 @@ def test_only_where_camera_and_person_stand_to_each_other_matters(rig, avatar, s
 
 
 def test_how_many_rays_go_at_once_changes_nothing(avatar, shot, picture, monkeypatch):
-    monkeypatch.setattr(render_module, "RAYS_AT_ONCE", 700)
+    monkeypatch.setattr(render_module, "RAYS_PER_CHUNK", 700)
     np.testing.assert_allclose(render(avatar, *shot), picture, atol=2 * MIN_TRANSMITTANCE)
 
 
 def test_a_warp_solved_before_gives_the_same_picture(learnt, avatar, shot, picture):
-    np.testing.assert_array_equal(render(avatar, *shot, cells=learnt.novel.cells), picture)
+    np.testing.assert_array_equal(
+        render(avatar, *shot, cells=learnt.novel.correspondences), picture
+    )
 
 
 def test_rendering_leaves_the_avatar_as_it_was(avatar, shot):
-    grid = avatar.occupancy.grid
+    grid = avatar.occupancy.density_grid
     before = [t.clone() for t in (*avatar.field.parameters(), grid.density, grid.occupied)]
     render(avatar, *shot)
     after = (*avatar.field.parameters(), grid.density, grid.occupied)
@@ -188,7 +190,7 @@ def test_a_person_who_moves_by_a_pixel_is_seen_a_pixel_farther(rig, avatar, shot
 def test_a_larger_picture_shows_the_same_person(avatar, shot, picture):
     pose, camera = shot
     width, height = camera.size_px
-    large = render(avatar, pose, camera.resized((2 * width, 2 * height)))
+    large = render(avatar, pose, camera.resize((2 * width, 2 * height)))
     small = large.reshape(height, 2, width, 2, 4).mean(axis=(1, 3))
     assert decibels(small, picture) > 30.0
     assert small[..., 3].sum() == pytest.approx(picture[..., 3].sum(), rel=0.01)
@@ -213,7 +215,7 @@ def test_there_is_nothing_outside_the_occupied_cells(rig, avatar, rng):
     grid = avatar.rendering_grid()
     low, high = rig.box_low - 0.3, rig.box_high + 0.3
     points = torch.from_numpy(rng.uniform(low, high, (20_000, 3)).astype(np.float32))
-    color, density = avatar.field_at(points)
+    color, density = avatar.color_and_density_at(points)
     cell = torch.floor((points - grid.low) * grid.cells_per_m).long().numpy()
     inside = ((cell >= 0) & (cell < grid.occupied.shape)).all(axis=1)
     held = np.zeros(len(points), dtype=bool)
@@ -221,6 +223,6 @@ def test_there_is_nothing_outside_the_occupied_cells(rig, avatar, rng):
     assert 100 < held.sum() < len(points)
     assert (density.numpy()[~held] == 0.0).all()
     assert (color.numpy()[~held] == 0.0).all()
-    raw = avatar.field.raw_at(points[torch.from_numpy(held)].contiguous())
+    raw = avatar.field.raw_outputs_at(points[torch.from_numpy(held)].contiguous())
     np.testing.assert_allclose(color[held], torch.sigmoid(raw[:, :3]), atol=1e-6)
     np.testing.assert_allclose(density[held], raw[:, 3].clamp(max=9.0).exp(), rtol=1e-5)

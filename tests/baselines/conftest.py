@@ -17,8 +17,10 @@ def avatar(learnt):
 def novel(learnt):
     """The novel pose's picture by the exact renderer, and what it is a picture of."""
     seen = learnt.novel.observation
-    picture = render(learnt.trainer.avatar, seen.pose, seen.camera, cells=learnt.novel.cells)
-    return picture, seen, learnt.novel.cells
+    picture = render(
+        learnt.trainer.avatar, seen.pose, seen.camera, cells=learnt.novel.correspondences
+    )
+    return picture, seen, learnt.novel.correspondences
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +39,7 @@ def solid_in(bones_of):
     """Where skinning carries the centres of dense canonical cells, body frame."""
 
     def solid(avatar, pose):
-        grid = avatar.occupancy.grid
+        grid = avatar.occupancy.density_grid
         cells = (grid.density > SOLID_DENSITY).nonzero()
         points = ((cells + 0.5) / grid.cells_per_m + grid.low).numpy()
         matrix = (avatar.rig.weights_at(points) @ bones_of(avatar.rig, pose).numpy()).reshape(

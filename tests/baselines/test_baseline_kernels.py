@@ -66,7 +66,7 @@ def test_both_twins_place_the_same_samples(boxes, generator):
 def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, generator):
     full = boxes._replace(occupied=torch.ones_like(boxes.occupied))
     rays = rays_at(full, 100, generator)
-    points, counts = backend.place(rays, full, STEP_M)
+    points, counts = backend.sample_occupied_cells(rays, full, STEP_M)
     size = (full.shape / full.cells_per_m)[rays.slots.long()]
     low = full.low[rays.slots.long()]
     near = (low - rays.origins) / rays.directions
@@ -84,22 +84,22 @@ def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
     """A box that is smaller than the grid on one side and larger on the other."""
     full = boxes._replace(
         occupied=torch.ones_like(boxes.occupied),
-        ray_box_low=boxes.near + 0.1,
-        ray_box_high=boxes.far + 0.1,
+        ray_box_low=boxes.ray_box_low + 0.1,
+        ray_box_high=boxes.ray_box_high + 0.1,
     )
     rays = rays_at(full, 200, generator)
-    points, counts = backend.place(rays, full, STEP_M)
+    points, counts = backend.sample_occupied_cells(rays, full, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     assert len(points) > 500
-    assert (points > full.near[slot] - 1e-5).all()
-    assert (points < full.far[slot] + 1e-5).all()
-    assert (points > boxes.far[slot]).any()
+    assert (points > full.ray_box_low[slot] - 1e-5).all()
+    assert (points < full.ray_box_high[slot] + 1e-5).all()
+    assert (points > boxes.ray_box_high[slot]).any()
 
 
 @BACKENDS
 def test_an_empty_cell_has_no_samples(backend, boxes, generator):
     rays = rays_at(boxes, 300, generator)
-    points, counts = backend.place(rays, boxes, STEP_M)
+    points, counts = backend.sample_occupied_cells(rays, boxes, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     cell = ((points - boxes.low[slot]) * boxes.cells_per_m[slot]).long()
     cell = torch.minimum(cell.clamp(min=0), boxes.shape[slot] - 1)
@@ -112,7 +112,7 @@ def test_no_rays_have_no_samples(backend, boxes):
     none = RayBatch(
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
     )
-    points, counts = backend.place(none, boxes, STEP_M)
+    points, counts = backend.sample_occupied_cells(none, boxes, STEP_M)
     assert points.shape == (0, 3)
     assert counts.shape == (0,)
 
@@ -127,9 +127,9 @@ def posed(rig):
     avatar = Trainer(rig, config, torch.device("cpu")).avatar
     warp = BroydenWarp(avatar.field, rig, 2)
     chance = np.random.default_rng(0)
-    cells = np.argwhere(rig.distance < 0.05)
+    cells = np.argwhere(rig.skin_distance < 0.05)
     cells = cells[chance.integers(len(cells), size=600)] + chance.random((600, 3))
-    spacing = (rig.box_high - rig.box_low) / rig.distance.shape
+    spacing = (rig.box_high - rig.box_low) / rig.skin_distance.shape
     canonical = (cells * spacing + rig.box_low).astype(np.float32)
     slots = np.repeat([0, 1], 300).astype(np.int32)
     carried = np.empty_like(canonical)
@@ -147,7 +147,7 @@ def posed(rig):
 @BACKENDS
 def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
     canonical, carried, slots, poses = posed
-    roots, valid = backend.find_roots(carried, slots, poses)
+    roots, valid = backend.find_all_roots(carried, slots, poses)
     off = torch.where(valid, (roots - canonical[:, None]).norm(dim=-1), torch.inf).amin(dim=1)
     assert (off < 1e-3).float().mean() >= 0.99
 
@@ -155,7 +155,7 @@ def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
 @BACKENDS
 def test_no_root_is_found_twice(backend, posed):
     _, carried, slots, poses = posed
-    roots, valid = backend.find_roots(carried, slots, poses)
+    roots, valid = backend.find_all_roots(carried, slots, poses)
     gap = (roots[:, :, None] - roots[:, None]).norm(dim=-1)
     both = valid[:, :, None] & valid[:, None] & ~torch.eye(roots.shape[1], dtype=torch.bool)
     assert gap[both].min() >= SAME_ROOT_M

@@ -29,7 +29,7 @@ VARIANTS = {
     "union, broyden": {"skipping": "union", "roots": "broyden"},
     "global": {"empty_term": "global"},
     "no alpha": {"alpha_weight": 0.0},
-    "no hard surface": {"hard_weight": 0.0},
+    "no hard surface": {"hard_surface_weight": 0.0},
 }
 SCHEMES = {name: choices for name, choices in VARIANTS.items() if not name.startswith("no ")}
 """Where samples lie, what warps them, where density is asked; losses are our own, tested there."""

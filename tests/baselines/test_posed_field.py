@@ -17,18 +17,18 @@ def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bone
     warp = BroydenWarp(avatar.field, rig, 1)
     warp.set_pose(0, bones_of(rig, seen.pose))
     low = torch.from_numpy(cells.low)
-    size = torch.tensor(cells.index.shape) * cells.cell_m
+    size = torch.tensor(cells.packed_cells.shape) * cells.cell_m
     points = low + torch.rand(4000, 3, generator=generator) * size
     slots = torch.zeros(4000, dtype=torch.int32)
     warped = warp(points, slots, correspondence_tables(cells, CPU))
-    roots, valid = avatar.field.backend.find_roots(points, slots, warp.poses)
+    roots, valid = avatar.field.backend.find_all_roots(points, slots, warp.poses)
     box = [torch.from_numpy(corner) for corner in (rig.box_low, rig.box_high)]
     valid &= ((roots >= box[0]) & (roots <= box[1])).all(dim=-1)
     score = torch.full(valid.shape, -torch.inf)
-    score[valid] = avatar.field.raw_at(roots[valid])[:, 3]
+    score[valid] = avatar.field.raw_outputs_at(roots[valid])[:, 3]
     assert torch.equal(warped.has_root, valid.any(dim=1))
     assert (valid.sum(dim=1) > 1).sum() > 40
-    chosen = avatar.field.raw_at(warped.points)[:, 3]
+    chosen = avatar.field.raw_outputs_at(warped.points)[:, 3]
     torch.testing.assert_close(chosen, score.amax(dim=1)[warped.has_root], atol=1e-5, rtol=0)
 
 
@@ -36,7 +36,7 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
     _, seen, cells = novel
     points = solid_in(avatar, seen.pose)
     slots = torch.zeros(len(points), dtype=torch.int32)
-    broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.grid)
+    broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.density_grid)
     broyden.set_pose(0, bones_of(rig, seen.pose))
     tables = correspondence_tables(cells, CPU)
     exact, ours = (warp(points, slots, tables)
@@ -52,30 +52,39 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
 def test_samples_know_which_root_warped_them(avatar, learnt, generator):
     """Through its row each sample leads back into its cell: x = x* + J⁻¹ (p - center)."""
     replay, backend = learnt.trainer.replay, avatar.field.backend
-    rays = replay.draw(200, generator).rays
+    rays = replay.sample_rays(200, generator).rays
     sampler = PosedSampler(
-        backend, NoSkipping(), CorrespondenceWarp(avatar.field, avatar.occupancy), avatar.step_m
+        backend,
+        NoSkipping(),
+        CorrespondenceWarp(avatar.field, avatar.occupancy),
+        avatar.sample_step_m,
     )
-    samples = sampler.sample_rays(rays, replay.cells)
+    samples = sampler.sample_rays(rays, replay.correspondences)
     slot = rays.slots.long().repeat_interleave(samples.counts)
-    root = replay.cells.roots[slot, samples.root_rows.long()]
+    root = replay.correspondences.roots[slot, samples.root_rows.long()]
     inverse = root[:, 3:].unflatten(1, (3, 3))
     offset = torch.linalg.solve(inverse, samples.points - root[:, :3])
     assert (
-        float((offset.abs().amax(dim=1) < 0.5 * replay.cells.cell_m + 1e-3).float().mean()) > 0.99
+        float(
+            (offset.abs().amax(dim=1) < 0.5 * replay.correspondences.cell_m + 1e-3).float().mean()
+        )
+        > 0.99
     )
 
 
 def test_ours_asks_no_point_that_no_skipping_leaves_out(avatar, learnt, generator):
     replay, backend = learnt.trainer.replay, avatar.field.backend
-    rays = replay.draw(300, generator).rays
+    rays = replay.sample_rays(300, generator).rays
     everything = PosedSampler(
-        backend, NoSkipping(), CorrespondenceWarp(avatar.field, avatar.occupancy), avatar.step_m
-    ).sample_rays(rays, replay.cells)
-    how = MarchSettings(avatar.step_m, torch.inf, 512)
-    ours = backend.march(rays, replay.cells, avatar.occupancy.grid, how)
-    assert (everything.counts >= ours.count).all()
-    assert int(everything.counts.sum()) > 1.5 * int(ours.count.sum())
+        backend,
+        NoSkipping(),
+        CorrespondenceWarp(avatar.field, avatar.occupancy),
+        avatar.sample_step_m,
+    ).sample_rays(rays, replay.correspondences)
+    how = MarchSettings(avatar.sample_step_m, torch.inf, 512)
+    ours = backend.march(rays, replay.correspondences, avatar.occupancy.density_grid, how)
+    assert (everything.counts >= ours.counts).all()
+    assert int(everything.counts.sum()) > 1.5 * int(ours.counts.sum())
     for ray in range(0, 300, 10):
         mine, all_of_them = (
             s.points[int(s.offsets[ray]) : int(s.offsets[ray]) + int(s.counts[ray])]

@@ -55,12 +55,12 @@ def test_the_union_holds_what_every_frame_holds(learnt, avatar, generator, solid
     field = PosedField(avatar.field, CorrespondenceWarp(avatar.field, avatar.occupancy))
     union = SequenceGrid(avatar.rig, field, interval=16, device=CPU)
     for slot in range(len(replay)):
-        union.probe(slot, replay.cells, generator)
+        union.probe(slot, replay.correspondences, generator)
     frames = PerFrameGrids(field, 1, CPU)
     assert 0.01 < float(union.occupied.float().mean()) < 0.2
     for slot in range(0, len(replay), 5):
         solid = solid_in(avatar, learnt.trainer.poses.pose(slot))
-        assert holds(union.posed_occupancy(replay.cells), slot, solid) > 0.999
+        assert holds(union.posed_occupancy(replay.correspondences), slot, solid) > 0.999
         rotations = learnt.trainer.poses.pose(slot).joint_rotations
         tables = correspondence_tables(CorrespondenceGrid.solve(avatar.rig, rotations), CPU)
         frames.add_frame(0, tables)
@@ -70,7 +70,7 @@ def test_the_union_holds_what_every_frame_holds(learnt, avatar, generator, solid
         # every point of the frame's own grid is in the union, give or take a coarse cell's width
         cell = frames.occupied[0].nonzero() + 0.5
         centers = cell / frames.posed_occupancy(tables).cells_per_m[0] + tables.low[0]
-        assert holds(union.posed_occupancy(replay.cells), slot, centers) > 0.98
+        assert holds(union.posed_occupancy(replay.correspondences), slot, centers) > 0.98
 
 
 class Nowhere:
@@ -80,7 +80,7 @@ class Nowhere:
         found = torch.ones(len(points), dtype=torch.bool)
         return CanonicalPoints(points, torch.zeros(len(points), dtype=torch.int32), found)
 
-    def admit(self, slot, bones):
+    def set_pose(self, slot, bones):
         pass
 
 
@@ -105,7 +105,7 @@ def of_slot(frames, slot):
 
 
 def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, generator):
-    cells, (field, thicken) = learnt.trainer.replay.cells, fog
+    cells, (field, thicken) = learnt.trainer.replay.correspondences, fog
     frames = PerFrameGrids(field, 1, CPU)
     frames.add_frame(0, cells)
     assert frames.occupied.all()  # until it has been probed
@@ -121,7 +121,7 @@ def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, g
 
 
 def test_the_frame_whose_grid_is_oldest_is_renewed_first(fog, learnt, generator):
-    cells, (field, thicken) = learnt.trainer.replay.cells, fog
+    cells, (field, thicken) = learnt.trainer.replay.correspondences, fog
     frames = PerFrameGrids(field, 3, CPU)
     for slot in (0, 1, 2):
         frames.add_frame(slot, cells)
@@ -142,10 +142,10 @@ def test_empty_points_are_empty_in_the_pose_that_was_probed(learnt, avatar, gene
     union = SequenceGrid(avatar.rig, PosedField(avatar.field, warp), interval=16, device=CPU)
     assert len(union.sample_empty(10, generator)) == 0
     for slot in range(4):
-        union.probe(slot, learnt.trainer.replay.cells, generator)
+        union.probe(slot, learnt.trainer.replay.correspondences, generator)
     empty = union.sample_empty(2000, generator)
     assert len(empty) == 2000
-    density = torch.exp(avatar.field.raw_at(empty)[:, 3])
+    density = torch.exp(avatar.field.raw_outputs_at(empty)[:, 3])
     assert float(density.max()) < 1.5
     low, high = torch.from_numpy(avatar.rig.box_low), torch.from_numpy(avatar.rig.box_high)
     spread = (empty.amax(0) - empty.amin(0)) / (high - low)

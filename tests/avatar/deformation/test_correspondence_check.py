@@ -58,7 +58,7 @@ def seen(rig):
 
 def test_strays_are_samples_that_skinning_carries_elsewhere(seen):
     strays, samples, rays, off = seen
-    found = strays.among(samples, rays)
+    found = strays.find_spurious(samples, rays)
     assert len(found) > 20
     assert (off[found] > 0.99 * MAX_RAY_DISTANCE_M).all()
 
@@ -68,13 +68,13 @@ def test_nearly_every_sample_that_is_carried_far_is_found(seen):
     strays, samples, rays, off = seen
     far = off > 2.0 * MAX_RAY_DISTANCE_M
     found = torch.zeros_like(far)
-    found[strays.among(samples, rays)] = True
+    found[strays.find_spurious(samples, rays)] = True
     assert (found & far).sum() > 0.98 * far.sum()
 
 
 def test_few_cells_are_doubtful_and_none_in_the_canonical_pose(rig, seen):
     strays = seen[0]
-    assert 0 < strays.doubtful.sum() < 0.2 * len(strays.doubtful)
+    assert 0 < strays.unreliable_rows.sum() < 0.2 * len(strays.unreliable_rows)
     canonical = rig.canonical_rotations
     cells = CorrespondenceGrid.solve(rig, canonical)
     assert not CorrespondenceCheck.for_pose(rig, canonical, cells, CPU).unreliable_rows.any()

@@ -28,7 +28,7 @@ def nearest_root_error(cells, targets, canonical):
 def candidates(cells, targets, bends=True):
     """What each root of their cells makes of posed points; far off where there is no such root."""
     place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
-    packed = torch.from_numpy(cells.index[tuple(place.T)])
+    packed = torch.from_numpy(cells.packed_cells[tuple(place.T)])
     offset = torch.from_numpy(targets - (cells.low + (place + 0.5) * cells.cell_m)).float()
     slot, roots = torch.zeros(len(targets), dtype=torch.int64), torch.from_numpy(cells.roots)[None]
     found = []
@@ -42,7 +42,7 @@ def candidates(cells, targets, bends=True):
 
 def solved_roots(cells):
     """Roots and inverse Jacobians, without the rows that say how bent cells bend."""
-    packed = torch.from_numpy(cells.index[cells.index > 0])
+    packed = torch.from_numpy(cells.packed_cells[cells.packed_cells > 0])
     rows = torch.cat([torch_reference.root_row(packed, candidate) for candidate in range(3)])
     return cells.roots[rows[rows > 0].numpy()]
 
@@ -95,8 +95,8 @@ def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
 def test_no_cell_is_far_from_the_body(rig, bent_pose):
     cells = CorrespondenceGrid.solve(rig, bent_pose, band_m=0.05)
     place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
-    cell = (place * rig.distance.shape).astype(int)
-    assert rig.distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
+    cell = (place * rig.skin_distance.shape).astype(int)
+    assert rig.skin_distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
 
 
 def test_wild_poses_are_solved_without_harm(rig, rng):
@@ -110,11 +110,13 @@ def test_wild_poses_are_solved_without_harm(rig, rng):
 
 def test_only_nodes_near_the_skin_are_blended(rig):
     near = rig.skinning_nodes_within(0.11)
-    assert len(near.nodes) < 0.4 * rig.weights[..., 0].size
-    weights = np.zeros((len(near.nodes), 24), dtype=np.float32)
-    weights[np.repeat(np.arange(len(near.nodes)), np.diff(near.first)), near.joints] = near.shares
-    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.nodes])
-    assert len(rig.skinning_nodes_within(0.2).nodes) > len(near.nodes)
+    assert len(near.node_indices) < 0.4 * rig.weights[..., 0].size
+    weights = np.zeros((len(near.node_indices), 24), dtype=np.float32)
+    weights[np.repeat(np.arange(len(near.node_indices)), np.diff(near.offsets)), near.joints] = (
+        near.weights
+    )
+    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.node_indices])
+    assert len(rig.skinning_nodes_within(0.2).node_indices) > len(near.node_indices)
 
 
 def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeypatch):
@@ -169,10 +171,10 @@ def test_a_pose_is_solved_the_same_way_every_time(rig, bent_pose):
 
 def test_a_wider_band_holds_all_that_a_narrow_one_holds_and_more(rig, rng, bent_pose):
     canonical = around_the_skin(rig, rng, spread=0.06)
-    place = (canonical - rig.box_low) / (rig.box_high - rig.box_low) * rig.distance.shape
-    inside = ((place >= 0) & (place < rig.distance.shape)).all(axis=1)
+    place = (canonical - rig.box_low) / (rig.box_high - rig.box_low) * rig.skin_distance.shape
+    inside = ((place >= 0) & (place < rig.skin_distance.shape)).all(axis=1)
     canonical, cell = canonical[inside], place[inside].astype(int)
-    off_skin = rig.distance[tuple(cell.T)]
+    off_skin = rig.skin_distance[tuple(cell.T)]
     far = (off_skin > 0.1) & (off_skin < 0.14)
     targets = posed(rig, rig.canonical_rotations + 0.02, canonical).numpy()
     wide = CorrespondenceGrid.solve(rig, rig.canonical_rotations + 0.02, band_m=0.15)

@@ -73,7 +73,11 @@ def avatar(learnt) -> Avatar:
 
 @pytest.fixture(scope="module")
 def shot(learnt):
-    return learnt.novel.observation.pose, learnt.novel.observation.camera, learnt.novel.cells
+    return (
+        learnt.novel.observation.pose,
+        learnt.novel.observation.camera,
+        learnt.novel.correspondences,
+    )
 
 
 def views(avatar, pose, camera) -> dict[str, Camera]:
@@ -130,7 +134,7 @@ def test_clear_foggy_and_opaque_people_are_summed_as_exactly(altered, shot, log_
     there[strays] = 0.0
     ray = torch.repeat_interleave(torch.arange(len(samples.counts)), samples.counts)
     count = torch.bincount(ray, there, minlength=len(samples.counts))
-    through = math.exp(-math.exp(min(log_density, MAX_LOG_DENSITY)) * person.step_m)
+    through = math.exp(-math.exp(min(log_density, MAX_LOG_DENSITY)) * person.sample_step_m)
     alpha = 1.0 - through ** count.numpy().reshape(picture.shape[:2])
     np.testing.assert_allclose(picture[..., 3], alpha, atol=1e-5)
 
@@ -139,8 +143,10 @@ def test_an_avatar_that_occupies_nothing_is_not_to_be_seen(avatar, shot):
     pose, camera, cells = shot
     occupancy = avatar.occupancy
     empty = object.__new__(type(occupancy))
-    nothing = torch.zeros_like(occupancy.grid.occupied)
-    empty.__dict__.update(occupancy.__dict__, grid=occupancy.grid._replace(occupied=nothing))
+    nothing = torch.zeros_like(occupancy.density_grid.occupied)
+    empty.__dict__.update(
+        occupancy.__dict__, density_grid=occupancy.density_grid._replace(occupied=nothing)
+    )
     nobody = dataclasses.replace(avatar, occupancy=empty)
     assert (render(nobody, pose, camera, cells=cells) == 0.0).all()
 
@@ -150,7 +156,7 @@ def test_an_avatar_that_occupies_nothing_is_not_to_be_seen(avatar, shot):
 
 def scattered(avatar, share: float):
     """The avatar's grid with so many cells occupied, anywhere."""
-    grid = avatar.occupancy.grid
+    grid = avatar.occupancy.density_grid
     chance = torch.rand(grid.occupied.shape, generator=torch.Generator().manual_seed(2))
     return grid._replace(occupied=(chance < share).to(torch.uint8))
 
@@ -165,14 +171,14 @@ def test_pruning_loses_no_sample(avatar, shot, share):
     held = cull_cells(cells, grid)
     some = march(rays, correspondence_tables(held, CPU), grid, how)
     assert torch.equal(some.points, full.points)
-    assert torch.equal(some.count, full.count)
-    assert ((held.packed_cells > 0) <= (cells.index > 0)).all()
+    assert torch.equal(some.counts, full.counts)
+    assert ((held.packed_cells > 0) <= (cells.packed_cells > 0)).all()
     assert (len(full.points) > 0) == (share > 0.0)
 
 
 def test_pruning_leaves_few_cells_that_lead_to_nothing(avatar, shot):
     grid, cells = avatar.rendering_grid(), shot[2]
-    kept, whole = (cull_cells(cells, grid).packed_cells > 0).sum(), (cells.index > 0).sum()
+    kept, whole = (cull_cells(cells, grid).packed_cells > 0).sum(), (cells.packed_cells > 0).sum()
     assert 0.2 * whole < kept < 0.85 * whole
 
 
@@ -191,9 +197,9 @@ def test_no_ray_beside_the_window_meets_anything(avatar, shot):
     for seen in views(avatar, pose, camera).values():
         samples = avatar.field.backend.march(
             rays_of(seen, world_from_body), correspondence_tables(cells, CPU), grid,
-            MarchSettings(avatar.step_m, math.inf, 1024),
+            MarchSettings(avatar.sample_step_m, math.inf, 1024),
         )  # fmt: skip
-        count = samples.count.numpy().reshape(seen.size_px[::-1]).copy()
+        count = samples.counts.numpy().reshape(seen.size_px[::-1]).copy()
         assert count.any()
         count[screen_bounds(held, seen, world_from_body)] = 0
         assert not count.any()

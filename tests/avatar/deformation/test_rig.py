@@ -126,11 +126,11 @@ def test_far_from_creases_the_weights_are_those_of_the_nearest_vertex(rig, shape
 
 
 def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
-    shape = np.array(rig.distance.shape)
+    shape = np.array(rig.skin_distance.shape)
     cell = (rng.random((500, 3)) * shape).astype(int)
     centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
     expected = np.sqrt(((centers[:, None] - skin[None]) ** 2).sum(axis=-1)).min(axis=1)
-    found = rig.distance[tuple(cell.T)]
+    found = rig.skin_distance[tuple(cell.T)]
     near = expected < 0.18
     assert near.any()
     assert not near.all()
@@ -173,10 +173,10 @@ def winding_number(points, vertices, faces) -> np.ndarray:
 
 
 def test_what_is_inside_is_where_the_skin_winds_about_it(rig, skin, shaped, rng):
-    shape = np.array(rig.distance.shape)
-    off_skin = np.argwhere((rig.distance > 0.015) & (rig.distance < 0.1))
+    shape = np.array(rig.skin_distance.shape)
+    off_skin = np.argwhere((rig.skin_distance > 0.015) & (rig.skin_distance < 0.1))
     cell = off_skin[rng.integers(len(off_skin), size=200)]
     centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
     inside = winding_number(centers, skin, shaped.body.faces) > 0.5
     assert 0.05 < inside.mean() < 0.5
-    assert (rig.inside[tuple(cell.T)] == inside).mean() > 0.99
+    assert (rig.inside_skin[tuple(cell.T)] == inside).mean() > 0.99

@@ -55,11 +55,11 @@ def test_posed_patches_lie_on_the_posed_skin(shaped, observed, coverage):
 
 def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverage):
     coverage.add(observed())
-    parts = coverage.parts()
+    parts = coverage.by_part()
     for name in ("torso", "head", "left thigh", "right shin", "left upper arm"):
         assert parts[name].sides["front"] > 0.8
         assert parts[name].sides["back"] == 0.0
-    assert 0.3 < coverage.seen < 0.5
+    assert 0.3 < coverage.seen_share < 0.5
     _, normals = pose_patches(coverage.patches, shaped.with_pose(observed().pose).world_from_rest())
     # nobody is seen more than 72° aslant, and the body spans 15° of the camera's view to each side
     assert not (coverage.cosines[normals[:, 2] < np.cos(np.radians(72 + 15))] > 0.0).any()
@@ -77,9 +77,9 @@ def test_turning_once_shows_all_around(observed, coverage):
     for turned in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
         coverage.add(observed(turned=turned))
     # what is left: crown, shoulders from above, chin, armpits
-    assert coverage.seen > 0.93
+    assert coverage.seen_share > 0.93
     for name in ("torso", "left thigh", "right shin", "left forearm"):
-        assert min(coverage.parts()[name].sides.values()) > 0.9
+        assert min(coverage.by_part()[name].sides.values()) > 0.9
 
 
 def test_half_a_turn_shows_one_side_only(observed, coverage):
@@ -106,21 +106,21 @@ def test_an_arm_before_the_chest_hides_it(shaped, observed):
 def test_what_is_outside_the_picture_is_not_seen(observed, coverage):
     coverage.add(observed(up_m=1.6))
     for foot in ("left foot", "right foot"):
-        assert coverage.parts()[foot].seen == 0.0
+        assert coverage.by_part()[foot].seen_share == 0.0
     here = coverage.patches.parts == PART_NAMES.index("left foot")
     assert set(coverage.stages[here].tolist()) == {
         VisibilityStage.FACING_AWAY,
         VisibilityStage.OUTSIDE_IMAGE,
     }
-    assert coverage.parts()["head"].seen > 0.2
+    assert coverage.by_part()["head"].seen_share > 0.2
 
 
 def test_what_the_mask_leaves_out_is_not_seen(observed, coverage):
     alpha = np.ones((200, 200), dtype=np.float32)
     alpha[:, :100] = 0.4  # the person's right half, seen from the front
     coverage.add(observed(alpha=alpha))
-    parts = coverage.parts()
-    assert parts["right thigh"].seen == 0.0
+    parts = coverage.by_part()
+    assert parts["right thigh"].seen_share == 0.0
     assert parts["left thigh"].sides["front"] > 0.9
     here = coverage.patches.parts == PART_NAMES.index("right thigh")
     assert set(coverage.stages[here].tolist()) <= {
@@ -132,7 +132,7 @@ def test_what_the_mask_leaves_out_is_not_seen(observed, coverage):
 
 def test_somebody_behind_the_camera_is_not_seen(observed, coverage):
     coverage.add(observed(distance_m=-4.0))
-    assert coverage.seen == 0.0
+    assert coverage.seen_share == 0.0
 
 
 def test_nothing_seen_is_ever_unseen(observed, coverage, rng):
@@ -171,13 +171,13 @@ def test_what_was_seen_survives_a_checkpoint(shaped, observed, coverage):
     again.merge_state(coverage.to_state())
     assert np.array_equal(again.stages, coverage.stages)
     assert np.abs(again.cosines - coverage.cosines).max() < 0.5 / 255.0 + 1e-6
-    assert again.seen_share == coverage.seen
+    assert again.seen_share == coverage.seen_share
 
 
 def test_notes_of_another_body_count_nothing(shaped, coverage):
     notes = Coverage(shaped).to_state() | {"stages": "BAQE"}
-    coverage.recall(notes)
-    assert coverage.seen == 0.0
+    coverage.merge_state(notes)
+    assert coverage.seen_share == 0.0
 
 
 def test_a_frame_costs_little(observed, coverage):
@@ -196,10 +196,10 @@ def test_a_frame_costs_little(observed, coverage):
 
 def test_shares_of_parts_make_up_the_share_of_the_whole(observed, coverage):
     coverage.add(observed(turned=0.7))
-    patches, parts = coverage.patches, coverage.parts()
+    patches, parts = coverage.patches, coverage.by_part()
     areas = [float(patches.areas[patches.parts == k].sum()) for k in range(len(PART_NAMES))]
-    whole = np.average([parts[name].seen for name in PART_NAMES], weights=areas)
-    assert whole == pytest.approx(coverage.seen, rel=1e-5)
+    whole = np.average([parts[name].seen_share for name in PART_NAMES], weights=areas)
+    assert whole == pytest.approx(coverage.seen_share, rel=1e-5)
 
 
 def test_patches_that_touch_are_near_and_look_the_same_way(shaped):

@@ -40,16 +40,20 @@ def shell_at(rig, *, thickness_m):
 
 def run(occupancy, log_density_at, generator, updates, **kwargs):
     for _ in range(updates):
-        occupancy.update(log_density_at, share=0.25, step_m=STEP_M, generator=generator, **kwargs)
+        occupancy.update(
+            log_density_at, share=0.25, sample_step_m=STEP_M, generator=generator, **kwargs
+        )
 
 
 def test_everything_near_the_skin_is_occupied_at_first(rig, occupancy):
-    assert torch.equal(occupancy.grid.occupied.bool(), torch.from_numpy(rig.distance <= 0.08))
+    assert torch.equal(
+        occupancy.density_grid.occupied.bool(), torch.from_numpy(rig.skin_distance <= 0.08)
+    )
 
 
 def test_empty_space_is_given_up(occupancy, generator):
     run(occupancy, lambda points: torch.full_like(points[:, 0], -20.0), generator, 40)
-    dense = occupancy.grid.density > MIN_STEP_OPACITY / STEP_M
+    dense = occupancy.density_grid.density > MIN_STEP_OPACITY / STEP_M
     assert not dense.any()
 
 
@@ -57,56 +61,56 @@ def test_a_sheet_thinner_than_a_cell_is_never_forgotten(rig, occupancy, generato
     """One probe a cell often misses it; an EMA that decays fast lost it (15 dB)."""
     log_density_at, middle = shell_at(rig, thickness_m=0.005)
     run(occupancy, log_density_at, generator, 100)
-    cell = int((middle - rig.box_low[2]) * occupancy.grid.cells_per_m[2])
-    sheet = (rig.distance <= 0.08)[:, :, cell]
+    cell = int((middle - rig.box_low[2]) * occupancy.density_grid.cells_per_m[2])
+    sheet = (rig.skin_distance <= 0.08)[:, :, cell]
     for _ in range(100):
         run(occupancy, log_density_at, generator, 1)
-        held = occupancy.grid.occupied[:, :, cell].bool().numpy()[sheet]
+        held = occupancy.density_grid.occupied[:, :, cell].bool().numpy()[sheet]
         assert held.mean() > 0.99
 
 
 def test_nothing_is_occupied_far_from_the_skin(rig, occupancy, generator):
     run(occupancy, lambda points: torch.full_like(points[:, 0], 5.0), generator, 30)
-    assert not occupancy.grid.occupied[torch.from_numpy(rig.distance > 0.08)].any()
+    assert not occupancy.density_grid.occupied[torch.from_numpy(rig.skin_distance > 0.08)].any()
 
 
 def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
     log_density_at, _ = shell_at(rig, thickness_m=0.05)
     run(occupancy, log_density_at, generator, 60)
-    points = occupancy.empty_points(500, generator)
-    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    points = occupancy.sample_empty(500, generator)
+    cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 500
-    assert not occupancy.grid.occupied[tuple(cell.T)].any()
-    assert (rig.distance[tuple(cell.T.numpy())] <= 0.08).all()
+    assert not occupancy.density_grid.occupied[tuple(cell.T)].any()
+    assert (rig.skin_distance[tuple(cell.T.numpy())] <= 0.08).all()
 
 
 def test_empty_points_follow_every_change_of_the_occupancy(occupancy, generator):
-    occupied = occupancy.grid.occupied
+    occupied = occupancy.density_grid.occupied
     occupied.zero_()
-    assert len(occupancy.empty_points(100, generator)) == 100
+    assert len(occupancy.sample_empty(100, generator)) == 100
     occupied.fill_(1)
-    assert len(occupancy.empty_points(100, generator)) == 0
-    occupied.view(-1)[occupancy.band[7]] = 0
-    points = occupancy.empty_points(100, generator)
-    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    assert len(occupancy.sample_empty(100, generator)) == 0
+    occupied.view(-1)[occupancy.band_cells[7]] = 0
+    points = occupancy.sample_empty(100, generator)
+    cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 100
     assert not occupied[tuple(cell.T)].any()
     run(occupancy, lambda at: torch.full_like(at[:, 0], 5.0), generator, 60)
-    assert len(occupancy.empty_points(100, generator)) == 0
+    assert len(occupancy.sample_empty(100, generator)) == 0
 
 
 def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, generator):
-    assert len(occupancy.empty_points(100, generator)) == 0
+    assert len(occupancy.sample_empty(100, generator)) == 0
 
 
 def test_haze_counts_as_nothing_where_that_is_asked(occupancy, generator):
     def haze(at):
         return torch.full_like(at[:, 0], math.log(30.0))
 
-    run(occupancy, haze, generator, 60, thinnest=20.0)
-    assert occupancy.grid.occupied.view(-1)[occupancy.band].all()
-    run(occupancy, haze, generator, 60, thinnest=40.0)
-    assert not occupancy.grid.occupied.any()
+    run(occupancy, haze, generator, 60, min_density=20.0)
+    assert occupancy.density_grid.occupied.view(-1)[occupancy.band_cells].all()
+    run(occupancy, haze, generator, 60, min_density=40.0)
+    assert not occupancy.density_grid.occupied.any()
 
 
 def test_growing_adds_the_six_neighbours():
@@ -142,17 +146,17 @@ def test_one_piece_has_no_specks():
 
 
 def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
-    points = occupancy.solid_points(500, generator)
-    cell = ((points - occupancy.grid.low) * occupancy.grid.cells_per_m).long()
+    points = occupancy.sample_interior(500, generator)
+    cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 500
-    assert rig.inside[tuple(cell.T.numpy())].all()
-    assert (rig.distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()
+    assert rig.inside_skin[tuple(cell.T.numpy())].all()
+    assert (rig.skin_distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()
 
 
 def cell_at(rig, point):
-    cells = np.array(rig.distance.shape)
+    cells = np.array(rig.skin_distance.shape)
     place = ((point - rig.box_low) / (rig.box_high - rig.box_low) * cells).astype(int)
-    return int(np.ravel_multi_index(place, rig.distance.shape))
+    return int(np.ravel_multi_index(place, rig.skin_distance.shape))
 
 
 def knees(rig):
@@ -169,11 +173,11 @@ def test_the_middle_of_the_knees_is_between_legs_and_what_is_before_or_beside_th
 
 
 def test_nothing_near_the_skin_or_under_it_is_between_legs(rig):
-    cells = np.flatnonzero(rig.distance <= 0.08)
+    cells = np.flatnonzero(rig.skin_distance <= 0.08)
     found = cells[inner_leg_cells(rig, cells)]
     assert 0.01 * len(cells) < len(found) < 0.2 * len(cells)
-    assert rig.distance.reshape(-1)[found].min() > OFF_SKIN_M
-    assert not rig.inside.reshape(-1)[found].any()
+    assert rig.skin_distance.reshape(-1)[found].min() > OFF_SKIN_M
+    assert not rig.inside_skin.reshape(-1)[found].any()
 
 
 def test_points_are_drawn_between_the_legs(rig, generator):

@@ -23,7 +23,7 @@ BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "num
 
 
 def points_in(levels, count, generator, *, beyond=0.0):
-    extent = torch.from_numpy((levels.counts[0] - 1) / levels.cells_per_m[0])
+    extent = torch.from_numpy((levels.vertex_counts[0] - 1) / levels.cells_per_m[0])
     unit = torch.rand(count, 3, generator=generator) * (1 + 2 * beyond) - beyond
     return torch.from_numpy(levels.low) + unit * extent.float()
 
@@ -36,7 +36,7 @@ def packed(counts):
 
 
 def test_the_levels_hold_dense_and_hashed_ones(levels):
-    assert levels.dense.tolist() == [1, 1, 0, 0]
+    assert levels.is_dense.tolist() == [1, 1, 0, 0]
     assert (np.diff(levels.offsets)[2:] == 4096).all()
 
 
@@ -46,7 +46,7 @@ def test_features_at_a_vertex_of_a_dense_level_are_its_entry(backend, levels, ge
     i, j, k = 3, 2, 1
     point = torch.from_numpy(levels.low) + torch.tensor([i, j, k]) / float(levels.cells_per_m[0])
     features = backend.encode(point[None].float(), table, levels)
-    nx, ny, _ = levels.counts[0].tolist()
+    nx, ny, _ = levels.vertex_counts[0].tolist()
     torch.testing.assert_close(
         features[0, :FEATURES_PER_LEVEL], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
     )
@@ -65,7 +65,7 @@ def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
 @pytest.mark.parametrize("count", [0, 1, 700])
 def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     points = points_in(levels, count, generator)
-    slope = torch.randn(count, levels.width, generator=generator)
+    slope = torch.randn(count, levels.feature_width, generator=generator)
     ours, theirs = (torch.zeros(levels.entries, FEATURES_PER_LEVEL) for _ in range(2))
     NUMBA.encode_backward(points, slope, levels, ours)
     TORCH.encode_backward(points, slope, levels, theirs)
@@ -169,7 +169,7 @@ def scene(rig):
     rotations[15, 2], rotations[16, 2], rotations[17, 1] = -1.0, 0.8, -0.8
     generator = torch.Generator().manual_seed(1)
     grid = OccupancyGrid(rig, torch.device("cpu")).density_grid
-    distance = torch.from_numpy(rig.distance)
+    distance = torch.from_numpy(rig.skin_distance)
     grid.density.copy_(torch.where(distance < 0.02, 400.0, 0.5) * (distance < 0.05))
     grid.occupied.copy_((distance < 0.05).to(torch.uint8))
     cells = correspondence_tables(CorrespondenceGrid.solve(rig, rotations), torch.device("cpu"))
@@ -188,10 +188,10 @@ def scene(rig):
 def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
     how = MarchSettings(0.01, grace_m, 96)
     ours, theirs = NUMBA.march(*scene, how), TORCH.march(*scene, how)
-    agree = ours.count == theirs.count
+    agree = ours.counts == theirs.counts
     assert agree.float().mean() > 0.97  # a lattice point on a wall may fall on either side
-    assert int(ours.count.sum()) > 2000
-    a, b = (samples.points[agree.repeat_interleave(samples.count)] for samples in (ours, theirs))
+    assert int(ours.counts.sum()) > 2000
+    a, b = (samples.points[agree.repeat_interleave(samples.counts)] for samples in (ours, theirs))
     off = (a - b).norm(dim=1)
     assert float((off < 1e-3).float().mean()) > 0.995
 
@@ -204,10 +204,10 @@ def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
     parts = [[] for _ in rays.slots]
     alive = torch.arange(len(rays.slots))
     while len(alive):
-        some, jitter = backend.march_on(rays, cells, grid, MarchSettings(0.01, math.inf, 7))
-        for ray, points in zip(alive, some.points.split(some.count.tolist()), strict=True):
+        some, jitter = backend.march_resumable(rays, cells, grid, MarchSettings(0.01, math.inf, 7))
+        for ray, points in zip(alive, some.points.split(some.counts.tolist()), strict=True):
             parts[ray].append(points)
-        on = some.count == 7
+        on = some.counts == 7
         alive = alive[on]
         rays = RayBatch(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
     assert max(map(len, parts)) > 5
@@ -221,30 +221,32 @@ def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
 def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, backend):
     rays, cells, grid = scene
     shape = tuple(cells.shape[0].tolist())
-    index = cells.index.numpy().reshape(shape)
+    index = cells.packed_cells.numpy().reshape(shape)
     away = distance_transform_cdt(index == 0, metric="chessboard")
     told = cells._replace(
-        index=torch.from_numpy(np.where(index == 0, -away, index).astype(np.int32).reshape(1, -1))
+        packed_cells=torch.from_numpy(
+            np.where(index == 0, -away, index).astype(np.int32).reshape(1, -1)
+        )
     )
-    assert int(told.index.min()) < -3
+    assert int(told.packed_cells.min()) < -3
     how = MarchSettings(0.01, math.inf, 512)
     ours, plain = backend.march(rays, told, grid, how), backend.march(rays, cells, grid, how)
     assert torch.equal(ours.points, plain.points)
-    assert torch.equal(ours.count, plain.count)
+    assert torch.equal(ours.counts, plain.counts)
 
 
 @BACKENDS
 def test_rays_that_miss_have_no_samples(scene, backend):
     rays, cells, grid = scene
     away = rays._replace(directions=-rays.directions)
-    assert int(backend.march(away, cells, grid, MarchSettings(0.01, 0.06, 96)).count.sum()) == 0
+    assert int(backend.march(away, cells, grid, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
 
 
 @BACKENDS
 def test_nothing_is_sampled_where_nothing_is_occupied(scene, backend):
     rays, cells, grid = scene
     empty = DensityGrid(torch.zeros_like(grid.occupied), *grid[1:])
-    assert int(backend.march(rays, cells, empty, MarchSettings(0.01, 0.06, 96)).count.sum()) == 0
+    assert int(backend.march(rays, cells, empty, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
 
 
 @BACKENDS
@@ -253,7 +255,7 @@ def test_a_ray_is_followed_for_its_grace_in_metres_whatever_the_step(scene, back
     rays, cells, grid = scene
     solid = grid._replace(density=torch.full_like(grid.density, 1e6))
     for step_m in (0.02, 0.01, 0.005):
-        count = backend.march(rays, cells, solid, MarchSettings(step_m, 0.06, 512)).count
+        count = backend.march(rays, cells, solid, MarchSettings(step_m, 0.06, 512)).counts
         assert int(count.max()) * step_m == pytest.approx(0.06, abs=2.1 * step_m)
 
 
@@ -265,7 +267,7 @@ def test_densities_only_rise_and_to_the_highest_sample(scene, backend):
     outside = low - 1.0
     points = torch.cat([here, outside[None]]).float()
     log_density = torch.tensor([3.0, 2.0, -1.0, 5.0])
-    backend.keep_highest(points, log_density, grid)
+    backend.scatter_max_density(points, log_density, grid)
     assert float(grid.density[4, 5, 6]) == pytest.approx(math.exp(3.0), rel=1e-5)
     assert float(grid.density[7, 7, 7]) == 2.0
     assert int((grid.density != 2.0).sum()) == 1

@@ -10,7 +10,7 @@ from avatar.numba_kernels.numba_backend import NumbaBackend
 NUMBA = NumbaBackend()
 OPERATIONS = (
     "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
-    "keep_highest", "wrenches", "follow",
+    "scatter_max_density", "bone_wrenches", "update_roots",
 )  # fmt: skip
 
 
@@ -18,23 +18,23 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     """What every operation of a step makes of one batch of rays."""
     trainer, generator = learnt.trainer, torch.Generator().manual_seed(0)
     field, poses = trainer.avatar.field, trainer.poses
-    batch, cells = trainer.replay.draw(700, generator), trainer.replay.cells
-    grid = trainer.avatar.occupancy.grid
+    batch, cells = trainer.replay.sample_rays(700, generator), trainer.replay.correspondences
+    grid = trainer.avatar.occupancy.density_grid
     grid = grid._replace(density=grid.density.clone())
     samples = NUMBA.march(batch.rays, cells, grid, MarchSettings(0.01, 0.06, 128))
     points, count = samples.points, len(samples.points)
     raw = torch.randn(count, 4, generator=generator)
-    slope = torch.randn(count, field.levels.width, generator=generator)
+    slope = torch.randn(count, field.levels.feature_width, generator=generator)
     background = torch.rand(700, 3, generator=generator)
     grad_table = torch.zeros_like(field.table)
     NUMBA.encode_backward(points, slope, field.levels, grad_table)
     grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
     NUMBA.scatter_max_density(points, raw[:, 3].contiguous(), grid)
     wrenches = NUMBA.bone_wrenches(
-        samples, grad_points, batch.rays.slots, cells, poses.skin, poses.bones
+        samples, grad_points, batch.rays.slots, cells, poses.skinning, poses.bones
     )
     moved = cells._replace(roots=cells.roots.clone())
-    NUMBA.update_roots(moved, 0, poses.skin, poses.bones[0])
+    NUMBA.update_roots(moved, 0, poses.skinning, poses.bones[0])
     return {
         "encode": [NUMBA.encode(points, field.table, field.levels)],
         "encode_backward": [grad_table],
@@ -44,9 +44,9 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         "composite_loss": list(
             NUMBA.composite_loss(raw, samples, 0.01, batch.target, background, 0.1, 0.1)
         ),
-        "keep_highest": [grid.density],
-        "wrenches": [wrenches],
-        "follow": [moved.roots[0, : int((cells.index[0] >> 3).max())]],
+        "scatter_max_density": [grid.density],
+        "bone_wrenches": [wrenches],
+        "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],
     }
 
 

@@ -66,16 +66,16 @@ def samples_near_the_skin(rig, count, generator):
 def jacobians(table, points, slot):
     """Inverse Jacobians of skinning at the points, by autograd."""
     leaf = points.clone().requires_grad_()
-    posed = torch_skinning.skin_points(leaf, *table.skin, table.bones[slot])
+    posed = torch_skinning.skin_points(leaf, *table.skinning, table.bones[slot])
     rows = [torch.autograd.grad(posed[:, k].sum(), leaf, retain_graph=True)[0] for k in range(3)]
     return torch.linalg.inv(torch.stack(rows, dim=1))
 
 
 def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, generator):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
-    extent = torch.from_numpy((levels.counts[0] - 1) / levels.cells_per_m[0]).float()
+    extent = torch.from_numpy((levels.vertex_counts[0] - 1) / levels.cells_per_m[0]).float()
     points = torch.from_numpy(levels.low) + torch.rand(500, 3, generator=generator) * extent
-    slope = torch.randn(500, levels.width, generator=generator)
+    slope = torch.randn(500, levels.feature_width, generator=generator)
     torch.testing.assert_close(
         NUMBA.encode_points_backward(points, slope, table, levels),
         TORCH.encode_points_backward(points, slope, table, levels),
@@ -96,7 +96,7 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
     )
     slots = torch.ones(3, dtype=torch.int32)
     results = [
-        backend.bone_wrenches(samples, pull, slots, cells, table.skin, table.bones)
+        backend.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
         for backend in (NUMBA, TORCH)
     ]
     assert float(results[0][1].abs().max()) == 0.0
@@ -108,8 +108,8 @@ def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
     moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
     bones = torch.from_numpy(moved.astype(np.float32))
     ours, theirs = copied(cells), copied(cells)
-    NUMBA.update_roots(ours, 0, table.skin, bones)
-    TORCH.update_roots(theirs, 0, table.skin, bones)
+    NUMBA.update_roots(ours, 0, table.skinning, bones)
+    TORCH.update_roots(theirs, 0, table.skinning, bones)
     off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
     assert float((off < 1e-2).float().mean()) > 0.99
     assert not torch.equal(ours.roots, cells.roots)
@@ -126,7 +126,7 @@ def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, tab
     )
     before = residual(rig, table, cells, tables.roots[0], bones)
     for _ in range(2):
-        NUMBA.update_roots(tables, 0, table.skin, bones)
+        NUMBA.update_roots(tables, 0, table.skinning, bones)
     after = residual(rig, table, cells, tables.roots[0], bones)
     assert np.median(before) > 3e-3
     assert np.quantile(after, 0.95) < 5e-4
@@ -134,9 +134,9 @@ def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, tab
 
 def residual(rig, table, cells, roots, bones):
     """How far each root, skinned, is from its cell's centre."""
-    place = np.argwhere(cells.index > 0)
-    rows = cells.index[tuple(place.T)] >> 3
-    posed = torch_skinning.skin_points(roots[rows, :3], *table.skin, bones).numpy()
+    place = np.argwhere(cells.packed_cells > 0)
+    rows = cells.packed_cells[tuple(place.T)] >> 3
+    posed = torch_skinning.skin_points(roots[rows, :3], *table.skinning, bones).numpy()
     return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
 
 
@@ -150,24 +150,26 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
     )
     slots = torch.ones(1, dtype=torch.int32)
-    wrenches = NUMBA.bone_wrenches(samples, pull, slots, cells, table.skin, table.bones)
-    table.feel(slots.long(), wrenches, torch.ones(1))
-    (gradient,) = table.gradients(1)
-    given = torch_skinning.skin_points(samples.points, *table.skin, table.bones[1]).double().numpy()
+    wrenches = NUMBA.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
+    table.accumulate(slots.long(), wrenches, torch.ones(1))
+    (gradient,) = table.pose_gradients(1)
+    given = (
+        torch_skinning.skin_points(samples.points, *table.skinning, table.bones[1]).double().numpy()
+    )
 
     def pulled(joint: int, axis: int, size: float) -> float:
         table.corrections[1, joint, axis] = size
-        table._move(1)
-        root = table.root(1)
+        table._update_bones(1)
+        root = table.root_correction(1)
         target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
         x = samples.points.clone()
         for _ in range(8):
             off = torch.from_numpy(target).float() - torch_skinning.skin_points(
-                x, *table.skin, table.bones[1]
+                x, *table.skinning, table.bones[1]
             )
             x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
         table.corrections[1, joint, axis] = 0.0
-        table._move(1)
+        table._update_bones(1)
         return float((x.double() * pull.double()).sum())
 
     for joint in (0, 1, 4, 9, 16, 18, 24):

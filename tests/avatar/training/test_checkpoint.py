@@ -61,7 +61,7 @@ def damaged(path: Path, change) -> Path:
 
 def numbers(trainer):
     """Everything that training has changed."""
-    grid = trainer.avatar.occupancy.grid
+    grid = trainer.avatar.occupancy.density_grid
     moments = [t for state in trainer.optimizer.state_dict()["state"].values() for t in
                (state["exp_avg"], state["exp_avg_sq"], state["step"])]  # fmt: skip
     fields = [*trainer.field.parameters(), *trainer.avatar.field.parameters()]
@@ -107,7 +107,7 @@ def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
 
 
 def test_a_second_checkpoint_replaces_the_first(trainer, saved):
-    trainer.step(rate=1.0, hard_share=0.5)
+    trainer.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.save(trainer, saved.parent)
     assert checkpoint.load(saved.parent, CPU)[0].steps == 21
     assert list(saved.parent.iterdir()) == [saved]
@@ -220,16 +220,3 @@ def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change
 
     with pytest.raises(InputError, match=str(saved)):
         checkpoint.load(damaged(saved, lose), CPU)
-
-
-def test_a_checkpoint_from_before_there_was_a_mean_shows_what_was_learnt(saved, trainer):
-    again, _ = checkpoint.load(damaged(saved, lambda state: state.pop("mean")), CPU)
-    shown = zip(again.avatar.field.parameters(), trainer.field.parameters(), strict=True)
-    assert all(torch.equal(ours, theirs) for ours, theirs in shown)
-
-
-def test_a_checkpoint_from_before_anything_was_inside_knows_of_nothing_solid(saved, trainer):
-    again, _ = checkpoint.load(damaged(saved, lambda state: state["rig"].pop("inside")), CPU)
-    assert not again.avatar.rig.inside_skin.any()
-    assert again.avatar.rig.inside_skin.shape == trainer.avatar.rig.inside.shape
-    assert len(again.avatar.occupancy.sample_interior(10, torch.Generator())) == 0

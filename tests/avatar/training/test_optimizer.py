@@ -36,7 +36,7 @@ def filled(field, value) -> RadianceField:
 
 
 def test_a_copy_has_the_same_numbers_and_none_in_common(field):
-    copied = field.copied()
+    copied = field.clone()
     for ours, theirs in zip(copied.parameters(), field.parameters(), strict=True):
         assert torch.equal(ours, theirs)
         assert ours.data_ptr() != theirs.data_ptr()
@@ -44,14 +44,14 @@ def test_a_copy_has_the_same_numbers_and_none_in_common(field):
 
 
 def test_the_first_steps_are_followed_at_once(field):
-    mean = filled(field.copied(), 0.0)
+    mean = filled(field.clone(), 0.0)
     for steps in range(1, EMA_INTERVAL + 1):
         update_ema(mean, filled(field, float(steps)), steps)
         assert all((p == steps).all() for p in mean.parameters())
 
 
 def test_later_it_is_the_exponential_mean_over_the_horizon(field):
-    mean, late = filled(field.copied(), 0.0), EMA_INTERVAL * 1000
+    mean, late = filled(field.clone(), 0.0), EMA_INTERVAL * 1000
     filled(field, 1.0)
     for steps in range(late, late + EMA_INTERVAL * 20):
         update_ema(mean, field, steps)

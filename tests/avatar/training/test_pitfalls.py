@@ -135,7 +135,7 @@ def forgotten(rig, *, decay: float, updates: int) -> float:
     def log_density_at(points):
         return torch.where((points[:, 2] - middle).abs() < thickness_m / 2, 6.0, -20.0)
 
-    sheet = torch.from_numpy(rig.distance <= 0.08)[:, :, layer]
+    sheet = torch.from_numpy(rig.skin_distance <= 0.08)[:, :, layer]
     shares = []
     for update in range(updates):
         occupancy.update(
@@ -265,13 +265,13 @@ def test_no_frame_falls_back_between_marks(small, large):
 def test_a_picture_that_ended_by_cached_densities_would_have_holes(large):
     """A surface that is grazed is cut off; the exact picture has none of it."""
     avatar = large.avatar
-    how = MarchSettings(avatar.step_m, 4 * avatar.step_m, 512)
-    cut = partial(avatar.field.backend.march, grid=avatar.occupancy.grid, how=how)
-    assert max(large.overlaps(samples_along=cut)) < 0.98 <= min(large.overlaps())
+    how = MarchSettings(avatar.sample_step_m, 4 * avatar.sample_step_m, 512)
+    cut = partial(avatar.field.backend.march, grid=avatar.occupancy.density_grid, how=how)
+    assert max(large.overlaps(sample_rays=cut)) < 0.98 <= min(large.overlaps())
     held = large.held[0]
     seen = held.observation
-    exact = render(avatar, seen.pose, seen.camera, cells=held.cells)
-    ended = render(avatar, seen.pose, seen.camera, cells=held.cells, sample_rays=cut)
+    exact = render(avatar, seen.pose, seen.camera, cells=held.correspondences)
+    ended = render(avatar, seen.pose, seen.camera, cells=held.correspondences, sample_rays=cut)
     assert ((exact - ended)[..., 3] > 0.5).sum() > 200
 
 

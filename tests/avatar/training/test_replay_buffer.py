@@ -30,7 +30,7 @@ def store(frames, capacity=8) -> ReplayBuffer:
 
 def cut(frame, near, far):
     """The same frame with fewer pixels."""
-    kept = np.r_[:near, frame.near : frame.near + far]
+    kept = np.r_[:near, frame.near_count : frame.near_count + far]
     return dataclasses.replace(
         frame, directions=frame.directions[kept], colors=frame.colors[kept], near_person_bits=near
     )
@@ -55,7 +55,7 @@ def places(batch, frames):
 
 def drawn_from(replay, generator, count=40_000):
     """The share of the rays that each slot gets."""
-    slots = replay.draw(count, generator).rays.slots.long()
+    slots = replay.sample_rays(count, generator).rays.slots.long()
     return torch.bincount(slots, minlength=len(replay)).numpy() / count
 
 
@@ -87,7 +87,7 @@ def test_rays_begin_anywhere_within_a_step(frames, generator):
 
 def test_nine_rays_in_ten_go_near_the_person(frames, generator):
     batch = store(frames).sample_rays(20_000, generator)
-    near = np.array([frame.near for frame in frames])[batch.rays.slots.numpy()]
+    near = np.array([frame.near_count for frame in frames])[batch.rays.slots.numpy()]
     share = float((places(batch, frames) < near).mean())
     assert share == pytest.approx(NEAR_PERSON_RAY_SHARE, abs=0.01)
 
@@ -107,13 +107,13 @@ def test_whatever_the_frames_hold_rays_stay_within_it(frames, sizes):
 def test_stores_that_grow_keep_what_they_hold(frames):
     replay = store([cut(frames[0], 3, 2), cut(frames[1], 40, 0), frames[2]])
     for slot, frame in enumerate(frames[:3]):
-        index, roots = frame.cells.index.reshape(-1), frame.cells.roots
+        index, roots = frame.correspondences.packed_cells.reshape(-1), frame.correspondences.roots
         tables = replay.correspondences
         np.testing.assert_array_equal(tables.packed_cells[slot, : len(index)], index)
         np.testing.assert_array_equal(tables.roots[slot, : len(roots)], roots)
-        np.testing.assert_array_equal(tables.low[slot], frame.cells.low)
-        assert tuple(tables.shape[slot].tolist()) == frame.cells.index.shape
-    assert replay.correspondences.cell_m == frames[0].cells.cell_m
+        np.testing.assert_array_equal(tables.low[slot], frame.correspondences.low)
+        assert tuple(tables.shape[slot].tolist()) == frame.correspondences.packed_cells.shape
+    assert replay.correspondences.cell_m == frames[0].correspondences.cell_m
 
 
 def test_half_of_the_rays_follow_the_error_and_a_new_frame_enters_with_the_largest(

@@ -36,11 +36,13 @@ def kept(frames, clip):
 
 def test_a_frame_is_made_ready_again_from_its_colours_alone(frames, rig):
     for frame in frames:
-        again = rebuild_frame(frame.index, frame.pose, frame.sight, frame.colors, rig)
-        assert again.near_count == frame.near
+        again = rebuild_frame(frame.index, frame.pose, frame.view, frame.colors, rig)
+        assert again.near_count == frame.near_count
         np.testing.assert_array_equal(again.directions, frame.directions)
         np.testing.assert_array_equal(again.origin, frame.origin)
-        np.testing.assert_array_equal(again.correspondences.packed_cells, frame.cells.index)
+        np.testing.assert_array_equal(
+            again.correspondences.packed_cells, frame.correspondences.packed_cells
+        )
 
 
 def test_replay_gives_back_the_colours_that_it_was_given(frames):
@@ -61,29 +63,29 @@ def test_what_is_written_is_read(kept, tmp_path):
     kept.save(tmp_path / "frames.tensors")
     again = SavedFrames.load(tmp_path / "frames.tensors")
     assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]
-    for one, other in zip(kept.key_frames, again.replay_frames, strict=True):
+    for one, other in zip(kept.replay_frames, again.replay_frames, strict=True):
         assert one.index == other.index
         np.testing.assert_array_equal(one.colors, other.colors)
-        np.testing.assert_array_equal(one.sight.near, other.view.near_person_bits)
+        np.testing.assert_array_equal(one.view.near_person_bits, other.view.near_person_bits)
         for name in ("focal_px", "center_px", "size_px", "distortion"):
-            assert getattr(one.sight.camera, name) == getattr(other.view.camera, name)
+            assert getattr(one.view.camera, name) == getattr(other.view.camera, name)
         np.testing.assert_array_equal(one.pose.joint_rotations, other.pose.joint_rotations)
-    for one, other in zip(kept.held, again.held_out, strict=True):
+    for one, other in zip(kept.held_out, again.held_out, strict=True):
         assert one.observation.frame.index == other.observation.frame.index
         np.testing.assert_array_equal(one.observation.frame.rgb, other.observation.frame.rgb)
         np.testing.assert_allclose(one.observation.alpha, other.observation.alpha, atol=1e-5)
 
 
 def test_frames_of_an_earlier_video_have_numbers_of_their_own(kept):
-    earlier = kept.earlier().earlier()
-    assert [frame.index + 2 * INDEX_SHIFT_PER_VIDEO for frame in earlier.key_frames] == [
-        frame.index for frame in kept.key_frames
+    earlier = kept.as_earlier_video().as_earlier_video()
+    assert [frame.index + 2 * INDEX_SHIFT_PER_VIDEO for frame in earlier.replay_frames] == [
+        frame.index for frame in kept.replay_frames
     ]
-    indices = [h.observation.frame.index for h in earlier.held]
+    indices = [h.observation.frame.index for h in earlier.held_out]
     assert all(index < 0 for index in indices)
     assert [number_in_video(index) for index in indices] == [3, 4]
     assert [video_age(index) for index in indices] == [2, 2]
-    assert [video_age(h.observation.frame.index) for h in kept.held] == [0, 0]
+    assert [video_age(h.observation.frame.index) for h in kept.held_out] == [0, 0]
 
 
 def test_few_held_out_frames_are_kept_of_many(clip):

@@ -52,7 +52,9 @@ def ticking(monkeypatch):
 def silhouettes(learnt, held):
     """Where the avatar is, and where the person was."""
     observation = held.observation
-    picture = render(learnt.trainer.avatar, observation.pose, observation.camera, cells=held.cells)
+    picture = render(
+        learnt.trainer.avatar, observation.pose, observation.camera, cells=held.correspondences
+    )
     return picture[..., 3] > 0.5, observation.alpha > 0.5
 
 

@@ -40,7 +40,7 @@ def test_time_goes_on_from_where_an_earlier_run_stopped(trainer, spend):
 def test_a_pause_does_not_count(trainer, spend):
     clock = TrainingClock(trainer)
     spend(2.0)
-    with trainer.held_up():
+    with trainer.paused():
         spend(60.0)
     spend(1.0)
     assert clock.read() == 3.0
@@ -48,7 +48,7 @@ def test_a_pause_does_not_count(trainer, spend):
 
 
 def test_a_pause_before_the_clock_takes_nothing_from_it(trainer, spend):
-    with trainer.held_up():
+    with trainer.paused():
         spend(60.0)
     clock = TrainingClock(trainer)
     spend(1.0)
@@ -59,7 +59,7 @@ def test_a_pause_that_ends_badly_does_not_count_either(trainer, spend):
     clock = TrainingClock(trainer)
 
     def stopped() -> None:
-        with trainer.held_up():
+        with trainer.paused():
             spend(60.0)
             raise KeyboardInterrupt
 

@@ -44,7 +44,7 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
     raw = hidden @ second + second_bias
     count = len(samples.points)
     rendered = torch_reference.composite(
-        raw[:count], samples.first, samples.count, CONFIG.sample_step_m
+        raw[:count], samples.offsets, samples.counts, CONFIG.sample_step_m
     )
     loss = torch_reference.loss_per_ray(
         rendered, batch.target.to(table.dtype), background.to(table.dtype),
@@ -81,24 +81,24 @@ def one_step(trainer, backend):
     """Gradients of a step, and everything random that went into it."""
     field, occupancy = trainer.avatar.field, trainer.avatar.occupancy
     field.backend = backend
-    batch = trainer.replay.draw(CONFIG.rays, torch.Generator().manual_seed(3))
+    batch = trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(4)
     field.table_grad.zero_()
     compute_gradients(
-        field, OccupancySampler(backend, occupancy, CONFIG), trainer.replay.cells, batch, CONFIG,
+        field, OccupancySampler(backend, occupancy, CONFIG), trainer.replay.correspondences, batch, CONFIG,
         hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
     how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
-    samples = backend.march(batch.rays, trainer.replay.cells, occupancy.grid, how)
-    empty = occupancy.empty_points(CONFIG.empty_space_points, generator)
+    samples = backend.march(batch.rays, trainer.replay.correspondences, occupancy.density_grid, how)
+    empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
     drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
     chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
     apart = field_priors.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
-    solid = occupancy.solid_points(CONFIG.interior_points, generator)
+    solid = occupancy.sample_interior(CONFIG.interior_points, generator)
     close = field_priors.sample_smoothness_pairs(samples.points, CONFIG, generator)
-    gaps = occupancy.gap_points(CONFIG.inner_leg_points, generator)
+    gaps = occupancy.sample_inner_leg(CONFIG.inner_leg_points, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
     return grads, (samples, empty, pairs, solid, close, gaps, batch, background)
@@ -134,7 +134,7 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
 
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
-    trainer.avatar.occupancy.grid.occupied.zero_()
+    trainer.avatar.occupancy.density_grid.occupied.zero_()
     (_, first, *_), drawn = one_step(trainer, NumbaBackend())
     samples, empty, pairs, _, close, _, batch, background = drawn
     assert isinstance(samples, RaySamples)

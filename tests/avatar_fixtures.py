@@ -1,4 +1,4 @@
-"""Stand-ins for the avatar's tests: a rig, poses, and small hash levels."""
+"""Fixtures of the avatar and the baselines: a rig, poses, hash levels and a short training."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
