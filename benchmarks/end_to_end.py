@@ -21,7 +21,8 @@ from apps.report.learning_curve import CurvePoint, largest_drop
 from avatar.evaluation.held_out import composite_on_white, ground_truth_on_white
 from avatar.evaluation.image_metrics import psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
-from export.player import Player, premultiply
+from export.picture_difference import premultiply
+from export.player import Player
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture

@@ -22,7 +22,8 @@ from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample
 from capture.camera import Camera
 from export.package.render_settings import QUALITY_TIERS
-from export.player import Player, premultiply
+from export.picture_difference import premultiply
+from export.player import Player
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation

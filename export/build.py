@@ -34,9 +34,9 @@ from export.package_checks import (
     check_graph,
     fit_camera,
     mean_psnr_to_renderer,
-    picture_on_white,
     quality_warnings,
 )
+from export.picture_difference import picture_on_white
 from export.player import Player
 from preprocess.body.body_pose import BodyPose
 
@@ -61,7 +61,7 @@ class ExportReport:
         bytes: Its size.
         seconds: Wall time of baking, checking and writing.
         psnr_to_renderer: Of each tier, dB, mean over the views.
-        largest_difference: Between graph and twin, in 1/255.
+        largest_difference: Between graph and reference, in 1/255.
         tuning: PSNR to the volume renderer's before and after fine-tuning, dB, of pictures that
             it has not seen; None if it was left out.
         warnings: What the user should know.
@@ -152,9 +152,9 @@ def export_field(
     started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
     # the field, and the renderer with it, is asked on this thread alone
-    lattice = sample_field(field_at, rig, occupied=occupied, config=config)
-    with PackageWriter(path) as draft, ThreadPoolExecutor(2) as beside:
-        baked = beside.submit(bake_tables, lattice, rig, config)
+    grid = sample_field(field_at, rig, occupied=occupied, config=config)
+    with PackageWriter(path) as draft, ThreadPoolExecutor(2) as executor:
+        baked = executor.submit(bake_tables, grid, rig, config)
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
         def finer() -> PlayerTables:
@@ -164,16 +164,16 @@ def export_field(
             )
 
         better = _fine_tune(
-            baked.result(), finer, rig, renderer, views, config, beside,
+            baked.result(), finer, rig, renderer, views, config, executor,
             lambda share: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * share),
         )  # fmt: skip
         tables = better.tables
-        compressed = beside.submit(draft.add_tables, tables)
-        rules = {
+        compressed = executor.submit(draft.add_tables, tables)
+        settings = {
             tier: better.settings if tier == "hq" else QUALITY_TIERS[tier] for tier in config.tiers
         }
-        package = _unchecked_package(tables, rules, rig, views, metrics)
-        others = {t: beside.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
+        package = _unchecked_package(tables, settings, rig, views, metrics)
+        others = {t: executor.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
         hq = Player(package)
         notes, warnings = (
             {},
@@ -217,7 +217,7 @@ def _fine_tune(
     renderer: RenderFunction,
     views: Sequence[PosedView],
     config: BakeConfig,
-    beside: Executor,
+    executor: Executor,
     progress: ExportProgress,
 ) -> FineTuningResult:
     """Fine-tunes, if that is wanted, finer bricks where the player is too far from the renderer.
@@ -226,19 +226,19 @@ def _fine_tune(
     """
     if config.fine_tuning_pictures:
         with suppress(KeyboardInterrupt):
-            rules = QUALITY_TIERS["hq"]
-            far = is_below_target(tables, rig, rules, renderer, views=views, executor=beside)
+            settings = QUALITY_TIERS["hq"]
+            far = is_below_target(tables, rig, settings, renderer, views=views, executor=executor)
             tables = finer() if far else tables
             return fine_tune(
-                tables, rig, rules, renderer,
-                views=views, max_pictures=config.fine_tuning_pictures, executor=beside, may_add_layers=far, progress=progress,
+                tables, rig, settings, renderer,
+                views=views, max_pictures=config.fine_tuning_pictures, executor=executor, may_add_layers=far, progress=progress,
             )  # fmt: skip
     return FineTuningResult(tables=tables, settings=QUALITY_TIERS["hq"], psnr=None)
 
 
 def _unchecked_package(
     tables: PlayerTables,
-    rules: Mapping[str, RenderSettings],
+    settings: Mapping[str, RenderSettings],
     rig: Rig,
     views: Sequence[PosedView],
     metrics: Mapping[str, Any],
@@ -251,7 +251,7 @@ def _unchecked_package(
             psnr_to_renderer=0.0,
             largest_difference=0.0,
         )
-        for tier, rule in rules.items()
+        for tier, rule in settings.items()
     }
     golden = [
         GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
@@ -268,9 +268,9 @@ def _unchecked_package(
             sha256={},
         ),
         graphs={
-            tier: build_graph(tables, rule).SerializeToString() for tier, rule in rules.items()
+            tier: build_graph(tables, rule).SerializeToString() for tier, rule in settings.items()
         },
-        tables=dict.fromkeys(rules, tables),
+        tables=dict.fromkeys(settings, tables),
         golden=(),
         preview=b"",
     )

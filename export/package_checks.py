@@ -1,69 +1,80 @@
-"""Whether a package's player draws what it should: its graph's meaning, the renderer's pictures."""
+"""Checks of a package's player against its reference and against the volume renderer."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.evaluation.held_out import composite_on_white
 from avatar.evaluation.image_metrics import psnr
 from capture.camera import Camera
 from export.bake.bake_tables import ExportRefused
-from export.bake.render_targets import PosedView, RgbaPicture
+from export.bake.render_targets import PosedView
 from export.package.manifest import GoldenFrame
 from export.package.package_file import AvatarPackage
-from export.player import MIN_CLOSE_FRACTION, PictureDifference, Player, premultiply
+from export.picture_difference import (
+    MIN_CLOSE_FRACTION,
+    PictureDifference,
+    picture_on_white,
+    premultiply,
+)
+from export.player import Player
 from export.reference.reference_player import PlayerInputs, draw_reference
 
-POOR_PSNR, GOOD_PSNR = 30.0, 38.0
-"""Player against volume renderer, dB: what is below the second, or the first, is warned of."""
+POOR_PSNR = 30.0
+"""Player against volume renderer, dB: below this a package shows its avatar poorly."""
+GOOD_PSNR = 38.0
+"""Player against volume renderer, dB: from this on, both look the same."""
 SIMPLIFIED_WARNING = (
     "The package simplifies fine detail or soft edges: what it draws is {score:.1f} dB from the "
-    "avatar as it was learnt ({good:.0f} dB and more look the same)."
+    "avatar as trained ({good:.0f} dB and more look the same)."
 )
+"""Shown between `POOR_PSNR` and `GOOD_PSNR`."""
 POOR_WARNING = (
     "The package shows the avatar poorly: what it draws is only {score:.1f} dB from the avatar as "
-    "it was learnt ({good:.0f} dB and more look the same). The avatar is still fog rather than a "
-    "surface; learn longer (ia-ingest with --resume and more --seconds)."
+    "trained ({good:.0f} dB and more look the same). The avatar is still fog rather than a "
+    "surface; train longer (ia-ingest with --resume and more --seconds)."
 )
+"""Shown below `POOR_PSNR`."""
 CHECK_PX = 256
-"""Longer side of the pictures that are compared with the volume renderer."""
+"""Longer side of the pictures that are compared with the volume renderer, pixels."""
 
 
 def fit_camera(camera: Camera, longest_px: int) -> Camera:
-    """The camera for a picture whose longer side is at most so long."""
+    """Return the camera with a longer side of at most `longest_px` pixels; never enlarge it."""
     return camera.resize_longer_side(min(longest_px, max(camera.size_px)))
-
-
-def picture_on_white(picture: RgbaPicture) -> Float32[np.ndarray, "height width 3"]:
-    """A picture on white, in [0, 1]."""
-    return np.clip(composite_on_white(picture), 0.0, 1.0)
 
 
 def check_graph(
     player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
 ) -> float:
-    """Refuses a graph that does not draw what its twin draws; returns the largest difference."""
-    tables, rules = package.tables[tier], package.manifest.tiers[tier].settings
+    """Compare a tier's graph with its reference.
+
+    Returns:
+        The largest difference over all frames, in 1/255.
+
+    Raises:
+        ExportRefused: If a picture does not match.
+    """
+    tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
     worst = 0.0
     for number, frame in enumerate(frames):
         camera = frame.camera
-        shot = PlayerInputs(
+        inputs = PlayerInputs(
             bones=player.bones(frame.pose, camera),
             focal=np.array(camera.focal_px, dtype=np.float32),
             center=np.array(camera.center_px, dtype=np.float32),
             size_px=camera.size_px,
-            samples=rules.samples,
+            samples=settings.samples,
         )
         drawn = premultiply(player.render(frame.pose, camera))
-        likeness = PictureDifference.of(drawn, draw_reference(tables, rules, shot))
-        worst = max(worst, likeness.largest_difference)
-        if not likeness.matches:
+        difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
+        worst = max(worst, difference.largest_difference)
+        if not difference.matches:
             raise ExportRefused(
-                f"In view {number} the player's graph ({tier}) is within 2/255 of its meaning on "
-                f"only {likeness.close_fraction:.2%} of the pixels ({MIN_CLOSE_FRACTION:.1%} are wanted). Nothing was "
-                "written; the checkpoint is kept. This is a fault of the program: please report "
-                "it with the version of onnxruntime."
+                f"In view {number} the player's graph ({tier}) is within 2/255 of its reference "
+                f"on only {difference.close_fraction:.2%} of the pixels; {MIN_CLOSE_FRACTION:.1%} "
+                "are required. Nothing was written; the checkpoint is kept. This is a fault of the "
+                "program: please report it with the version of onnxruntime."
             )
     return worst
 
@@ -73,7 +84,7 @@ def mean_psnr_to_renderer(
     views: Sequence[PosedView],
     exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
 ) -> float:
-    """Compares the player with the exact renderer's pictures on white; the mean PSNR, dB."""
+    """Return the mean PSNR of the player to the renderer's pictures on white, dB."""
     scores = []
     for (pose, camera), truth in zip(views, exact, strict=True):
         drawn = picture_on_white(premultiply(player.render(pose, fit_camera(camera, CHECK_PX))))
@@ -82,7 +93,7 @@ def mean_psnr_to_renderer(
 
 
 def quality_warnings(score: float) -> list[str]:
-    """What a user should know of a package whose player has this PSNR to the renderer, dB."""
+    """Return the warnings for a player with this mean PSNR to the renderer, dB."""
     if score >= GOOD_PSNR:
         return []
     text = POOR_WARNING if score < POOR_PSNR else SIMPLIFIED_WARNING

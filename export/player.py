@@ -3,19 +3,19 @@
 from collections import deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import numpy as np
+import onnxruntime
 from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.onnx_session import create_session, find_provider, shorten_error
 from export.package.graph_tables import graph_initializers
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
+from export.picture_difference import PictureDifference, premultiply
 from export.player_limits import (
     ResolutionLimit,
     check_render_inputs,
@@ -26,10 +26,9 @@ from export.player_limits import (
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, world_from_body
 
-MAX_CLOSE_DIFFERENCE = 2
-"""Two pictures are alike where no channel (premultiplied) differs by more, in 1/255 …"""
-MIN_CLOSE_FRACTION = 0.999
-"""… on at least this share of the pixels."""
+MIN_ORT_VERSION = "1.24"
+IN_MEMORY_TABLES = "add_external_initializers_from_files_in_memory"
+"""What older releases cannot do from Python."""
 
 
 @final
@@ -173,11 +172,11 @@ class Player:
             for pose, camera in shots:
                 yield self.render(pose, camera, samples=samples)
             return
-        with ThreadPoolExecutor(workers) as beside:
+        with ThreadPoolExecutor(workers) as executor:
             drawn = deque[Future[UInt8[np.ndarray, "_ _ 4"]]]()
             try:
                 for pose, camera in shots:
-                    drawn.append(beside.submit(self.render, pose, camera, samples=samples))
+                    drawn.append(executor.submit(self.render, pose, camera, samples=samples))
                     if len(drawn) >= 2 * workers:
                         yield drawn.popleft().result()
                 while drawn:
@@ -197,44 +196,6 @@ class Player:
 
     def _body_from_rest(self, rotations: Float[np.ndarray, "23 3"]) -> Float[np.ndarray, "24 4 4"]:
         return body_from_rest(self.manifest.rest_joints, self.manifest.parents, rotations)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureDifference:
-    """How far two pictures are apart.
-
-    Attributes:
-        largest: Largest difference of any premultiplied channel, in 1/255.
-        close: Share of the pixels that differ by no more than `CLOSE`.
-    """
-
-    largest_difference: float
-    close_fraction: float
-
-    @classmethod
-    def of(
-        cls, a: Float32[np.ndarray, "height width 4"], b: Float32[np.ndarray, "height width 4"]
-    ) -> "PictureDifference":
-        """Of two premultiplied pictures in [0, 1]."""
-        difference = np.abs(a - b).max(axis=-1) * 255.0
-        return cls(
-            largest_difference=float(difference.max()),
-            close_fraction=float((difference <= MAX_CLOSE_DIFFERENCE).mean()),
-        )
-
-    @property
-    def matches(self) -> bool:
-        """Whether they count as the same picture."""
-        return self.close_fraction >= MIN_CLOSE_FRACTION
-
-
-def premultiply(
-    rgba: UInt8[np.ndarray, "height width 4"],
-) -> Float32[np.ndarray, "height width 4"]:
-    """A straight 8-bit picture as premultiplied floats in [0, 1]."""
-    picture = rgba.astype(np.float32) / np.float32(255.0)
-    picture[..., :3] *= picture[..., 3:]
-    return picture
 
 
 def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDifference]:
@@ -258,3 +219,74 @@ def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDi
         )
         for frame, stored in zip(package.manifest.golden, package.golden, strict=True)
     ]
+
+
+def find_provider(name: str) -> str:
+    """onnxruntime's own name of a provider: "cpu" is "CPUExecutionProvider".
+
+    Raises:
+        InputError: If this onnxruntime has none of that name.
+    """
+    known = onnxruntime.get_available_providers()
+    for provider in known:
+        if name.lower() in (provider.lower(), provider.lower().removesuffix("executionprovider")):
+            return provider
+    short = ", ".join(provider.removesuffix("ExecutionProvider").lower() for provider in known)
+    raise InputError(
+        f"onnxruntime {onnxruntime.__version__} has no provider {name!r} here; it has: {short}. "
+        "Others come with other builds of it, such as onnxruntime-gpu or onnxruntime-openvino."
+    )
+
+
+def shorten_error(error: Exception, max_length: int = 400) -> str:
+    """What onnxruntime says, without the pages that some providers add."""
+    said = " ".join(str(error).split())
+    return (
+        said
+        if len(said) <= max_length
+        else f"{said[: max_length // 2]} … {said[-max_length // 2 :]}"
+    )
+
+
+def create_session(
+    graph: bytes, tables: dict[str, bytes], threads: int, provider: str
+) -> onnxruntime.InferenceSession:
+    """A graph that is ready to run, with threads that do not spin.
+
+    Args:
+        graph: The ONNX model.
+        tables: Its external tables by name; they must live as long as the session.
+        threads: Of one run.
+        provider: As `find_provider` gives it.
+
+    Raises:
+        InputError: If it does not run here.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # what fails is said below
+    options.enable_mem_reuse = False  # planning it takes longer than anything else at load
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    names, buffers = list(tables), list(tables.values())
+    if not hasattr(options, IN_MEMORY_TABLES):
+        raise InputError(
+            f"onnxruntime {onnxruntime.__version__} is too old for the player; {MIN_ORT_VERSION} or newer "
+            "is needed: pip install --upgrade onnxruntime (or the build of it that you use)."
+        )
+    getattr(options, IN_MEMORY_TABLES)(names, buffers, [len(buffer) for buffer in buffers])
+    wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # what it lacks, the CPU does
+    try:
+        session = onnxruntime.InferenceSession(graph, options, providers=wanted)
+    except Exception as error:
+        raise InputError(
+            f"The package's graph does not run on onnxruntime {onnxruntime.__version__} "
+            f"({provider}): {shorten_error(error)}"
+        ) from error
+    if session.get_providers()[0] != provider:
+        raise InputError(
+            f"onnxruntime {onnxruntime.__version__} knows {provider} but could not start it here; "
+            "it would draw on the CPU instead. Are the drivers and libraries installed?"
+        )
+    return session

@@ -105,11 +105,11 @@ class ResolutionLimit:
     them. There a voxel is dozens of pixels wide: a coarser picture, enlarged, shows as much.
     """
 
-    def __init__(self, tables: PlayerTables, rules: RenderSettings) -> None:
+    def __init__(self, tables: PlayerTables, settings: RenderSettings) -> None:
         """Of what is drawn, and how; nothing is computed before it is needed."""
         self._skin, self._pelvis, self._reach_m = tables.skinning, tables.pelvis, tables.reach_m
-        self._nearest_m, self._largest_px = rules.near_plane_m, rules.max_footprint_px
-        self._footprint_m = tables.surfels.spacing_m * rules.footprint_spacings
+        self._nearest_m, self._largest_px = settings.near_plane_m, settings.max_footprint_px
+        self._footprint_m = tables.surfels.spacing_m * settings.footprint_spacings
 
     def downscale_factor(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
         """How many times coarser a picture has to be drawn; 1 if surfels cover it as it is.

@@ -7,15 +7,13 @@ from pathlib import Path
 import onnxruntime
 
 from export.package.manifest import Manifest
-from export.player import (
+from export.picture_difference import (
     MAX_CLOSE_DIFFERENCE,
     MIN_CLOSE_FRACTION,
     PictureDifference,
-    find_provider,
 )
-from export.player import (
-    verify_package as draw_golden_frames,
-)
+from export.player import find_provider
+from export.player import verify_package as draw_golden_frames
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.render import render
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
-from export.player import Player, premultiply
+from export.picture_difference import premultiply
+from export.player import Player
 from preprocess.observation import Observation
 
 BEST_TIER = "hq"

@@ -1,4 +1,4 @@
-"""The loops of baking, compiled: walks along normals, and neighbours' colours."""
+"""The loops of baking, compiled: walks along normals, and neighbours' colors."""
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -79,9 +79,9 @@ def _mean_colors(visible, rgb, nodes):
 
 
 def dilate_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
-    """Gives each empty node beside visible ones their mean colour, in place.
+    """Gives each empty node beside visible ones their mean color, in place.
 
-    Between a visible and an empty node colour is interpolated too: black would darken the rim.
+    Between a visible and an empty node color is interpolated too: black would darken the rim.
     The border is left alone, and counts as empty.
     """
     inner = np.zeros_like(visible)

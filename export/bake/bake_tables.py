@@ -38,17 +38,17 @@ class ExportRefused(RuntimeError):  # noqa: N818 - names what happened
 
 
 OUTER_MARGIN_M = 0.012
-"""Rays begin at most about so far outside of the hull."""
+"""Rays begin at most about so far outside of the surface."""
 PROBE_SPACING_M = 0.012
 """Distance between the points along a normal that are looked at: much less than a cell."""
 
 
 def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
-    """The skin under a hull, as deep as one sees.
+    """The skin under a surface, as deep as one sees.
 
     Args:
         rig: Whose.
-        hull: The hull.
+        surface: The surface.
     """
     shape = np.array(rig.weights.shape[:3])
     step_m = (rig.box_high - rig.box_low) / (shape - 1)
@@ -90,9 +90,9 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
 
 
 FAINT_DENSITY_FRACTION = 0.1
-"""The hull's level is at most this share of what the densest percent of a field reaches."""
+"""The surface's level is at most this share of what the densest percent of a field reaches."""
 BRICK_MARGIN_M = 0.012
-"""Bricks reach this far outside of the hull."""
+"""Bricks reach this far outside of the surface."""
 VOXEL_TO_CELL_RATIO = 0.53
 """Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
 MIN_VOXEL_M, MAX_VOXEL_M = 0.0038, 0.006
@@ -118,8 +118,8 @@ class BakeConfig:
 
     Attributes:
         voxel_m: Distance between brick voxels.
-        surfel_spacing_m: Cell on which the hull is taken; made coarser if there are too many.
-        surface_density: Density of the hull's level set, 1/m; less where the whole field is faint.
+        surfel_spacing_m: Cell on which the surface is taken; made coarser if there are too many.
+        surface_density: Density of the surface's level set, 1/m; less where the whole field is faint.
         tiers: Which qualities the package has; "hq" is always among them.
         tuned: On how many pictures bricks are fine-tuned; 0 for none.
     """
@@ -190,38 +190,38 @@ def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
     """The second half: numpy and serial kernels only, on whatever thread.
 
     Args:
-        lattice: What the field said.
+        grid: What the field said.
         rig: What moves it.
         config: How finely.
 
     Raises:
         ExportRefused: If there is nothing to be seen in the field.
     """
-    hull = _surface_within_surfel_limit(grid, config)
+    surface = _surface_within_surfel_limit(grid, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
     pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
-    reached = _visible_nodes(grid, hull)
+    reached = _visible_nodes(grid, surface)
     return PlayerTables(
-        surfels=_encode_surfels(hull),
+        surfels=_encode_surfels(surface),
         bricks=_encode_bricks(grid, reached),
-        skinning=bake_skinning(rig, hull),
+        skinning=bake_skinning(rig, surface),
         pelvis=pelvis.astype(np.float32),
         reach_m=_max_reach_m(rig),
     )
 
 
-def _surface_within_surfel_limit(lattice: FieldGrid, config: BakeConfig) -> ProxySurface:
-    """The hull, on a lattice so coarse that surfel numbers fit into the z-buffer's keys."""
-    visible = lattice.density[lattice.density > MIN_DENSITY]
+def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySurface:
+    """The surface, on a grid so coarse that surfel numbers fit into the z-buffer's keys."""
+    visible = grid.density[grid.density > MIN_DENSITY]
     if visible.size == 0:
         raise ExportRefused(EMPTY_AVATAR_MESSAGE)
     level = min(config.surface_density, FAINT_DENSITY_FRACTION * float(np.percentile(visible, 99)))
     spacing_m = config.surfel_spacing_m
     while True:
-        hull = extract_proxy_surface(lattice, level=level, spacing_m=spacing_m)
-        if 0 < len(hull.positions) < 1 << SURFEL_BITS:
-            return hull
-        spacing_m *= 1.02 * max(1.0, len(hull.positions) / (1 << SURFEL_BITS)) ** 0.5
+        surface = extract_proxy_surface(grid, level=level, spacing_m=spacing_m)
+        if 0 < len(surface.positions) < 1 << SURFEL_BITS:
+            return surface
+        spacing_m *= 1.02 * max(1.0, len(surface.positions) / (1 << SURFEL_BITS)) ** 0.5
 
 
 def _max_reach_m(rig: Rig) -> float:
@@ -234,18 +234,18 @@ def _max_reach_m(rig: Rig) -> float:
     return float(along.max() + 0.35)
 
 
-def _encode_surfels(hull: ProxySurface) -> SurfelTable:
-    low = hull.positions.min(axis=0)
-    extent_m = float((hull.positions.max(axis=0) - low).max())
-    codes = np.round((hull.positions - low) / extent_m * 65535.0).astype(np.uint16)
+def _encode_surfels(surface: ProxySurface) -> SurfelTable:
+    low = surface.positions.min(axis=0)
+    extent_m = float((surface.positions.max(axis=0) - low).max())
+    codes = np.round((surface.positions - low) / extent_m * 65535.0).astype(np.uint16)
     order = np.argsort(_morton_order(codes), kind="stable")
-    thickness = np.round(hull.thickness[order] / THICKNESS_STEP_M)
+    thickness = np.round(surface.thickness[order] / THICKNESS_STEP_M)
     return SurfelTable(
         low=low,
         extent_m=extent_m,
-        spacing_m=hull.spacing_m,
+        spacing_m=surface.spacing_m,
         position_codes=round_codes(codes[order], POSITION_CODE_STEP, 65535),
-        normal_codes=np.round(hull.normals[order] * 127.0 / NORMAL_CODE_STEP).astype(np.int8)
+        normal_codes=np.round(surface.normals[order] * 127.0 / NORMAL_CODE_STEP).astype(np.int8)
         * np.int8(NORMAL_CODE_STEP),
         thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
     )
@@ -261,15 +261,15 @@ def _morton_order(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "p
     return order
 
 
-def _encode_bricks(lattice: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> BrickTable:
-    """The visible part of the lattice near the hull, cut into bricks."""
-    counts = np.array(lattice.density.shape) // BRICK_SIZE
+def _encode_bricks(grid: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> BrickTable:
+    """The visible part of the grid near the surface, cut into bricks."""
+    counts = np.array(grid.density.shape) // BRICK_SIZE
     places = np.flatnonzero(reached)
-    seen = encode_density(lattice.density.ravel()[places])
+    seen = encode_density(grid.density.ravel()[places])
     seen = np.where(
         seen > 0, np.maximum(round_codes(seen, DENSITY_CODE_STEP, 255), DENSITY_CODE_STEP), 0
     )
-    codes = np.zeros(lattice.density.shape, dtype=np.uint8)
+    codes = np.zeros(grid.density.shape, dtype=np.uint8)
     codes.ravel()[places] = seen
     visible = dilate(codes > 0)
     blocks = _overlapping_blocks(visible)
@@ -280,27 +280,27 @@ def _encode_bricks(lattice: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> Br
     voxels[1:, ..., 3] = _overlapping_blocks(codes)[used]
     shown = blocks[used]
     for channel in range(3):
-        values = _overlapping_blocks(lattice.rgb[..., channel])[used]
+        values = _overlapping_blocks(grid.rgb[..., channel])[used]
         voxels[1:, ..., channel] = round_codes(values, COLOR_CODE_STEP, 255) * shown
-    return BrickTable(low=lattice.low, voxel_m=lattice.voxel_m, index=index, voxels=voxels)
+    return BrickTable(low=grid.low, voxel_m=grid.voxel_m, index=index, voxels=voxels)
 
 
 def _overlapping_blocks(
     nodes: Shaped[np.ndarray, "x y z"],
 ) -> Shaped[np.ndarray, "blocks_x blocks_y blocks_z 9 9 9"]:
-    """A lattice's blocks of 8 cells along each side; neighbours share a layer of nodes."""
+    """A grid's blocks of 8 cells along each side; neighbours share a layer of nodes."""
     blocks = np.lib.stride_tricks.sliding_window_view(nodes, (BRICK_NODES,) * 3)
     return blocks[::BRICK_SIZE, ::BRICK_SIZE, ::BRICK_SIZE]
 
 
-def _visible_nodes(lattice: FieldGrid, hull: ProxySurface) -> Bool[np.ndarray, "x y z"]:
-    """Nodes that rays see: from a little outside of the hull as deep as its thickness."""
-    reached = np.zeros(lattice.density.shape, dtype=bool)
+def _visible_nodes(grid: FieldGrid, surface: ProxySurface) -> Bool[np.ndarray, "x y z"]:
+    """Nodes that rays see: from a little outside of the surface as deep as its thickness."""
+    reached = np.zeros(grid.density.shape, dtype=bool)
     mark_visible_nodes(
-        reached, lattice.low, np.float32(lattice.voxel_m), hull.positions, hull.normals,
-        hull.thickness, np.float32(BRICK_MARGIN_M),
+        reached, grid.low, np.float32(grid.voxel_m), surface.positions, surface.normals,
+        surface.thickness, np.float32(BRICK_MARGIN_M),
     )  # fmt: skip
-    gap = 1 + 2 * int(np.ceil(hull.spacing_m / lattice.voxel_m))  # between neighbouring surfels
+    gap = 1 + 2 * int(np.ceil(surface.spacing_m / grid.voxel_m))  # between neighbouring surfels
     for _ in range(gap // 2):
         reached = dilate(reached)
     return reached

@@ -1,4 +1,4 @@
-"""The trained field read once on a voxel lattice: everything else of a bake looks at this."""
+"""The trained field read once on a voxel grid: everything else of a bake looks at this."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ FieldFunction = Callable[
     [Float32[torch.Tensor, "points 3"]],
     tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
 ]
-"""Canonical points to colour in [0, 1] and density in 1/m."""
+"""Canonical points to color in [0, 1] and density in 1/m."""
 CHUNK_POINTS = 1 << 18
 """Points that the field is asked for at a time."""
 MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
@@ -23,7 +23,7 @@ MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldGrid:
-    """Density and colour on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
+    """Density and color on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
 
     Attributes:
         low: Corner, canonical metres.
@@ -81,7 +81,7 @@ def _occupied_nodes(
     step: Float[np.ndarray, "3"],
     counts: Int[np.ndarray, "3"],
 ) -> Iterator[Int[np.ndarray, "nodes 3"]]:
-    """Lattice nodes inside occupied cells, some 10⁵ at a time."""
+    """Grid nodes inside occupied cells, some 10⁵ at a time."""
     padded = np.pad(occupied, 1)
     cells = [
         np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)

@@ -19,7 +19,6 @@ from export.bake.render_targets import (
     RenderFunction,
     RenderTargets,
     TargetBuilder,
-    VoxelCodes,
 )
 from export.package.player_tables import (
     BRICK_SIZE,
@@ -31,7 +30,7 @@ from export.package.player_tables import (
 )
 from export.package.render_settings import RenderSettings
 from export.package.table_codec import add_border_voxels
-from export.reference.sirt_kernels import back_project
+from export.reference.compositor import VoxelCodes, back_project
 
 TRAINING_PX, VALIDATION_PX = 540, 256
 """Longer side of the pictures that bricks are tuned on, and of those that judge."""
@@ -70,7 +69,7 @@ class FineTuningResult:
 
     Attributes:
         tables: The best that was seen; the given ones if nothing was better.
-        rules: How they are drawn: as asked, or with more behind the first depth layer.
+        settings: How they are drawn: as asked, or with more behind the first depth layer.
         psnr: Of pictures that were not learnt from to the renderer's, dB, before and after; None
             where nothing was tuned.
     """
@@ -91,7 +90,7 @@ def is_below_target(
 ) -> bool:
     """Whether the player is farther from the renderer than is wanted, as baked. As for `tuned`."""
     onlooker = TargetBuilder(
-        tables=tables, codes=_own_voxel_codes(tables.bricks), rig=rig, renderer=renderer, executor=executor,
+        tables=tables, codes=VoxelCodes.of(tables.bricks), rig=rig, renderer=renderer, executor=executor,
         on_picture=lambda: None,
     )  # fmt: skip
     near = list(
@@ -122,7 +121,7 @@ def fine_tune(
     Args:
         tables: As baked.
         rig: What moves them.
-        rules: How they will be drawn, at the least.
+        settings: How they will be drawn, at the least.
         renderer: Asked on this thread alone.
         views: Poses and cameras of the avatar.
         pictures: How many to learn from, at most.
@@ -139,7 +138,7 @@ def fine_tune(
         _perturbed_views(views, rig, NOVEL_POSES, NOVEL_POSE_NOISE_RAD, generator, VALIDATION_PX)
     )
     total = len(learnt) + len(asked) + 2 * NOVEL_POSES + ROUNDS
-    steps, codes = iter(range(1, total + 1)), _own_voxel_codes(tables.bricks)
+    steps, codes = iter(range(1, total + 1)), VoxelCodes.of(tables.bricks)
     onlooker = TargetBuilder(
         tables=tables, codes=codes, rig=rig, renderer=renderer, executor=executor,
         on_picture=lambda: progress(next(steps) / total),
@@ -166,32 +165,36 @@ def fine_tune(
 
 
 def _choose_layers(
-    onlooker: TargetBuilder, rules: RenderSettings, novel: Sequence[PosedView]
+    onlooker: TargetBuilder, settings: RenderSettings, novel: Sequence[PosedView]
 ) -> RenderSettings:
-    """The rules, or those that draw more of what lies behind, if new poses win by it."""
-    deeper = replace(rules, **DEEPER_SETTINGS)
-    before, after = (onlooker.psnr(onlooker.build(novel, each), each) for each in (rules, deeper))
-    return deeper if after >= before + MIN_DEEPER_GAIN_DB else rules
+    """The settings, or those that draw more of what lies behind, if new poses win by it."""
+    deeper = replace(settings, **DEEPER_SETTINGS)
+    before, after = (
+        onlooker.psnr(onlooker.build(novel, each), each) for each in (settings, deeper)
+    )
+    return deeper if after >= before + MIN_DEEPER_GAIN_DB else settings
 
 
 def _sirt_rounds(
-    targets: RenderTargets, tables: PlayerTables, rules: RenderSettings, baked: VoxelCodes
+    targets: RenderTargets, tables: PlayerTables, settings: RenderSettings, baked: VoxelCodes
 ) -> Iterator[VoxelCodes]:
     """Codes after each round, as they are before they are rounded."""
-    density, color = baked
+    codes, density = baked, baked.density
     low, high = (
         np.maximum(density - MAX_DENSITY_CODE_CHANGE, 0.0),
         np.minimum(density + MAX_DENSITY_CODE_CHANGE, 255.0),
     )
     for _ in range(ROUNDS):
-        push = back_project(
-            targets.segments, rules, tables.bricks.index, density, color, targets.target_colors
+        update = back_project(
+            targets.segments, settings, tables.bricks, codes, targets.target_colors
         )
-        color = color - push.color / (push.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
-        density = density - push.density / (push.density_normalizer + np.float32(DENSITY_DAMPING))
+        color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
+        density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
+        color, density = codes.color - color_step, codes.density - density_step
         color, density = np.clip(color, 0.0, 255.0), np.clip(density, low, high)
         color[: BRICK_SIZE**3], density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
-        yield VoxelCodes(density, color)
+        codes = VoxelCodes(density, color)
+        yield codes
 
 
 def _quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
@@ -200,11 +203,6 @@ def _quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
     density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_CODE_STEP, 255)
     density = np.where(baked.density > 0, np.maximum(density, DENSITY_CODE_STEP), density)
     return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
-
-
-def _own_voxel_codes(bricks: BrickTable) -> VoxelCodes:
-    core = bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE].reshape(-1, 4).astype(np.float32)
-    return VoxelCodes(np.ascontiguousarray(core[:, 3]), np.ascontiguousarray(core[:, :3]))
 
 
 def _bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:

@@ -1,4 +1,4 @@
-"""The hull: points on a level set just outside of what can be seen, with normals and depth."""
+"""The surface: points on a level set just outside of what can be seen, with normals and depth."""
 
 from dataclasses import dataclass
 
@@ -22,15 +22,15 @@ OPAQUE_OPTICAL_DEPTH = 7.0
 THICKNESS_MARGIN_M = 0.004
 """Added to the thickness, for what lies deeper beside the normal than along it."""
 MAX_THICKNESS_M = 0.1
-"""Nothing is looked for deeper than this under the hull."""
+"""Nothing is looked for deeper than this under the surface."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProxySurface:
-    """A person's hull in canonical space.
+    """A person's surface in canonical space.
 
     Attributes:
-        spacing_m: Cell of the lattice that the level set was taken on.
+        spacing_m: Cell of the grid that the level set was taken on.
         positions: Metres.
         normals: Outward, of length 1.
         thickness: How deep one sees into it along the normal, metres.
@@ -46,10 +46,10 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
     """The outer level set of the blurred log-density, without floaters and hollows.
 
     Args:
-        lattice: The field.
-        level: Density in 1/m. Lower, and haze that nobody sees shapes the hull; higher, and it
+        grid: The field.
+        level: Density in 1/m. Lower, and haze that nobody sees shapes the surface; higher, and it
             cuts into what is seen.
-        spacing_m: Cell of the lattice that the set is taken on; surfels sit on its edges.
+        spacing_m: Cell of the grid that the set is taken on; surfels sit on its edges.
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
@@ -67,11 +67,11 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
     )
 
 
-def _log_density(lattice: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
+def _log_density(grid: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
     """Logarithm of the density over the level, within `CONTRAST`; most nodes are empty."""
-    logs = np.full(lattice.density.shape, -np.log(DENSITY_CONTRAST), dtype=np.float32)
-    places = np.flatnonzero(lattice.density > np.float32(level / DENSITY_CONTRAST))
-    dense = lattice.density.ravel()[places] / np.float32(level)
+    logs = np.full(grid.density.shape, -np.log(DENSITY_CONTRAST), dtype=np.float32)
+    places = np.flatnonzero(grid.density > np.float32(level / DENSITY_CONTRAST))
+    dense = grid.density.ravel()[places] / np.float32(level)
     logs.ravel()[places] = np.log(np.clip(dense, 1.0 / DENSITY_CONTRAST, DENSITY_CONTRAST))
     return logs
 
@@ -96,7 +96,7 @@ def _label_components(mask: Bool[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y
 def _zero_crossings(
     logs: Float32[np.ndarray, "x y z"], smoothed: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
-    """Where lattice edges cross zero (marching cubes' vertices), in nodes, and the unit normals.
+    """Where grid edges cross zero (marching cubes' vertices), in nodes, and the unit normals.
 
     `slope` is a smoother version of `logs`, for the normals.
     """
@@ -130,7 +130,7 @@ def _central_differences(
 
 
 def _visible_thickness(
-    lattice: FieldGrid,
+    grid: FieldGrid,
     positions: Float32[np.ndarray, "surfels 3"],
     normals: Float32[np.ndarray, "surfels 3"],
 ) -> Float32[np.ndarray, "surfels"]:
@@ -139,9 +139,9 @@ def _visible_thickness(
     That is where the optical depth reaches `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of all there is within
     `DEEPEST_M`; and `MARGIN_M`.
     """
-    step = np.float32(0.5 * lattice.voxel_m)
+    step = np.float32(0.5 * grid.voxel_m)
     ends = visible_depth_steps(
-        lattice.density, lattice.low, np.float32(lattice.voxel_m), positions, normals, step,
+        grid.density, grid.low, np.float32(grid.voxel_m), positions, normals, step,
         int(MAX_THICKNESS_M / step), OPAQUE_OPTICAL_DEPTH, 0.999,
     )  # fmt: skip
     return ((ends + 1) * step + THICKNESS_MARGIN_M).astype(np.float32)

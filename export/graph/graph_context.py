@@ -1,4 +1,4 @@
-"""What every part of the player's graph looks at: inputs, tables and rules.
+"""What every part of the player's graph looks at: inputs, tables and settings.
 
 Vectors and matrices whose components are tensors of their own (no batched small products).
 """
@@ -41,7 +41,7 @@ class GraphContext:
         graph: The graph.
         tables: What is drawn, for the sizes and scales that become constants.
         columns: The tables' contents as values of the graph (`export.package.player_tables.initialisers`).
-        rules: How it is drawn.
+        settings: How it is drawn.
         view: From where.
         samples: Along each ray and layer, int64 scalar.
     """

@@ -1,6 +1,6 @@
-"""Nodes that read colour and density out of the bricks.
+"""Nodes that read color and density out of the bricks.
 
-Nodes that follow rays through canonical space, and gather colour on the way.
+Nodes that follow rays through canonical space, and gather color on the way.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from export.package.player_tables import BRICK_NODES, BRICK_SIZE, LOG_DENSITY_RA
 VOXEL_STRIDES = (BRICK_NODES * BRICK_NODES, BRICK_NODES, 1)
 """Steps along x, y and z inside a brick."""
 COLOR_WEIGHT_SCALE = 256
-"""Weights of colours are integers that sum to this: two channels share a multiplication."""
+"""Weights of colors are integers that sum to this: two channels share a multiplication."""
 VOXEL_OFFSET_BITS = 10
 """A voxel's place inside its brick takes so many bits, the brick's block the others."""
 
@@ -41,9 +41,9 @@ class BrickTetrahedra:
     fractions: VectorValue
 
 
-def locate_tetrahedra(scene: GraphContext, lattice: VectorValue) -> BrickTetrahedra:
+def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetrahedra:
     """The tetrahedra about lattice coordinates, (point - low) / voxel_m."""
-    graph, bricks = scene.graph, scene.tables.bricks
+    graph, bricks = context.graph, context.tables.bricks
     packed, fraction = None, []
     for axis, coordinate in enumerate(lattice):
         inside = coordinate.clip(0.0, bricks.index.shape[axis] * BRICK_SIZE - 1e-3)
@@ -54,7 +54,7 @@ def locate_tetrahedra(scene: GraphContext, lattice: VectorValue) -> BrickTetrahe
     assert packed is not None
     # as floats: two bits of the place may be lost, but it never reaches the next block
     block = (packed.cast(np.float32) * (1.0 / (1 << VOXEL_OFFSET_BITS))).cast(np.int32)
-    base = packed + _brick_offsets(scene).gather(block)
+    base = packed + _brick_offsets(context).gather(block)
     x, y, z = fraction
     largest, smallest = x.maximum(y, z), x.minimum(y, z)
     middle = (x + y + z) - largest - smallest
@@ -72,10 +72,10 @@ def _packed_addresses(bricks: BrickTable, axis: int) -> np.ndarray:
     return packed.astype(np.int32)
 
 
-def _brick_offsets(scene: GraphContext) -> GraphValue:
+def _brick_offsets(context: GraphContext) -> GraphValue:
     """What added to a packed place gives the voxel's address, for each block."""
-    offset = scene.table_values["brick_offset"]
-    blocks = scene.graph.range(scene.graph.constant(np.int32(scene.tables.bricks.index.size)))
+    offset = context.table_values["brick_offset"]
+    blocks = context.graph.range(context.graph.constant(np.int32(context.tables.bricks.index.size)))
     return offset - blocks * (1 << VOXEL_OFFSET_BITS)
 
 
@@ -102,25 +102,25 @@ def _tetrahedron_corners(
     return [base, base + first, base + last_two, base + (sx + sy + sz)]
 
 
-def interpolate_density(scene: GraphContext, cell: BrickTetrahedra) -> GraphValue:
+def interpolate_density(context: GraphContext, cell: BrickTetrahedra) -> GraphValue:
     """Density in 1/m: its logarithm is linear in a tetrahedron; below half a code is nothing."""
-    table = scene.table_values["voxel_density"]
+    table = context.table_values["voxel_density"]
     codes = [table.gather(corner).cast(np.float32) for corner in cell.corners]
     code = codes[0]
     for i, fraction in enumerate(cell.fractions):
         code = code + fraction * (codes[i + 1] - codes[i])
     low, high = LOG_DENSITY_RANGE
     density = (code * ((high - low) / 255.0) + low).exp()
-    return scene.graph.where(code > 0.5, density, 0.0)
+    return context.graph.where(code > 0.5, density, 0.0)
 
 
-def interpolate_color(scene: GraphContext, cell: BrickTetrahedra) -> VectorValue:
+def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> VectorValue:
     """Red, green and blue in [0, 1]."""
     parts = [(part * float(COLOR_WEIGHT_SCALE) + 0.5).cast(np.int32) for part in cell.fractions]
     a, b, c = parts
     red_blue = green = None
     for corner, weight in zip(cell.corners, (COLOR_WEIGHT_SCALE - a, a - b, b - c, c), strict=True):
-        code = scene.table_values["voxel_color"].gather(corner)
+        code = context.table_values["voxel_color"].gather(corner)
         pair, other = code.bitwise_and(0xFF00FF) * weight, code.bitwise_and(0xFF00) * weight
         red_blue = pair if red_blue is None else red_blue + pair
         green = other if green is None else green + other
@@ -175,7 +175,7 @@ class BlockValues:
 
 
 def march_segments(
-    scene: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+    context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> tuple[VectorValue, GraphValue]:
     """Front-to-back compositing, a block of samples at a time.
 
@@ -184,55 +184,57 @@ def march_segments(
     takes all that is left of a ray.
 
     Args:
-        scene: What is drawn.
+        context: What is drawn.
         posed: The skin's nodes in the camera's frame.
         segment: The rays.
 
     Returns:
-        Premultiplied colour, and the light that is left, in [0, 1].
+        Premultiplied color, and the light that is left, in [0, 1].
     """
-    graph, rules = scene.graph, scene.settings
-    usual = rules.sample_span_m / scene.samples.cast(np.float32)
-    shortened = compression_scale(scene, segment.direction_canonical)
-    scale = (scene.samples + (rules.samples - 1)) // rules.samples  # more samples, more blocks
-    blocks, steady = (scale * count for count in (rules.max_blocks, rules.uniform_blocks))
+    graph, settings = context.graph, context.settings
+    usual = settings.sample_span_m / context.samples.cast(np.float32)
+    shortened = compression_scale(context, segment.direction_canonical)
+    scale = (
+        context.samples + (settings.samples - 1)
+    ) // settings.samples  # more samples, more blocks
+    blocks, steady = (scale * count for count in (settings.max_blocks, settings.uniform_blocks))
     block = composite_samples(
-        scene, segment, segment.begin * 0.0 + 1.0, rules.block_samples, usual * shortened
+        context, segment, segment.begin * 0.0 + 1.0, settings.block_samples, usual * shortened
     )
     number = graph.range(graph.size(segment.begin).cast(np.int32))
-    start = [block.transmittance, *block.color, *_unfinished_rays(scene, number, segment, block)]
+    start = [block.transmittance, *block.color, *_unfinished_rays(context, number, segment, block)]
 
     def once(turn: GraphValue, state: list[GraphValue]) -> tuple[GraphValue, list[GraphValue]]:
         (light, *color), number, before, values = state[:4], state[4], state[5], state[6:]
-        segment = _newton_step(scene, posed, _unpack_segment(values))
+        segment = _newton_step(context, posed, _unpack_segment(values))
         doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
         last = turn > blocks - 3
-        shortened = compression_scale(scene, segment.direction_canonical)
-        longest = graph.where(last, rules.max_segment_m, usual * doublings.exp2() * shortened)
-        block = composite_samples(scene, segment, before, rules.block_samples, longest)
+        shortened = compression_scale(context, segment.direction_canonical)
+        longest = graph.where(last, settings.max_segment_m, usual * doublings.exp2() * shortened)
+        block = composite_samples(context, segment, before, settings.block_samples, longest)
         light = light.scatter(number, block.transmittance)
         color = [
             c.scatter(number, added, reduction="add")
             for c, added in zip(color, block.color, strict=True)
         ]
-        left = _unfinished_rays(scene, number, segment, block)
+        left = _unfinished_rays(context, number, segment, block)
         return graph.size(left[0]) > 0, [light, *color, *left]
 
     light, *color = graph.loop_while(blocks - 1, start, once)[:4]
     return color, light
 
 
-def compression_scale(scene: GraphContext, direction: VectorValue) -> GraphValue:
+def compression_scale(context: GraphContext, direction: VectorValue) -> GraphValue:
     """Factor by which lengths along rays shrink where the pose compresses canonical space."""
-    return (scene.settings.max_compression / dot(direction, direction).sqrt()).minimum(1.0)
+    return (context.settings.max_compression / dot(direction, direction).sqrt()).minimum(1.0)
 
 
 def _unfinished_rays(
-    scene: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
+    context: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
 ) -> list[GraphValue]:
     """Which rays go on: their numbers, the light that is left, and `_pack_segment` of their rest."""
-    graph = scene.graph
-    on = (block.transmittance > scene.settings.min_transmittance) & (
+    graph = context.graph
+    on = (block.transmittance > context.settings.min_transmittance) & (
         block.end < segment.end - MIN_REMAINING_M
     )
     chosen = graph.range(graph.size(on).cast(np.int32)).compress(on)
@@ -263,14 +265,14 @@ def _pack_segment(segment: SegmentValues) -> list[GraphValue]:
 
 
 def composite_samples(
-    scene: GraphContext,
+    context: GraphContext,
     segment: SegmentValues,
     light: GraphValue,
     num_samples: int,
     max_spacing: GraphValue | float,
 ) -> BlockValues:
-    """A block of so many samples: density at each, colour once, at their mean."""
-    graph, bricks = scene.graph, scene.tables.bricks
+    """A block of so many samples: density at each, color once, at their mean."""
+    graph, bricks = context.graph, context.tables.bricks
     step = ((segment.end - segment.begin) * (1.0 / num_samples)).minimum(max_spacing)
     scale = 1.0 / bricks.voxel_m
     start = [
@@ -284,7 +286,9 @@ def composite_samples(
         (middles * b.reshape(1, -1) + a.reshape(1, -1)).reshape(-1)
         for a, b in zip(start, slope, strict=True)
     ]
-    density = interpolate_density(scene, locate_tetrahedra(scene, lattice)).reshape(num_samples, -1)
+    density = interpolate_density(context, locate_tetrahedra(context, lattice)).reshape(
+        num_samples, -1
+    )
     passed = graph.split((density * -step.reshape(1, -1)).exp(), num_samples)
     weight = mean = None
     before = light
@@ -299,7 +303,8 @@ def composite_samples(
     assert mean is not None
     middle = mean / weight.maximum(1e-9)
     seen = interpolate_color(
-        scene, locate_tetrahedra(scene, [a + middle * b for a, b in zip(start, slope, strict=True)])
+        context,
+        locate_tetrahedra(context, [a + middle * b for a, b in zip(start, slope, strict=True)]),
     )
     way = step * float(num_samples)
     return BlockValues(
@@ -314,18 +319,18 @@ def composite_samples(
 
 
 def _newton_step(
-    scene: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+    context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> SegmentValues:
     """Corrects canonical points and directions where the derivative can be inverted."""
-    graph, rules = scene.graph, scene.settings
+    graph, settings = context.graph, context.settings
     camera, derivative = skin_points(
-        scene, posed, locate_skinning_cell(scene, segment.start_canonical)
+        context, posed, locate_skinning_cell(context, segment.start_canonical)
     )
-    inverse = invert_jacobian(scene, derivative, adjugate(derivative))
+    inverse = invert_jacobian(context, derivative, adjugate(derivative))
     off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
     shift = inverse.apply(off)
     length = (dot(shift, shift) + 1e-20).sqrt()
-    share = (rules.max_correction_m / length).minimum(1.0)
+    share = (settings.max_correction_m / length).minimum(1.0)
     turned = inverse.apply(segment.direction_camera)
     return SegmentValues(
         direction_camera=segment.direction_camera,

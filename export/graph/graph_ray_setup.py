@@ -1,4 +1,4 @@
-"""Nodes that say where each pixel's ray enters the hull, and what it sees from there on."""
+"""Nodes that say where each pixel's ray enters the surface, and what it sees from there on."""
 
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ class DepthLayer:
         canonical, camera: where that is.
         color: Premultiplied.
         light: What is let through, in [0, 1].
-        enter, end: Where the ray enters the hull and where it ends, metres along it.
+        enter, end: Where the ray enters the surface and where it ends, metres along it.
     """
 
     ray: VectorValue
@@ -74,8 +74,8 @@ def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> Ve
 
 
 def trace_depth_layer(
-    scene: GraphContext,
-    hull: PosedProxySurface,
+    context: GraphContext,
+    surface: PosedProxySurface,
     keys: GraphValue,
     ray: VectorValue,
     front_layer: DepthLayer | None,
@@ -83,36 +83,36 @@ def trace_depth_layer(
     """Color and light behind of rays.
 
     The map from canonical space to the camera's is taken as linear about the surfel that a ray
-    sees: its inverse carries the ray to where it enters the hull.
+    sees: its inverse carries the ray to where it enters the surface.
 
     Args:
-        scene: What is drawn.
-        hull: In its pose.
+        context: What is drawn.
+        surface: In its pose.
         keys: What each ray sees.
         ray: Directions.
         before: What the same rays saw in the first layer, if this is the second.
     """
-    graph, surfel = scene.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
-    place = hull.surfels.cell
+    graph, surfel = context.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
+    place = surface.surfels.cell
     place = SkinningCell(
         rows=gather_vector(place.rows, surfel), fraction=gather_vector(place.fraction, surfel)
     )
-    camera, derivative = skin_points(scene, hull.posed, place)
-    inverse = invert_jacobian(scene, derivative, adjugate(derivative))
-    normal = gather_vector([scene.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
-    # where the skin is folded, the hull is looked at from straight above
+    camera, derivative = skin_points(context, surface.posed, place)
+    inverse = invert_jacobian(context, derivative, adjugate(derivative))
+    normal = gather_vector([context.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
+    # where the skin is folded, the surface is looked at from straight above
     above = [-n for n in normal]
     seen_along = zip(inverse.apply(ray), above, strict=True)
     direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
     along = dot(camera, ray)
     beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
-    thickness = scene.table_values["thickness"].gather(surfel)
-    enter, begin, end = _segment_bounds(scene, normal, thickness, direction, beside, along)
+    thickness = context.table_values["thickness"].gather(surfel)
+    enter, begin, end = _segment_bounds(context, normal, thickness, direction, beside, along)
     canonical = gather_vector(
-        [scene.table_values[f"position_{letter}"] for letter in "xyz"], surfel
+        [context.table_values[f"position_{letter}"] for letter in "xyz"], surfel
     )
     if front_layer is not None:
-        begin = _begin_behind_front_layer(scene, front_layer, canonical, camera, begin, end)
+        begin = _begin_behind_front_layer(context, front_layer, canonical, camera, begin, end)
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = SegmentValues(
@@ -123,11 +123,15 @@ def trace_depth_layer(
         direction_canonical=direction,
     )
     if front_layer is None:
-        color, light = march_segments(scene, hull.posed, segment)
+        color, light = march_segments(context, surface.posed, segment)
     else:
-        rules = scene.settings
+        settings = context.settings
         block = composite_samples(
-            scene, segment, begin * 0.0 + 1.0, rules.further_layer_samples, rules.max_segment_m
+            context,
+            segment,
+            begin * 0.0 + 1.0,
+            settings.further_layer_samples,
+            settings.max_segment_m,
         )
         color, light = block.color, block.transmittance
     return DepthLayer(
@@ -143,40 +147,40 @@ def trace_depth_layer(
 
 
 def _segment_bounds(
-    scene: GraphContext,
+    context: GraphContext,
     normal: VectorValue,
     thickness: GraphValue,
     direction: VectorValue,
     beside: VectorValue,
     along: GraphValue,
 ) -> tuple[GraphValue, GraphValue, GraphValue]:
-    """Where rays enter the hull's tangent plane, and from where to where they are followed.
+    """Where rays enter the surface's tangent plane, and from where to where they are followed.
 
     `beside` is where each ray comes closest to its surfel, seen from that in canonical space,
     `along` how far that is along the ray.
     """
-    graph, rules = scene.graph, scene.settings
+    graph, settings = context.graph, context.settings
     falling = dot(normal, direction)
-    shallow = -0.5 * rules.min_cosine
+    shallow = -0.5 * settings.min_cosine
     hit = -dot(normal, beside) / falling.minimum(shallow)
     hit = graph.where(falling < shallow, hit, 0.0).clip(
-        -rules.max_entry_shift_m, rules.max_entry_shift_m
+        -settings.max_entry_shift_m, settings.max_entry_shift_m
     )
     enter = along + hit
-    cosine = (-falling).maximum(rules.min_cosine)
-    lead = (rules.entry_margin_m / cosine).minimum(
-        compression_scale(scene, direction) * rules.max_entry_margin_m
+    cosine = (-falling).maximum(settings.min_cosine)
+    lead = (settings.entry_margin_m / cosine).minimum(
+        compression_scale(context, direction) * settings.max_entry_margin_m
     )
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
-    bent = cosine.minimum(rules.max_compression)  # compression at the surfel seldom lasts
-    times = ((sine * rules.grazing_factor + 1.0) / bent).minimum(rules.max_lengthening)
-    length = (thickness * times + lead).minimum(rules.max_segment_m)
+    bent = cosine.minimum(settings.max_compression)  # compression at the surfel seldom lasts
+    times = ((sine * settings.grazing_factor + 1.0) / bent).minimum(settings.max_lengthening)
+    length = (thickness * times + lead).minimum(settings.max_segment_m)
     begin = enter - lead
     return enter, begin, begin + length
 
 
 def _begin_behind_front_layer(
-    scene: GraphContext,
+    context: GraphContext,
     before: DepthLayer,
     canonical: VectorValue,
     camera: VectorValue,
@@ -184,7 +188,7 @@ def _begin_behind_front_layer(
     end: GraphValue,
 ) -> GraphValue:
     """Where rays begin that must not see a second time what they have passed already."""
-    rules = scene.settings
+    settings = context.settings
 
     def apart(here: VectorValue, first: VectorValue) -> GraphValue:
         between = [a - b for a, b in zip(here, first, strict=True)]
@@ -192,7 +196,7 @@ def _begin_behind_front_layer(
 
     one_sheet = (
         apart(canonical, before.canonical_position)
-        < apart(camera, before.camera_position) * rules.same_sheet_ratio + rules.same_sheet_m
+        < apart(camera, before.camera_position) * settings.same_sheet_ratio + settings.same_sheet_m
     )
     later = begin.maximum(before.end).minimum(end)
-    return scene.graph.where(one_sheet, later, begin)
+    return context.graph.where(one_sheet, later, begin)

@@ -1,6 +1,6 @@
 """Nodes that carry canonical points to the camera's frame, with the derivative.
 
-Nodes that carry the hull's surfels into the camera's frame, cheaply: most are never seen.
+Nodes that carry the surface's surfels into the camera's frame, cheaply: most are never seen.
 """
 
 from collections.abc import Sequence
@@ -41,10 +41,10 @@ class SkinningCell:
     fraction: VectorValue
 
 
-def pose_nodes(scene: GraphContext) -> PosedNodeValues:
+def pose_nodes(context: GraphContext) -> PosedNodeValues:
     """Linear blend skinning of every node, straight into the camera's frame."""
-    graph, columns = scene.graph, scene.table_values
-    blended = scene.camera.bones.transpose(1, 0).matmul(columns["node_weights"])
+    graph, columns = context.graph, context.table_values
+    blended = context.camera.bones.transpose(1, 0).matmul(columns["node_weights"])
     positions = [columns[f"node_{letter}"] for letter in "xyz"]
     ones = positions[0] * 0.0 + 1.0
     homogeneous = graph.concatenate([p.reshape(1, -1) for p in [*positions, ones]])
@@ -52,19 +52,22 @@ def pose_nodes(scene: GraphContext) -> PosedNodeValues:
     return PosedNodeValues(camera_positions=graph.split((matrix * homogeneous).reduce_sum(1), 3))
 
 
-def skinning_nodes_per_m(scene: GraphContext) -> list[float]:
+def skinning_nodes_per_m(context: GraphContext) -> list[float]:
     """Along x, y, z."""
     return [
-        scene.settings.skinning_subdivision / float(step) for step in scene.tables.skinning.step_m
+        context.settings.skinning_subdivision / float(step)
+        for step in context.tables.skinning.step_m
     ]
 
 
-def locate_skinning_cell(scene: GraphContext, canonical: VectorValue) -> SkinningCell:
+def locate_skinning_cell(context: GraphContext, canonical: VectorValue) -> SkinningCell:
     """Where canonical points lie among the nodes."""
-    skin = scene.tables.skinning
-    counts = [scene.settings.skinning_subdivision * (count - 1) + 1 for count in skin.index.shape]
+    skin = context.tables.skinning
+    counts = [context.settings.skinning_subdivision * (count - 1) + 1 for count in skin.index.shape]
     number, fraction = None, []
-    for axis, (point, per_m) in enumerate(zip(canonical, skinning_nodes_per_m(scene), strict=True)):
+    for axis, (point, per_m) in enumerate(
+        zip(canonical, skinning_nodes_per_m(context), strict=True)
+    ):
         place = point * per_m - float(skin.low[axis]) * per_m
         place = place.clip(0.0, counts[axis] - 1 - 1e-3)
         below = place.cast(np.int32)
@@ -72,12 +75,12 @@ def locate_skinning_cell(scene: GraphContext, canonical: VectorValue) -> Skinnin
         number = below if number is None else number * counts[axis] + below
     assert number is not None
     steps = (0, counts[2], counts[1] * counts[2], (counts[1] + 1) * counts[2])
-    table = scene.table_values["node"]
+    table = context.table_values["node"]
     return SkinningCell(rows=[table.gather(number + step) for step in steps], fraction=fraction)
 
 
 def skin_points(
-    scene: GraphContext, posed: PosedNodeValues, place: SkinningCell
+    context: GraphContext, posed: PosedNodeValues, place: SkinningCell
 ) -> tuple[VectorValue, MatrixValue]:
     """Where points are in the camera's frame, and how that changes with them.
 
@@ -139,21 +142,21 @@ class InverseJacobian:
 
 
 def invert_jacobian(
-    scene: GraphContext, jacobian: MatrixValue, cofactors: MatrixValue
+    context: GraphContext, jacobian: MatrixValue, cofactors: MatrixValue
 ) -> InverseJacobian:
     """Inverts derivatives (metres a step between nodes), given their adjugates."""
-    per_m = skinning_nodes_per_m(scene)
+    per_m = skinning_nodes_per_m(context)
     volume = dot(jacobian[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
-    stretch = scene.settings.max_volume_ratio
+    stretch = context.settings.max_volume_ratio
     trusted = (volume > 1.0 / stretch) & (volume < stretch)
-    one = scene.graph.where(trusted, volume, 1e30).reciprocal()
+    one = context.graph.where(trusted, volume, 1e30).reciprocal()
     scale = [one * float(np.prod(per_m) / step) for step in per_m]
     return InverseJacobian(cofactors=cofactors, scale=scale, trusted=trusted)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedSurfels:
-    """The hull: values of the graph, one entry a surfel.
+    """The surface: values of the graph, one entry a surfel.
 
     Attributes:
         place: Where they lie among the skin's nodes, the same in all poses.
@@ -171,14 +174,14 @@ class PosedSurfels:
     folded: GraphValue
 
 
-def pose_surfels(scene: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
+def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
     """Positions as sums over four nodes each.
 
     All but the nodes' posed places is the same in every pose: onnxruntime computes it once.
     """
-    columns = scene.table_values
-    place = locate_skinning_cell(scene, [columns[f"position_{letter}"] for letter in "xyz"])
-    rows, shares, normal, handed = _surfel_tetrahedra(scene, place)
+    columns = context.table_values
+    place = locate_skinning_cell(context, [columns[f"position_{letter}"] for letter in "xyz"])
+    rows, shares, normal, handed = _surfel_tetrahedra(context, place)
     corners = [gather_vector(posed.camera_positions, row) for row in rows]
     camera = []
     for axis in range(3):
@@ -186,7 +189,7 @@ def pose_surfels(scene: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
         camera.append(parts[0] + parts[1] + parts[2] + parts[3])
     edges = _tetrahedron_edges(corners)
     volume = dot(edges[0], cross(edges[1], edges[2])) * handed
-    least = scene.settings.fold_volume_ratio / float(np.prod(skinning_nodes_per_m(scene)))
+    least = context.settings.fold_volume_ratio / float(np.prod(skinning_nodes_per_m(context)))
     return PosedSurfels(
         cell=place, rows=rows, normal=normal, camera_positions=camera, folded=volume < least
     )
@@ -198,24 +201,24 @@ def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
 
 
 def faces_camera(
-    scene: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue
+    context: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue
 ) -> GraphValue:
     """Which of some surfels face the camera: n · J⁻¹ c, J the derivative in the tetrahedron.
 
     J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
     """
-    rules, rows = scene.settings, gather_vector(surfels.rows, number)
+    settings, rows = context.settings, gather_vector(surfels.rows, number)
     edges = _tetrahedron_edges([gather_vector(posed.camera_positions, row) for row in rows])
     across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
     volume = dot(edges[0], across[0])
     camera = gather_vector(surfels.camera_positions, number)
     facing = dot(gather_vector(surfels.normal, number), [dot(vector, camera) for vector in across])
     # the way along the edges turns left or right, so the volume may have either sign
-    return facing * volume < camera[2] * volume * volume * -rules.min_facing_cosine
+    return facing * volume < camera[2] * volume * volume * -settings.min_facing_cosine
 
 
 def _surfel_tetrahedra(
-    scene: GraphContext, place: SkinningCell
+    context: GraphContext, place: SkinningCell
 ) -> tuple[list[GraphValue], list[GraphValue], VectorValue, GraphValue]:
     """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
 
@@ -224,7 +227,7 @@ def _surfel_tetrahedra(
     The way from the lower to the upper corner of a cell takes the axis of the largest fraction
     first (as `lookup.Cell`).
     """
-    graph, (x, y, z) = scene.graph, place.fraction
+    graph, (x, y, z) = context.graph, place.fraction
     low, along_y, along_x, along_both = place.rows
     x_over_y, x_over_z, y_over_z = x > y, x > z, y > z
     first = graph.where(
@@ -239,8 +242,8 @@ def _surfel_tetrahedra(
     middle = (x + y + z) - largest - smallest
     shares = [1.0 - largest, largest - middle, middle - smallest, smallest]
     nx, ny, nz = (
-        scene.table_values[f"normal_{letter}"] * (1.0 / per_m)
-        for letter, per_m in zip("xyz", skinning_nodes_per_m(scene), strict=True)
+        context.table_values[f"normal_{letter}"] * (1.0 / per_m)
+        for letter, per_m in zip("xyz", skinning_nodes_per_m(context), strict=True)
     )
     one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
     three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))

@@ -38,7 +38,7 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
     Its tables stay outside (`initialisers`).
     """
     graph = GraphBuilder()
-    scene = GraphContext(
+    context = GraphContext(
         graph=graph,
         tables=tables,
         table_values={
@@ -49,25 +49,25 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
         camera=_camera_inputs(graph),
         samples=graph.input("samples", np.int64, []),
     )
-    graph.output(_draw_picture(scene), "rgba", ["pixels"])
+    graph.output(_draw_picture(context), "rgba", ["pixels"])
     return graph.model()
 
 
-def _draw_picture(scene: GraphContext) -> GraphValue:
-    graph = scene.graph
-    posed = pose_nodes(scene)
-    hull = PosedProxySurface(surfels=pose_surfels(scene, posed), posed=posed)
-    splats = project_surfels(scene, hull.surfels)
+def _draw_picture(context: GraphContext) -> GraphValue:
+    graph = context.graph
+    posed = pose_nodes(context)
+    surface = PosedProxySurface(surfels=pose_surfels(context, posed), posed=posed)
+    splats = project_surfels(context, surface.surfels)
     window = splats.window
-    keys = nearest_keys(scene, splats)
+    keys = nearest_keys(context, splats)
     covered = keys < EMPTY_KEY
     pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
-    ray = pixel_rays(scene.camera, window, pixel)
-    first = trace_depth_layer(scene, hull, keys.gather(pixel), ray, None)
+    ray = pixel_rays(context.camera, window, pixel)
+    first = trace_depth_layer(context, surface, keys.gather(pixel), ray, None)
     channels = [*first.color, first.transmittance]
-    if scene.settings.layers > 1:
-        channels = _add_further_layers(scene, hull, splats, pixel, first)
-    return _pack_rgba(scene, window, pixel, channels)
+    if context.settings.layers > 1:
+        channels = _add_further_layers(context, surface, splats, pixel, first)
+    return _pack_rgba(context, window, pixel, channels)
 
 
 def _camera_inputs(graph: GraphBuilder) -> CameraValues:
@@ -83,25 +83,25 @@ def _camera_inputs(graph: GraphBuilder) -> CameraValues:
 
 
 def _add_further_layers(
-    scene: GraphContext,
-    hull: PosedProxySurface,
+    context: GraphContext,
+    surface: PosedProxySurface,
     splats: SurfelSplats,
     pixel: GraphValue,
     first: DepthLayer,
 ) -> list[GraphValue]:
     """Color and light after all layers, one entry a ray of the first."""
-    graph, window, hidden = scene.graph, splats.window, None
+    graph, window, hidden = context.graph, splats.window, None
     color, light, before = first.color, first.transmittance, first
     number = graph.range(graph.size(pixel).cast(np.int32))
-    for _ in range(1, scene.settings.layers):
-        wanted = before.transmittance > scene.settings.layer_min_transmittance
+    for _ in range(1, context.settings.layers):
+        wanted = before.transmittance > context.settings.layer_min_transmittance
         kept = graph.range(graph.size(number).cast(np.int32)).compress(wanted)
         cell = _window_cells(window, pixel.gather(number.gather(kept)))
-        depth = (before.enter * before.ray[2]).gather(kept) + scene.settings.layer_gap_m
-        limits = depth_limits(scene, window, cell, depth)
-        hidden = hidden or hidden_splats(scene, hull.posed, hull.surfels, splats, limits)
+        depth = (before.enter * before.ray[2]).gather(kept) + context.settings.layer_gap_m
+        limits = depth_limits(context, window, cell, depth)
+        hidden = hidden or hidden_splats(context, surface.posed, surface.surfels, splats, limits)
         keys = keys_behind_limits(
-            scene, hull.surfels, hidden, limits, cell, before.surfel.gather(kept)
+            context, surface.surfels, hidden, limits, cell, before.surfel.gather(kept)
         )
         there = keys < EMPTY_KEY
         keys, kept = keys.compress(there), kept.compress(there)
@@ -116,7 +116,7 @@ def _add_further_layers(
             enter=before.enter,
             end=before.end.gather(kept),
         )
-        layer = trace_depth_layer(scene, hull, keys, seen_from.ray, seen_from)
+        layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         color = [
             c.scatter(number, behind * seen_from.transmittance, reduction="add")
             for c, behind in zip(color, layer.color, strict=True)
@@ -135,10 +135,10 @@ def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
 
 
 def _pack_rgba(
-    scene: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]
+    context: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]
 ) -> GraphValue:
-    """The whole picture, eight bits a channel, straight alpha: colour is divided by alpha."""
-    graph, view = scene.graph, scene.camera
+    """The whole picture, eight bits a channel, straight alpha: color is divided by alpha."""
+    graph, view = context.graph, context.camera
     *color, light = channels
     alpha = 1.0 - light
     inverse = 255.0 / alpha.maximum(1e-6)

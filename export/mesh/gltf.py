@@ -167,7 +167,7 @@ def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
 
 
 def _srgb_to_linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
-    """sRGB to linear light, which glTF's vertex colours are, and opaque; 16 bits keep the darks."""
+    """sRGB to linear light, which glTF's vertex colors are, and opaque; 16 bits keep the darks."""
     srgb = colors.astype(np.float64) / 255.0
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     opaque = np.concatenate([light, np.ones((len(light), 1))], axis=1)

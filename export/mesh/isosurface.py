@@ -1,4 +1,4 @@
-"""The zero set of a lattice of numbers as a mesh: one vertex a cell (naive surface nets)."""
+"""The zero set of a grid of numbers as a mesh: one vertex a cell (naive surface nets)."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
@@ -10,10 +10,10 @@ AXES = np.eye(3, dtype=np.int64)
 def extract_isosurface(
     values: Float32[np.ndarray, "x y z"],
 ) -> tuple[Float32[np.ndarray, "vertices 3"], Int32[np.ndarray, "faces 3"]]:
-    """Vertices in nodes of the lattice, and triangles that face from positive to negative.
+    """Vertices in nodes of the grid, and triangles that face from positive to negative.
 
     Every cell that the zero set crosses has one vertex, the mean of where it crosses the cell's
-    edges; every lattice edge that it crosses has a quad between its four cells (Gibson 1998,
+    edges; every grid edge that it crosses has a quad between its four cells (Gibson 1998,
     "Constrained elastic surface nets", without the relaxation). Closed if the border is negative.
 
     Args:

@@ -1,4 +1,4 @@
-"""A package's avatar as a mesh that other programs move: vertices, colours, skinning weights."""
+"""A package's avatar as a mesh that other programs move: vertices, colors, skinning weights."""
 
 from dataclasses import dataclass
 
@@ -27,11 +27,11 @@ MIN_VOLUME_FRACTION = 0.002
 NORMAL_SMOOTHINGS = 6
 """How often normals are averaged over neighbours: a trained field is never quite smooth."""
 COLOR_STEP_M, COLOR_DEPTH_M = 0.002, 0.03
-"""A vertex has the colour of a ray that enters there: its steps, and how deep it goes."""
+"""A vertex has the color of a ray that enters there: its steps, and how deep it goes."""
 COLOR_LEAD_M = 0.004
 """How far outside of the surface that ray begins."""
 MIN_COLOR_ALPHA = 0.2
-"""Alpha below which a vertex has no colour of its own but its neighbour's."""
+"""Alpha below which a vertex has no color of its own but its neighbour's."""
 JOINTS_PER_VERTEX = 4
 """Joints that move a vertex: what importers can be relied on to read."""
 
@@ -111,7 +111,7 @@ def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z
 def skinning_weights(
     tables: PlayerTables, points: Float32[np.ndarray, "points 3"]
 ) -> Float32[np.ndarray, "points 24"]:
-    """Weights of the joints at points near the hull; rows sum to 1.
+    """Weights of the joints at points near the surface; rows sum to 1.
 
     Trilinear between the skin's nodes; where none is stored about a point, the nearest one's.
     """
@@ -134,7 +134,7 @@ def skinning_weights(
 def _dense_grid(
     bricks: BrickTable,
 ) -> tuple[UInt8[np.ndarray, "x y z 4"], Float32[np.ndarray, "3"]]:
-    """The lattice round all bricks, with an empty border, and where its first node lies."""
+    """The grid round all bricks, with an empty border, and where its first node lies."""
     blocks = np.argwhere(bricks.index > 0)
     first, last = blocks.min(axis=0), blocks.max(axis=0)
     counts = (last - first + 1) * BRICK_SIZE

@@ -133,11 +133,11 @@ def _nodes_of_complete_cells(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarr
 
 
 def graph_initializers(
-    tables: PlayerTables, rules: RenderSettings
+    tables: PlayerTables, settings: RenderSettings
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Every table of the graph that draws by these rules, by its name."""
+    """Every table of the graph that draws by these settings, by its name."""
     surfels, bricks = tables.surfels, tables.bricks
-    nodes = skinning_nodes(tables.skinning, rules.skinning_subdivision)
+    nodes = skinning_nodes(tables.skinning, settings.skinning_subdivision)
     voxels = bricks.voxels.reshape(-1, 4)
     red, green, blue = (voxels[:, channel].astype(np.int32) for channel in range(3))
     columns = {

@@ -14,14 +14,7 @@ from export.package.render_settings import RenderSettings
 from export.package.table_codec import TableLayout
 from preprocess.body.body_pose import BodyPose
 
-FORMAT_VERSION = 3
-OPTIONAL_SETTINGS = {
-    "other_sheet_gap_m",
-    "max_compression",
-    "fold_volume_ratio",
-    "fold_depth_offset_m",
-}
-"""What the first packages of this format do not have: then it is as it always was."""
+FORMAT_VERSION = 4
 MAX_GOLDEN_PX = 128
 """Golden frames are no longer than this along either side."""
 JOINT_NAMES = (
@@ -38,7 +31,7 @@ CONVENTIONS = {
     "picture": "RGBA, 8 bits, straight alpha",
 }
 LICENCE_NOTE = (
-    "A likeness of a person: use it only as that person allows. It is neither the body model's "
+    "A difference of a person: use it only as that person allows. It is neither the body model's "
     "data nor code; the rights in it are those of the recording it was learnt from."
 )
 Record = TypeVar("Record")
@@ -50,9 +43,9 @@ class TierInfo:
 
     Attributes:
         layout: Sizes and scales of what it draws; that of "hq" says how the streams are read.
-        rules: How it is drawn.
+        settings: How it is drawn.
         psnr_to_renderer: Against the volume renderer, dB.
-        largest_difference: Between graph and twin, in 1/255, over the golden frames.
+        largest_difference: Between graph and reference, in 1/255, over the golden frames.
     """
 
     layout: TableLayout
@@ -200,8 +193,6 @@ def _parse_record(kind: type[Record], values: dict[str, Any]) -> Record:
     """A record of numbers and of tuples of three numbers."""
     content: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
-        if field.name in OPTIONAL_SETTINGS and field.name not in values:
-            continue
         value, whole = values[field.name], "int" in str(field.type)
         if "tuple" in str(field.type):
             content[field.name] = tuple(_parse_number(v, whole) for v in value)

@@ -1,4 +1,4 @@
-"""What a bake leaves: hull surfels, sparse bricks and a skin, as the small integers stored."""
+"""What a bake leaves: surface surfels, sparse bricks and a skin, as the small integers stored."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ DEPTH_CODES = 1 << (31 - SURFEL_BITS)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurfelTable:
-    """Points of the hull, just outside of what can be seen, in canonical space.
+    """Points of the surface, just outside of what can be seen, in canonical space.
 
     Attributes:
         low: Corner of the position codes' cube, metres.
@@ -31,7 +31,7 @@ class SurfelTable:
         spacing_m: About how far neighbours lie apart.
         position_codes: Sorted along a Morton curve.
         normal_codes: Outward unit normals × 127.
-        thickness_codes: How deep one sees into the hull along the normal, in half millimetres.
+        thickness_codes: How deep one sees into the surface along the normal, in half millimetres.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -64,12 +64,12 @@ class SurfelTable:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BrickTable:
-    """Color and log-density on a voxel lattice, stored only near the surface.
+    """Color and log-density on a voxel grid, stored only near the surface.
 
-    Lattice node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
+    Grid node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
 
     Attributes:
-        low: Corner of the lattice, canonical metres.
+        low: Corner of the grid, canonical metres.
         voxel_m: Distance between nodes.
         index: Which brick covers each 8×8×8 block of nodes; 0 is the empty one.
         voxels: RGB and log-density codes of each brick's 9×9×9 nodes.
@@ -110,7 +110,7 @@ class PlayerTables:
     """Everything that a tier of the player draws.
 
     Attributes:
-        surfels: The hull.
+        surfels: The surface.
         bricks: What is inside.
         skin: What moves it.
         pelvis: Rest pelvis in canonical space, metres: the middle of the depth window.

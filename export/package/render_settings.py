@@ -1,94 +1,94 @@
-"""How an avatar is drawn from its tables: the numbers that the graph and its twin share.
-
-The qualities in which one set of tables is drawn.
-"""
+"""Numbers that the player's graph and its reference share, and the quality tiers made of them."""
 
 from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """The rules of one tier.
-
-    Attributes:
-        layers: Depth layers, at least 1.
-        samples: Samples along `sample_span_m` of a ray, unless the player asks for another number.
-        sample_span_m: Metres; samples lie `sample_span_m / samples` apart, and closer where a ray ends.
-        block: Samples between two corrections of a ray's canonical path.
-        steady: So many blocks have steps of that length; each further block has twice the steps
-            of the one before it.
-        skinning_subdivision: In how many parts, 1 or 2, a step of the skin is cut along each axis:
-            posed positions are taken as linear between the nodes.
-        blocks: At most so many; the last one takes what is left of a ray. Where the player asks for
-            more samples, steady and other blocks are so many times more.
-        further_layer_samples: Samples of a ray in each further layer, all at once.
-        max_compression: Compression of canonical space along a ray (canonical metres a metre) up to
-            which steps and `max_entry_margin_m` are as stated; beyond it both shrink in proportion, except
-            in the last block, and a segment is not shortened any further.
-        max_correction_m: No correction is longer than this.
-        ended: A ray ends where less than this share of the light is left.
-        max_footprint_px: Surfels cover at most so many pixels along x and y.
-        footprint_spacings: A footprint's size in surfel spacings at the nearest surfel's depth.
-        entry_margin_m, max_entry_margin_m: How far in front of the hull a ray's segment begins, along the
-            normal, and at most along the ray.
-        slack_m: How far the segment's begin may lie from the surfel, along the ray.
-        grazing: How much longer a segment is where the ray grazes the hull (× sin²).
-        steepest: Least cosine between ray and normal that lengthens a segment.
-        lengthened: A segment is at most so many times as long as the hull is thick there.
-        max_segment_m: Longest segment, metres.
-        stretch: Where the derivative's determinant is outside of (1/stretch, stretch), the skin is
-            folded: surfels are looked at along their normals, and paths not corrected.
-        fold_volume_ratio: Ratio of posed to canonical volume about a surfel below which the surfel counts
-            as folded; negative ratios are inside out.
-        fold_depth_offset_m: Folded surfels are put this much deeper into the z-buffer, so that a
-            neighbour, whose inverse is better conditioned, is drawn instead; 0 turns it off.
-        hole_depth_m: A pixel that opposite ones, a footprint away, overtop by this much is a hole, and
-            filled.
-        layer_gap_m: Surfels of a further layer lie at least this far behind those of the one before it.
-        other_sheet_gap_m: The same of surfels of another sheet; below 0 they may lie before. Where two
-            limbs touch, each lies within the other's border. No less than `layer_gap_m` turns it off.
-        same_sheet_m, same_sheet_ratio: Where two layers' surfels are no farther apart in canonical space
-            than this, and so many times as far as in the camera's, they belong to one sheet: the
-            second ray begins where the first one ends.
-        facing: Least cosine with which a surfel of a further layer faces the camera.
-        transmitted: Least light that is left, that a further layer is drawn for.
-        nearest_m: Nearer surfels are not drawn.
-    """
+    """How one tier draws the tables. The names are keys of manifest.json."""
 
     layers: int = 2
+    """Depth layers of surfels, at least 1."""
+
+    # Samples along a ray
     samples: int = 10
+    """Density samples along `sample_span_m`, unless `Player.render` is given another number."""
     sample_span_m: float = 0.05
+    """Length that `samples` refers to, metres."""
     block_samples: int = 3
+    """Density samples in a block; a ray has one color sample and one Newton step per block."""
     uniform_blocks: int = 3
-    skinning_subdivision: int = 2
+    """Blocks at the nominal spacing; each later block doubles the spacing of the one before."""
     max_blocks: int = 6
+    """Blocks per ray; the last covers what remains. Both counts scale with the number of samples."""
     further_layer_samples: int = 6
-    max_correction_m: float = 0.01
+    """Density samples of a ray in each layer after the first, in a single block."""
     min_transmittance: float = 0.01
-    max_footprint_px: int = 64
-    footprint_spacings: float = 1.1
-    entry_margin_m: float = 0.004
-    max_entry_margin_m: float = 0.025
-    max_entry_shift_m: float = 0.02
-    grazing_factor: float = 1.5
-    min_cosine: float = 0.1
-    max_lengthening: float = 5.0
-    max_segment_m: float = 0.15
-    max_volume_ratio: float = 10.0
-    hole_depth_m: float = 0.025
-    layer_gap_m: float = 0.01
-    same_sheet_m: float = 0.01
-    same_sheet_ratio: float = 1.25
-    min_facing_cosine: float = 0.2
-    layer_min_transmittance: float = 0.02
-    near_plane_m: float = 0.1
-    other_sheet_gap_m: float = 0.01
+    """Stop a ray of the first layer below this transmittance."""
+    skinning_subdivision: int = 2
+    """Parts, 1 or 2, into which a step of the skinning grid is cut; positions are linear within."""
+    max_correction_m: float = 0.01
+    """Longest Newton step of a ray's canonical position, metres."""
     max_compression: float = 1e9
+    """Canonical metres per metre along a ray above which spacing and `max_entry_margin_m` shrink in
+    proportion, except in the last block; a segment is shortened by no larger factor."""
+
+    # Footprints in the z-buffer
+    max_footprint_px: int = 64
+    """Longest edge of a surfel's square footprint, pixels."""
+    footprint_spacings: float = 1.1
+    """Edge of a footprint at the nearest surfel's depth, in surfel spacings."""
+    hole_depth_m: float = 0.025
+    """Fill a pixel that opposite ones, a footprint away, overtop by this depth, metres."""
+    near_plane_m: float = 0.1
+    """Least depth of a surfel that is drawn, metres."""
+
+    # Where a ray enters and leaves
+    entry_margin_m: float = 0.004
+    """Begin a segment this far in front of the surface along its normal, metres …"""
+    max_entry_margin_m: float = 0.025
+    """… and at most this far along the ray, metres."""
+    max_entry_shift_m: float = 0.02
+    """Longest distance along the ray between the surfel and the surface point it stands for, metres."""
+    grazing_factor: float = 1.5
+    """Relative lengthening of a segment at grazing incidence (× sin²)."""
+    min_cosine: float = 0.1
+    """Least cosine between ray and normal by which a segment is lengthened."""
+    max_lengthening: float = 5.0
+    """Longest segment in units of the surface's thickness there."""
+    max_segment_m: float = 0.15
+    """Longest segment, metres."""
+
+    # Folded skin
+    max_volume_ratio: float = 10.0
+    """Where the Jacobian's determinant is outside (1 / ratio, ratio), do not invert it: look at the
+    surfel along its normal and leave the path uncorrected."""
     fold_volume_ratio: float = 0.3
+    """Posed over canonical volume below which a surfel counts as folded; negative is inside out."""
     fold_depth_offset_m: float = 0.0
+    """Put folded surfels this much deeper into the z-buffer, metres, so that a neighbor with a better
+    conditioned inverse is drawn instead; 0 disables it."""
+
+    # Layers after the first
+    layer_gap_m: float = 0.01
+    """Least depth between surfels of consecutive layers, metres."""
+    other_sheet_gap_m: float = 0.01
+    """Least depth between surfels of different sheets, metres; negative allows overlap where limbs
+    touch, and `layer_gap_m` or more disables the distinction."""
+    same_sheet_m: float = 0.01
+    """Surfels of two layers belong to one sheet where their canonical distance is below
+    `same_sheet_ratio` × posed distance + `same_sheet_m` (metres): the second ray then begins where
+    the first ends."""
+    same_sheet_ratio: float = 1.25
+    """Factor of the posed distance in that test."""
+    min_facing_cosine: float = 0.2
+    """Least cosine with which a surfel of a further layer faces the camera."""
+    layer_min_transmittance: float = 0.02
+    """Least transmittance for which a further layer is drawn."""
 
 
 HQ_SETTINGS = RenderSettings(max_compression=1.0, fold_depth_offset_m=0.02)
+"""Settings of the tier that every package has."""
 QUALITY_TIERS = {
     "hq": HQ_SETTINGS,
     "lite": replace(
@@ -104,4 +104,4 @@ QUALITY_TIERS = {
         layer_min_transmittance=0.15,
     ),
 }
-"""How each is drawn; "hq" comes first."""
+"""Settings by tier; "hq" comes first."""

@@ -32,7 +32,7 @@ class TableLayout:
         surfels: How many there are.
         surfel_low, surfel_extent_m, surfel_spacing_m: As in `Surfels`.
         bricks: How many there are, without the empty one.
-        brick_counts: Blocks of the lattice along x, y, z.
+        brick_counts: Blocks of the grid along x, y, z.
         brick_low, voxel_m: As in `BrickTable`.
         skin_nodes: How many nodes of the skin are stored.
         skin_counts: Nodes of its grid along x, y, z.

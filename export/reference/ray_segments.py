@@ -1,4 +1,4 @@
-"""Where the player's samples lie in the bricks, whatever these hold: pieces of rays."""
+"""Where the player samples the bricks along each ray, whatever the bricks hold."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -8,98 +8,116 @@ from jaxtyping import Float32, Int32, Int64
 
 from export.package.player_tables import BrickTable
 from export.package.render_settings import RenderSettings
-from export.reference.reference_march import (
+from export.reference.reference_skinning import (
     CanonicalRays,
     PosedNodes,
-    max_sample_spacing,
+    compression_factor,
     newton_correction,
 )
-from export.reference.reference_player import TracedPicture
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RaySegments:
-    """Blocks of samples along rays, as `twin_march.march` follows those that never end.
+    """Blocks of equidistant samples along rays, each ray's in the order in which light passes them.
 
     Attributes:
-        first: The first piece of each ray, in the order in which light passes them; and the end.
-        start: Where pieces begin, in voxels of the lattice.
+        ray_offsets: First segment of each ray, and the number of segments.
+        start: Begin of each segment, in voxels of the brick grid.
         slope: Voxels from one sample to the next.
-        step_m: The same along the ray, metres.
+        step_m: Metres from one sample to the next along the ray.
         count: Samples.
         layer: Depth layer, from 0.
     """
 
     ray_offsets: Int64[np.ndarray, "rays_and_one"]
-    start: Float32[np.ndarray, "pieces 3"]
-    slope: Float32[np.ndarray, "pieces 3"]
-    step_m: Float32[np.ndarray, "pieces"]
-    count: Int32[np.ndarray, "pieces"]
-    layer: Int32[np.ndarray, "pieces"]
+    start: Float32[np.ndarray, "segments 3"]
+    slope: Float32[np.ndarray, "segments 3"]
+    step_m: Float32[np.ndarray, "segments"]
+    count: Int32[np.ndarray, "segments"]
+    layer: Int32[np.ndarray, "segments"]
 
     @property
     def num_rays(self) -> int:
-        """How many there are."""
+        """Number of rays, with segments or without."""
         return len(self.ray_offsets) - 1
 
     @classmethod
     def of_first_layer(
-        cls, rays: CanonicalRays, posed: PosedNodes, bricks: BrickTable, rules: RenderSettings
+        cls,
+        rays: CanonicalRays,
+        posed: PosedNodes,
+        bricks: BrickTable,
+        settings: RenderSettings,
+        samples: int,
     ) -> "RaySegments":
-        """The first layer's, of these rays in their order."""
-        blocks = list(_march_blocks(rays, posed, rules))
+        """March the first layer's rays to their ends, as if none ever became opaque.
+
+        Args:
+            rays: One for each covered pixel.
+            posed: Skinning nodes in this pose.
+            bricks: Whose voxels the samples address.
+            settings: Spacing and number of blocks.
+            samples: Density samples along `RenderSettings.sample_span_m`.
+        """
+        blocks = list(_march_blocks(rays, posed, settings, samples))
         number = np.concatenate([ray for ray, _, _ in blocks])
+        rest = CanonicalRays(*map(np.concatenate, zip(*(b[1] for b in blocks), strict=True)))
         step_m = np.concatenate([step for _, _, step in blocks])
-        start = np.concatenate([rest.start_canonical for _, rest, _ in blocks])
-        direction = np.concatenate([rest.direction_canonical for _, rest, _ in blocks])
-        return cls._grouped_by_ray(
-            number, len(rays.begin), bricks, start, direction, step_m, (rules.block_samples, 0)
+        order = np.argsort(number, kind="stable")
+        return cls._along(
+            CanonicalRays(*(part[order] for part in rest)),
+            step_m[order],
+            np.searchsorted(number[order], np.arange(len(rays.begin) + 1)).astype(np.int64),
+            bricks,
+            (settings.block_samples, 0),
         )
 
     @classmethod
     def of_further_layer(
-        cls, look: TracedPicture, number: int, bricks: BrickTable, rules: RenderSettings
-    ) -> "RaySegments":
-        """Those of a look's further layer: 1 for the first one behind."""
-        (again, rays), count = look.further_layers[number - 1], rules.further_layer_samples
-        step_m = (rays.end - rays.begin) / np.float32(count)
-        return cls._grouped_by_ray(
-            again,
-            len(look.pixel),
-            bricks,
-            rays.start_canonical,
-            rays.direction_canonical,
-            step_m,
-            (count, number),
-        )
-
-    @classmethod
-    def _grouped_by_ray(
         cls,
-        number: Int64[np.ndarray, "pieces"],
-        rays: int,
+        rays: CanonicalRays,
+        ray_index: Int64[np.ndarray, "rays"],
+        num_rays: int,
         bricks: BrickTable,
-        start: Float32[np.ndarray, "pieces 3"],
-        direction: Float32[np.ndarray, "pieces 3"],
-        step_m: Float32[np.ndarray, "pieces"],
         count_and_layer: tuple[int, int],
     ) -> "RaySegments":
-        """Ray by ray; the pieces of each stay in their order."""
-        order, voxel_m = np.argsort(number, kind="stable"), np.float32(bricks.voxel_m)
-        count, layer = count_and_layer
+        """Make one segment for each ray of a further layer.
+
+        Args:
+            rays: The layer's rays.
+            ray_index: Ray of the first layer that each belongs to, ascending.
+            num_rays: Rays of the first layer.
+            bricks: Whose voxels the samples address.
+            count_and_layer: Samples of a segment, and the layer's number, from 1.
+        """
+        step_m = (rays.end - rays.begin) / np.float32(count_and_layer[0])
+        offsets = np.searchsorted(ray_index, np.arange(num_rays + 1)).astype(np.int64)
+        return cls._along(rays, step_m, offsets, bricks, count_and_layer)
+
+    @classmethod
+    def _along(
+        cls,
+        rays: CanonicalRays,
+        step_m: Float32[np.ndarray, "segments"],
+        ray_offsets: Int64[np.ndarray, "rays_and_one"],
+        bricks: BrickTable,
+        count_and_layer: tuple[int, int],
+    ) -> "RaySegments":
+        """Express segments, which are grouped by ray already, in voxels of the brick grid."""
+        (count, layer), voxel_m = count_and_layer, np.float32(bricks.voxel_m)
         return cls(
-            ray_offsets=np.searchsorted(number[order], np.arange(rays + 1)).astype(np.int64),
-            start=((start - bricks.low) / voxel_m)[order],
-            slope=(direction * (step_m / voxel_m)[:, None])[order],
-            step_m=step_m[order],
-            count=np.full(len(number), count, dtype=np.int32),
-            layer=np.full(len(number), layer, dtype=np.int32),
+            ray_offsets=ray_offsets,
+            start=(rays.start_canonical - bricks.low) / voxel_m,
+            slope=rays.direction_canonical * (step_m / voxel_m)[:, None],
+            step_m=step_m,
+            count=np.full(len(step_m), count, dtype=np.int32),
+            layer=np.full(len(step_m), layer, dtype=np.int32),
         )
 
     def append_layer(self, behind: "RaySegments") -> "RaySegments":
-        """The same rays, with further pieces behind those that they have."""
+        """Append the segments of a layer behind to those of each ray."""
         rays = np.arange(self.num_rays)
-        owners = [np.repeat(rays, np.diff(pieces.ray_offsets)) for pieces in (self, behind)]
+        owners = [np.repeat(rays, np.diff(segments.ray_offsets)) for segments in (self, behind)]
         order = np.argsort(np.concatenate(owners), kind="stable")
         columns = {
             name: np.concatenate([getattr(self, name), getattr(behind, name)])[order]
@@ -109,37 +127,54 @@ class RaySegments:
 
     @classmethod
     def concatenate(cls, many: "Sequence[RaySegments]") -> "RaySegments":
-        """The rays of many looks, one after the other."""
-        offsets = np.cumsum([0, *(len(pieces.step_m) for pieces in many)])
-        starts = [pieces.ray_offsets[:-1] + o for pieces, o in zip(many, offsets[:-1], strict=True)]
+        """Concatenate the rays of several pictures."""
+        offsets = np.cumsum([0, *(len(segments.step_m) for segments in many)])
+        starts = [s.ray_offsets[:-1] + o for s, o in zip(many, offsets[:-1], strict=True)]
         columns = {
-            name: np.concatenate([getattr(pieces, name) for pieces in many])
+            name: np.concatenate([getattr(segments, name) for segments in many])
             for name in _SEGMENT_FIELDS
         }
         return cls(ray_offsets=np.concatenate([*starts, offsets[-1:]]), **columns)
 
 
 _SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "ray_offsets"]
-"""What there is one of for each piece."""
+"""Fields with one row per segment."""
 
 
 def _march_blocks(
-    rays: CanonicalRays, posed: PosedNodes, rules: RenderSettings
-) -> Iterator[tuple[Int64[np.ndarray, "pieces"], CanonicalRays, Float32[np.ndarray, "pieces"]]]:
-    """Numbers of rays, what is left of them, and the steps of their next block."""
+    rays: CanonicalRays, posed: PosedNodes, settings: RenderSettings, samples: int
+) -> Iterator[tuple[Int64[np.ndarray, "segments"], CanonicalRays, Float32[np.ndarray, "segments"]]]:
+    """Yield, block by block, the numbers of unfinished rays, what is left of them, and their step."""
     number, rest = np.arange(len(rays.begin)), rays
-    for turn in range(rules.max_blocks):
+    for turn in range(settings.max_blocks * _block_multiple(settings, samples)):
         if turn > 0:
-            rest = newton_correction(rules, posed, rest)
+            rest = newton_correction(settings, posed, rest)
         step_m = np.minimum(
-            (rest.end - rest.begin) / np.float32(rules.block_samples),
-            max_sample_spacing(rules, rules.samples, turn, rest),
+            (rest.end - rest.begin) / np.float32(settings.block_samples),
+            _max_sample_spacing(settings, samples, turn, rest),
         )
         yield number, rest, step_m
-        way = step_m * np.float32(rules.block_samples)
+        length = step_m * np.float32(settings.block_samples)
         rest = rest._replace(
-            begin=rest.begin + way,
-            start_canonical=rest.start_canonical + rest.direction_canonical * way[:, None],
+            begin=rest.begin + length,
+            start_canonical=rest.start_canonical + rest.direction_canonical * length[:, None],
         )
         going = rest.begin < rest.end - 1e-5
         number, rest = number[going], CanonicalRays(*(part[going] for part in rest))
+
+
+def _block_multiple(settings: RenderSettings, samples: int) -> int:
+    """Factor on both counts of blocks where more samples than usual are asked for."""
+    return -(-samples // settings.samples)
+
+
+def _max_sample_spacing(
+    settings: RenderSettings, samples: int, turn: int, rays: CanonicalRays
+) -> Float32[np.ndarray, "rays"]:
+    """Upper bound on the distance between samples in the rays' `turn`-th block, metres."""
+    multiple = _block_multiple(settings, samples)
+    if turn > 0 and turn == settings.max_blocks * multiple - 1:
+        return np.full(len(rays.begin), settings.max_segment_m, dtype=np.float32)
+    doublings = max(0, turn + 1 - settings.uniform_blocks * multiple)
+    nominal = settings.sample_span_m / samples * 2.0**doublings
+    return np.float32(nominal) * compression_factor(settings, rays.direction_canonical)

@@ -1,10 +1,12 @@
-"""The player's picture computed in plain numpy: what the graph means, and its test.
+"""The player's picture in numpy: the reference that the ONNX graph is checked against.
 
-Written after the tables and the rules alone, with arrays of vectors and numpy's own inverse; it
-shares no code with the graph.
+    traced = trace_picture(tables, codes, settings, inputs)         # rays, as segments of samples
+    colors = composite_segments(traced.segments, settings, tables.bricks, codes)
+
+It is written from the tables and the settings alone, with arrays of vectors and numpy's own inverse,
+and shares no code with the graph.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,31 +16,29 @@ from jaxtyping import Bool, Float32, Int64
 from export.package.graph_tables import skinning_nodes
 from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables
 from export.package.render_settings import RenderSettings
-from export.reference.reference_march import (
+from export.reference.compositor import VoxelCodes, composite_segments
+from export.reference.ray_segments import RaySegments
+from export.reference.reference_skinning import (
     CanonicalRays,
     PosedNodes,
-    composite_block,
     compression_factor,
-    march_rays,
     skin_tetrahedral,
     skin_trilinear,
 )
 
 EMPTY_PIXEL_KEY = 2**31 - 1
-
-FirstLayerCompositor = Callable[[PosedNodes, CanonicalRays], Float32[np.ndarray, "rays 4"]]
-"""Premultiplied colour and alpha of the first layer's rays."""
+"""Z-buffer key of a pixel that no surfel covers."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlayerInputs:
-    """What the graph is given besides the tables.
+    """Inputs of the graph besides the tables.
 
     Attributes:
         bones: Camera-from-canonical matrices.
         focal, center: Pixels.
         size_px: Width and height.
-        samples: Along the rules' `sample_span_m` of each ray.
+        samples: Density samples along `RenderSettings.sample_span_m` of each ray.
     """
 
     bones: Float32[np.ndarray, "24 3 4"]
@@ -48,12 +48,27 @@ class PlayerInputs:
     samples: int
 
 
+class TracedPicture(NamedTuple):
+    """Where a picture's rays sample the bricks.
+
+    Attributes:
+        pixel: Numbers of the covered pixels, ascending.
+        segments: Their rays, through all layers.
+    """
+
+    pixel: Int64[np.ndarray, "pixels"]
+    segments: RaySegments
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _PosedSurface:
-    """The skin and, linear in tetrahedra, the hull in the camera's frame.
+    """Skinning nodes and, linear in tetrahedra, surfels in the camera's frame.
 
-    `facing` is the ray to each surfel along its normal in canonical space, negative where it faces
-    the camera; `volume` the ratio of posed to canonical volume, negative where it is inside out.
+    Attributes:
+        nodes: Posed nodes of the skinning grid.
+        positions: Surfels in the camera's frame, metres.
+        facing: Canonical ray to each surfel times its normal; negative where it faces the camera.
+        volume: Posed over canonical volume, negative where it is inside out.
     """
 
     nodes: PosedNodes
@@ -62,150 +77,161 @@ class _PosedSurface:
     volume: Float32[np.ndarray, "surfels"]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _PreviousLayer:
-    """What a layer saw at the next one's pixels: its surfels, and where its rays ended."""
+class _Splats(NamedTuple):
+    """Surfels' footprints, one row for each cell that one covers.
 
-    surfel: Int64[np.ndarray, "pixels"]
+    Attributes:
+        side: Edge of a footprint, pixels.
+        cell: Cells, numbered in a picture with a margin of `side` pixels.
+        key: Z-buffer keys.
+        depth: Depths of surfels that may form a further layer, metres; 0 for the others.
+    """
+
+    side: int
+    cell: Int64[np.ndarray, "splats"]
+    key: Int64[np.ndarray, "splats"]
+    depth: Float32[np.ndarray, "splats"]
+
+
+@dataclass(eq=False, kw_only=True)
+class _FrontLayer:
+    """What the next layer has to know of the layers before it, for each covered pixel.
+
+    Attributes:
+        transmittance: Fraction of light that is left.
+        depth: Depth at which the last ray entered the surface, metres.
+        end: End of the last ray, metres along it.
+        surfel: The last layer's surfel.
+    """
+
+    transmittance: Float32[np.ndarray, "pixels"]
+    depth: Float32[np.ndarray, "pixels"]
     end: Float32[np.ndarray, "pixels"]
+    surfel: Int64[np.ndarray, "pixels"]
 
-
-class FurtherLayer(NamedTuple):
-    """A further layer.
-
-    Attributes:
-        again: Which of the first layer's rays have it, ascending.
-        rays: Theirs.
-    """
-
-    ray_index: Int64[np.ndarray, "rays"]
-    rays: CanonicalRays
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TracedPicture:
-    """Where a picture's rays go through canonical space, and what the first layer shows.
-
-    Attributes:
-        pixel: Numbers of the covered pixels, ascending.
-        nodes: The skin in this pose.
-        first: Their rays.
-        seen: What these show: premultiplied colour and alpha.
-        behind: The further layers.
-    """
-
-    pixel: Int64[np.ndarray, "pixels"]
-    nodes: PosedNodes
-    first_rays: CanonicalRays
-    first_colors: Float32[np.ndarray, "pixels 4"]
-    further_layers: tuple[FurtherLayer, ...]
+    def of(self, ray: Int64[np.ndarray, "rays"]) -> "_FrontLayer":
+        """Select some pixels."""
+        return _FrontLayer(
+            transmittance=self.transmittance[ray],
+            depth=self.depth[ray],
+            end=self.end[ray],
+            surfel=self.surfel[ray],
+        )
 
 
 def draw_reference(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs
 ) -> Float32[np.ndarray, "height width 4"]:
-    """Premultiplied colour and alpha in [0, 1]."""
+    """Return premultiplied color and alpha in [0, 1]."""
     width, height = inputs.size_px
-    look = trace_picture(tables, settings, inputs)
-    seen = look.first_colors.copy()
-    for again, rays in look.further_layers:
-        seen[again] += _composite_further_layer(tables, settings, rays) * (1.0 - seen[again, 3:])
+    codes = VoxelCodes.of(tables.bricks)
+    traced = trace_picture(tables, codes, settings, inputs)
     picture = np.zeros((width * height, 4), dtype=np.float32)
-    picture[look.pixel] = seen
+    picture[traced.pixel] = composite_segments(traced.segments, settings, tables.bricks, codes)
     return picture.reshape(height, width, 4)
 
 
-def _composite_further_layer(
-    tables: PlayerTables, rules: RenderSettings, rays: CanonicalRays
-) -> Float32[np.ndarray, "rays 4"]:
-    """What rays of a further layer show."""
-    ones = np.ones(len(rays.begin))
-    return composite_block(tables.bricks, rays, ones, rules.further_layer_samples, np.inf).colors
-
-
 def trace_picture(
-    tables: PlayerTables,
-    settings: RenderSettings,
-    inputs: PlayerInputs,
-    composite_first: FirstLayerCompositor | None = None,
+    tables: PlayerTables, codes: VoxelCodes, settings: RenderSettings, inputs: PlayerInputs
 ) -> TracedPicture:
-    """Finds the rays of all layers.
+    """Find the segments of all layers' rays.
 
     Args:
         tables: What is drawn.
-        rules: How.
-        shot: From where, in which pose.
-        marched: What the first layer's rays show, if not by `twin_march.march`.
+        codes: Voxel codes of `tables.bricks`; pixels have further layers where they let light pass.
+        settings: How it is drawn.
+        inputs: The pose, the camera and the number of samples.
     """
-    width, height = inputs.size_px
     posed = _pose_surface(tables, settings, inputs)
-    side = _footprint_px(tables, settings, inputs, posed)
-    cell, key, deep_enough = _splat_surfels(tables, settings, inputs, posed, side)
-    cells = (height + 2 * side, width + 2 * side)  # the picture and its surroundings
-    buffer = np.full(cells, EMPTY_PIXEL_KEY, dtype=np.int64)
-    np.minimum.at(buffer.reshape(-1), cell, key)
-    filled = _fill_holes(buffer, tables, settings, side).ravel()
+    splats = _splat_surfels(tables, settings, inputs, posed)
+    filled = _fill_holes(_z_buffer(inputs, splats), tables, settings, splats.side).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
-    first, depth = _ray_entries(tables, settings, inputs, posed, covered, filled[covered], None)
-    if composite_first is None:
-        seen = march_rays(tables.bricks, settings, posed.nodes, first, inputs.samples)
-    else:
-        seen = composite_first(posed.nodes, first)
-    behind = list[FurtherLayer]()
-    light, end, keys = 1.0 - seen[:, 3], first.end.copy(), filled[covered]
-    again = np.arange(len(covered))
-    while len(behind) < settings.layers - 1:
-        again = again[light[again] > settings.layer_min_transmittance]
-        limit = np.full((height, width), 1e6, dtype=np.float32)
-        limit.reshape(-1)[covered[again]] = depth[again] + np.float32(settings.layer_gap_m)
-        limits = np.pad(limit, side, constant_values=1e6).reshape(-1)[cell]
-        there = deep_enough > limits
-        if settings.other_sheet_gap_m < settings.layer_gap_m:
-            passed = np.zeros((height, width), dtype=np.int64)
-            passed.reshape(-1)[covered[again]] = _surfel_of_key(keys[again])
-            limits -= np.float32(settings.layer_gap_m - settings.other_sheet_gap_m)
-            near = np.flatnonzero(~there & (deep_enough > limits))
-            before = np.pad(passed, side).reshape(-1)[cell[near]]
-            there[near] = ~_one_sheet(
-                settings, tables, posed.positions, _surfel_of_key(key[near]), before
-            )
-        buffer = np.full(cells, EMPTY_PIXEL_KEY, dtype=np.int64)
-        np.minimum.at(buffer.reshape(-1), cell[there], key[there])
-        found = buffer[side:-side, side:-side].ravel()[covered]
-        again = np.flatnonzero(found < EMPTY_PIXEL_KEY)
-        before = _PreviousLayer(surfel=_surfel_of_key(keys[again]), end=end[again])
-        rays, entered = _ray_entries(
-            tables, settings, inputs, posed, covered[again], found[again], before
-        )
-        behind.append(FurtherLayer(again, rays))
-        light[again] *= 1.0 - _composite_further_layer(tables, settings, rays)[:, 3]
-        depth[again], end[again], keys[again] = entered, rays.end, found[again]
-    return TracedPicture(
-        pixel=covered,
-        nodes=posed.nodes,
-        first_rays=first,
-        first_colors=seen,
-        further_layers=tuple(behind),
+    key = filled[covered]
+    rays, depth = _ray_entries(tables, settings, inputs, posed, covered, key, None)
+    segments = RaySegments.of_first_layer(
+        rays, posed.nodes, tables.bricks, settings, inputs.samples
     )
+    alpha = composite_segments(segments, settings, tables.bricks, codes)[:, 3]
+    front = _FrontLayer(
+        transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=_surfel_of_key(key)
+    )
+    alive = np.arange(len(covered))
+    for layer in range(1, settings.layers):
+        alive = alive[front.transmittance[alive] > settings.layer_min_transmittance]
+        key = _keys_behind(tables, settings, inputs, posed, splats, covered[alive], front.of(alive))
+        key = key[covered]
+        alive = np.flatnonzero(key < EMPTY_PIXEL_KEY)
+        rays, depth = _ray_entries(
+            tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive)
+        )
+        behind = RaySegments.of_further_layer(
+            rays, alive, len(covered), tables.bricks, (settings.further_layer_samples, layer)
+        )
+        alpha = composite_segments(behind, settings, tables.bricks, codes)[:, 3]
+        front.transmittance *= 1.0 - alpha
+        front.depth[alive], front.end[alive] = depth, rays.end
+        front.surfel[alive] = _surfel_of_key(key[alive])
+        segments = segments.append_layer(behind)
+    return TracedPicture(covered, segments)
+
+
+def _z_buffer(
+    inputs: PlayerInputs, splats: _Splats, chosen: Bool[np.ndarray, "splats"] | None = None
+) -> Int64[np.ndarray, "rows columns"]:
+    """Return the least key of every cell, of some splats or of all."""
+    (width, height), margin = inputs.size_px, 2 * splats.side
+    buffer = np.full((height + margin, width + margin), EMPTY_PIXEL_KEY, dtype=np.int64)
+    where = slice(None) if chosen is None else chosen
+    np.minimum.at(buffer.reshape(-1), splats.cell[where], splats.key[where])
+    return buffer
+
+
+def _keys_behind(
+    tables: PlayerTables,
+    settings: RenderSettings,
+    inputs: PlayerInputs,
+    posed: _PosedSurface,
+    splats: _Splats,
+    pixel: Int64[np.ndarray, "pixels"],
+    front: _FrontLayer,
+) -> Int64[np.ndarray, "all_pixels"]:
+    """Return every pixel's key in a z-buffer of surfels far enough behind the layer in front."""
+    (width, height), side = inputs.size_px, splats.side
+    limit = np.full((height, width), 1e6, dtype=np.float32)
+    limit.reshape(-1)[pixel] = front.depth + np.float32(settings.layer_gap_m)
+    limits = np.pad(limit, side, constant_values=1e6).reshape(-1)[splats.cell]
+    behind = splats.depth > limits
+    if settings.other_sheet_gap_m < settings.layer_gap_m:
+        passed = np.zeros((height, width), dtype=np.int64)
+        passed.reshape(-1)[pixel] = front.surfel
+        limits -= np.float32(settings.layer_gap_m - settings.other_sheet_gap_m)
+        near = np.flatnonzero(~behind & (splats.depth > limits))
+        before = np.pad(passed, side).reshape(-1)[splats.cell[near]]
+        behind[near] = ~_one_sheet(
+            settings, tables, posed.positions, _surfel_of_key(splats.key[near]), before
+        )
+    return _z_buffer(inputs, splats, behind)[side:-side, side:-side].ravel()
 
 
 def _one_sheet(
-    rules: RenderSettings,
+    settings: RenderSettings,
     tables: PlayerTables,
     camera: Float32[np.ndarray, "surfels 3"],
     one: Int64[np.ndarray, "pairs"],
     other: Int64[np.ndarray, "pairs"],
 ) -> Bool[np.ndarray, "pairs"]:
-    """Whether pairs of surfels are no farther apart in canonical space than as they are posed."""
+    """Tell which pairs of surfels are about as close in canonical space as they are posed."""
     places = tables.surfels.positions
     apart = np.linalg.norm(places[one] - places[other], axis=1)
     posed = np.linalg.norm(camera[one] - camera[other], axis=1)
-    return apart < posed * rules.same_sheet_ratio + rules.same_sheet_m
+    return apart < posed * settings.same_sheet_ratio + settings.same_sheet_m
 
 
-def _pose_surface(tables: PlayerTables, rules: RenderSettings, shot: PlayerInputs) -> _PosedSurface:
-    nodes = skinning_nodes(tables.skinning, rules.skinning_subdivision)
-    blended = (nodes.weights.T @ shot.bones.reshape(24, 12)).reshape(-1, 3, 4)
+def _pose_surface(
+    tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs
+) -> _PosedSurface:
+    nodes = skinning_nodes(tables.skinning, settings.skinning_subdivision)
+    blended = (nodes.weights.T @ inputs.bones.reshape(24, 12)).reshape(-1, 3, 4)
     node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
     there = PosedNodes(nodes, node_camera)
     splatted, edges = skin_tetrahedral(there, tables.surfels.positions)
@@ -222,16 +248,16 @@ def _pose_surface(tables: PlayerTables, rules: RenderSettings, shot: PlayerInput
 
 
 def _inverse_skinning(
-    rules: RenderSettings, posed: _PosedSurface, points: Float32[np.ndarray, "points 3"]
+    settings: RenderSettings, posed: _PosedSurface, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[
     Float32[np.ndarray, "points 3"],
     Float32[np.ndarray, "points 3 3"],
     Bool[np.ndarray, "points"],
 ]:
-    """Where points are in the camera's frame, the inverse derivative, and where it is sound."""
+    """Return positions in the camera's frame, the inverse Jacobian, and where it is sound."""
     camera, derivative = skin_trilinear(posed.nodes, points)
     volume = np.linalg.det(derivative)
-    sound = (volume > 1 / rules.max_volume_ratio) & (volume < rules.max_volume_ratio)
+    sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
     inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
     return camera, inverse.astype(np.float32), sound
 
@@ -241,45 +267,43 @@ def _surfel_of_key(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixel
 
 
 def _project_surfels(
-    rules: RenderSettings, shot: PlayerInputs, posed: _PosedSurface, reach: float
+    settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface, reach: float
 ) -> tuple[Float32[np.ndarray, "surfels 2"], Bool[np.ndarray, "surfels"]]:
-    """Where surfels land, in pixels, and which of them are no farther than that outside."""
+    """Project surfels; tell which are at most `reach` pixels outside the picture."""
     depth = posed.positions[:, 2]
-    safe = np.maximum(depth, np.float32(rules.near_plane_m))[:, None]
-    place = posed.positions[:, :2] / safe * shot.focal + shot.center
-    within = (place > -reach).all(axis=1) & (place < np.array(shot.size_px) + reach).all(axis=1)
-    return place, within & (depth > rules.near_plane_m)
+    safe = np.maximum(depth, np.float32(settings.near_plane_m))[:, None]
+    place = posed.positions[:, :2] / safe * inputs.focal + inputs.center
+    within = (place > -reach).all(axis=1) & (place < np.array(inputs.size_px) + reach).all(axis=1)
+    return place, within & (depth > settings.near_plane_m)
 
 
 def _footprint_px(
-    tables: PlayerTables, rules: RenderSettings, shot: PlayerInputs, posed: _PosedSurface
+    tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
 ) -> int:
-    """Pixels along the edge of every footprint: a surfel spacing where they are nearest."""
-    _, near = _project_surfels(rules, shot, posed, 0.5 * rules.max_footprint_px)
+    """Return the edge of every footprint, pixels: a surfel spacing where they are nearest."""
+    _, near = _project_surfels(settings, inputs, posed, 0.5 * settings.max_footprint_px)
     if not near.any():
         return 2
-    spacing_px = shot.focal.max() * tables.surfels.spacing_m / posed.positions[near, 2].min()
-    side = int(np.floor(spacing_px * rules.footprint_spacings + 0.999))
-    return int(np.clip(side, 2, rules.max_footprint_px))
+    spacing_px = inputs.focal.max() * tables.surfels.spacing_m / posed.positions[near, 2].min()
+    side = int(np.floor(spacing_px * settings.footprint_spacings + 0.999))
+    return int(np.clip(side, 2, settings.max_footprint_px))
 
 
 def _splat_surfels(
-    tables: PlayerTables, rules: RenderSettings, shot: PlayerInputs, posed: _PosedSurface, side: int
-) -> tuple[Int64[np.ndarray, "splats"], Int64[np.ndarray, "splats"], Float32[np.ndarray, "splats"]]:
-    """Each visible surfel's cells with its key, and its depth if it may form the second layer.
-
-    Cells count the pixels of a picture with a footprint's width around it.
-    """
-    width, height = shot.size_px
-    place, seen = _project_surfels(rules, shot, posed, 0.5 * side)
+    tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
+) -> _Splats:
+    """Splat every visible surfel onto the cells of its footprint."""
+    side = _footprint_px(tables, settings, inputs, posed)
+    width, height = inputs.size_px
+    place, seen = _project_surfels(settings, inputs, posed, 0.5 * side)
     surfel = np.flatnonzero(seen)
     depth, place = posed.positions[surfel, 2], place[surfel]
-    faces = posed.facing[surfel] < -depth * rules.min_facing_cosine
-    near = shot.bones[0, 2, :3] @ tables.pelvis + shot.bones[0, 2, 3] - tables.reach_m
+    faces = posed.facing[surfel] < -depth * settings.min_facing_cosine
+    near = inputs.bones[0, 2, :3] @ tables.pelvis + inputs.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_CODES - 1)
     code = np.clip(code, 0, DEPTH_CODES - 1).astype(np.int64)
-    steps = int(rules.fold_depth_offset_m / (2.0 * tables.reach_m) * DEPTH_CODES)
-    folded = posed.volume[surfel] < rules.fold_volume_ratio
+    steps = int(settings.fold_depth_offset_m / (2.0 * tables.reach_m) * DEPTH_CODES)
+    folded = posed.volume[surfel] < settings.fold_volume_ratio
     code = np.where(folded, np.minimum(code + steps, DEPTH_CODES - 1), code)
     key = (code << SURFEL_BITS) | surfel
     deep_enough = np.where(faces, depth, np.float32(0.0))
@@ -290,66 +314,70 @@ def _splat_surfels(
     inside = (column >= 0) & (column < width + 2 * side) & (row >= 0) & (row < height + 2 * side)
     shape = inside.shape
     cell = (row * (width + 2 * side) + column)[inside]
-    return cell, np.broadcast_to(key, shape)[inside], np.broadcast_to(deep_enough, shape)[inside]
+    key, depth = (np.broadcast_to(part, shape)[inside] for part in (key, deep_enough))
+    return _Splats(side, cell, key, depth)
 
 
 def _fill_holes(
-    keys: Int64[np.ndarray, "rows columns"], tables: PlayerTables, rules: RenderSettings, side: int
+    keys: Int64[np.ndarray, "rows columns"],
+    tables: PlayerTables,
+    settings: RenderSettings,
+    side: int,
 ) -> Int64[np.ndarray, "height width"]:
-    """Without the surroundings; what two pixels a footprint away overtop by far is filled."""
+    """Fill pixels that two opposite ones, a footprint away, overtop by far; cut off the margin."""
     here = slice(side, -side)
     across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
     along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
     neighbours, keys = np.minimum(across, along), keys[here, here]
-    steps = int(rules.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
+    steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
     return np.where(keys - (steps << SURFEL_BITS) > neighbours, neighbours, keys)
 
 
 def _ray_entries(
     tables: PlayerTables,
-    rules: RenderSettings,
-    shot: PlayerInputs,
+    settings: RenderSettings,
+    inputs: PlayerInputs,
     posed: _PosedSurface,
     pixel: Int64[np.ndarray, "pixels"],
     key: Int64[np.ndarray, "pixels"],
-    before: _PreviousLayer | None,
+    front: _FrontLayer | None,
 ) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"]]:
-    """Rays behind covered pixels, and the depths at which they enter the hull."""
+    """Return the canonical rays of covered pixels, and the depths at which they enter the surface."""
     surfels, surfel = tables.surfels, _surfel_of_key(key)
-    row, column = np.divmod(pixel, shot.size_px[0])
-    plane = (np.stack([column, row], axis=1) + 0.5 - shot.center) / shot.focal
+    row, column = np.divmod(pixel, inputs.size_px[0])
+    plane = (np.stack([column, row], axis=1) + 0.5 - inputs.center) / inputs.focal
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    camera, inverse, sound = _inverse_skinning(rules, posed, surfels.positions[surfel])
+    camera, inverse, sound = _inverse_skinning(settings, posed, surfels.positions[surfel])
     along = (camera * ray).sum(axis=1)
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
-    # where the skin is folded, the hull is looked at from straight above
+    # where the skin is folded, look at the surface along its normal
     direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
     nearest = ray * along[:, None] - camera
-    beside = np.einsum("nij,nj->ni", inverse, nearest)  # of the surfel, where the ray is closest
+    beside = np.einsum("nij,nj->ni", inverse, nearest)  # from the surfel to the ray
     beside = np.where(sound[:, None], beside, np.float32(0.0))
     falling = (normal * direction).sum(axis=1)
-    shallow = np.float32(-0.5 * rules.min_cosine)
+    shallow = np.float32(-0.5 * settings.min_cosine)
     hit = -(normal * beside).sum(axis=1) / np.minimum(falling, shallow)
     hit = np.where(falling < shallow, hit, 0.0)
-    enter = along + np.clip(hit, -rules.max_entry_shift_m, rules.max_entry_shift_m)
-    cosine = np.maximum(-falling, rules.min_cosine)
-    most_lead = rules.max_entry_margin_m * compression_factor(rules, direction)
-    lead = np.minimum(rules.entry_margin_m / cosine, most_lead)
+    enter = along + np.clip(hit, -settings.max_entry_shift_m, settings.max_entry_shift_m)
+    cosine = np.maximum(-falling, settings.min_cosine)
+    most_lead = settings.max_entry_margin_m * compression_factor(settings, direction)
+    lead = np.minimum(settings.entry_margin_m / cosine, most_lead)
     begin = enter - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
-    bent = np.minimum(cosine, np.float32(rules.max_compression))
+    bent = np.minimum(cosine, np.float32(settings.max_compression))
     length = thickness * np.minimum(
-        (1.0 + rules.grazing_factor * sine) / bent, rules.max_lengthening
+        (1.0 + settings.grazing_factor * sine) / bent, settings.max_lengthening
     )
-    end = begin + np.minimum(length + lead, rules.max_segment_m)
-    if before is not None:
-        first = surfels.positions[before.surfel]
+    end = begin + np.minimum(length + lead, settings.max_segment_m)
+    if front is not None:
+        first = surfels.positions[front.surfel]
         apart = np.linalg.norm(surfels.positions[surfel] - first, axis=1)
         in_camera = np.linalg.norm(camera - skin_trilinear(posed.nodes, first)[0], axis=1)
-        one_sheet = apart < in_camera * rules.same_sheet_ratio + rules.same_sheet_m
-        later = np.minimum(np.maximum(begin, before.end), end)
+        one_sheet = apart < in_camera * settings.same_sheet_ratio + settings.same_sheet_m
+        later = np.minimum(np.maximum(begin, front.end), end)
         begin = np.where(one_sheet, later, begin)
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = CanonicalRays(*(part.astype(np.float32) for part in (ray, begin, end, start, direction)))

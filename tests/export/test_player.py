@@ -13,14 +13,13 @@ from capture.input_error import InputError
 from export.graph.player_graph import build_graph
 from export.package.graph_tables import subdivided_skinning_nodes
 from export.package.package_file import read_package
-from export.player import PictureDifference, Player, premultiply, verify_package
-from export.reference.reference_march import (
-    PosedNodes,
-    sample_bricks,
-    skin_tetrahedral,
-    skin_trilinear,
-)
+from export.package.render_settings import RenderSettings
+from export.picture_difference import PictureDifference, premultiply
+from export.player import Player, verify_package
+from export.reference.compositor import VoxelCodes, composite_segments
+from export.reference.ray_segments import RaySegments
 from export.reference.reference_player import PlayerInputs, draw_reference
+from export.reference.reference_skinning import PosedNodes, skin_tetrahedral, skin_trilinear
 from preprocess.body.body_pose import BodyPose
 
 
@@ -42,8 +41,8 @@ def test_the_graph_draws_what_its_twin_draws(
     player = Player.load(exported.path, tier=tier)
     pose = stand_in.canonical if posed == "canonical" else bent
     view = camera(*size, distance_m=distance_m)
-    rules = player.manifest.tiers[tier].settings
-    shot = PlayerInputs(
+    settings = player.manifest.tiers[tier].settings
+    inputs = PlayerInputs(
         bones=player.bones(pose, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
@@ -51,9 +50,9 @@ def test_the_graph_draws_what_its_twin_draws(
         samples=5,
     )
     drawn = premultiply(player.render(pose, view, samples=5))
-    likeness = PictureDifference.of(drawn, draw_reference(tables, rules, shot))
+    difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
     assert drawn[..., 3].mean() > 0.05
-    assert likeness.matches, likeness
+    assert difference.matches, difference
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
@@ -66,17 +65,17 @@ def test_folded_surfels_stand_behind_their_neighbours_in_graph_and_twin(
     pose = replace(BodyPose.rest(), joint_rotations=rotations)
     view = replace(camera(96, 96), focal_px=(800.0, 800.0), center_px=(98.0, 184.0))
     player = Player.load(exported.path, tier=tier)
-    rules = player.manifest.tiers[tier].settings
-    shot = PlayerInputs(
+    settings = player.manifest.tiers[tier].settings
+    inputs = PlayerInputs(
         bones=player.bones(pose, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
         size_px=view.size_px,
-        samples=rules.samples,
+        samples=settings.samples,
     )
     drawn = premultiply(player.render(pose, view))
-    assert PictureDifference.of(drawn, draw_reference(tables, rules, shot)).matches
-    before = draw_reference(tables, replace(rules, fold_depth_offset_m=0.0), shot)
+    assert PictureDifference.of(drawn, draw_reference(tables, settings, inputs)).matches
+    before = draw_reference(tables, replace(settings, fold_depth_offset_m=0.0), inputs)
     assert PictureDifference.of(drawn, before).close_fraction < 0.99
 
 
@@ -87,9 +86,9 @@ def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
 ):
     package = read_package(exported.path)
     note = package.manifest.tiers["hq"]
-    rules = replace(note.settings, layers=layers, other_sheet_gap_m=other_sheet_gap_m)
-    tiers = {**package.manifest.tiers, "hq": replace(note, settings=rules)}
-    graph = build_graph(tables, rules).SerializeToString()
+    settings = replace(note.settings, layers=layers, other_sheet_gap_m=other_sheet_gap_m)
+    tiers = {**package.manifest.tiers, "hq": replace(note, settings=settings)}
+    graph = build_graph(tables, settings).SerializeToString()
     player = Player(
         replace(
             package,
@@ -98,15 +97,15 @@ def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
         )
     )
     view = camera(131, 120, distance_m=1.6)
-    shot = PlayerInputs(
+    inputs = PlayerInputs(
         bones=player.bones(bent, view),
         focal=np.array(view.focal_px, np.float32),
         center=np.array(view.center_px, np.float32),
         size_px=(131, 120),
-        samples=rules.samples,
+        samples=settings.samples,
     )
     drawn = premultiply(player.render(bent, view))
-    assert PictureDifference.of(drawn, draw_reference(tables, rules, shot)).matches
+    assert PictureDifference.of(drawn, draw_reference(tables, settings, inputs)).matches
 
 
 @pytest.mark.parametrize(("posed", "least"), [("canonical", 44.0), ("bent", 34.5)])
@@ -153,10 +152,10 @@ def test_shifting_the_centre_by_whole_pixels_shifts_the_picture(player, bent, ca
     view = camera(90, 90)
     x, y = view.center_px
     shifted = player.render(bent, replace(view, center_px=(x + 6.0, y - 4.0)))
-    likeness = PictureDifference.of(
+    difference = PictureDifference.of(
         premultiply(shifted[:-4, 6:]), premultiply(player.render(bent, view)[4:, :-6])
     )
-    assert likeness.matches
+    assert difference.matches
 
 
 def test_an_avatar_out_of_sight_leaves_the_picture_empty(player, bent, camera):
@@ -255,24 +254,31 @@ def test_a_proof_looks_at_every_entry(exported, tmp_path):
         verify_package(path)
 
 
-def test_bricks_give_linear_ramps_back(tables):
-    """Tetrahedra interpolate what is linear exactly: colour codes along any line."""
-    bricks = tables.bricks
-    i, j, k = np.meshgrid(*[np.arange(9)] * 3, indexing="ij")
+def test_tetrahedra_reproduce_linear_colors_and_constant_density(tables):
+    """One sample per ray: at any point of a brick a ramp of codes is read exactly."""
+    i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
     ramp = (3 * i + 7 * j + 11 * k + 5).astype(np.uint8)
-    voxels = np.stack([ramp, ramp, ramp, np.full_like(ramp, 200)], axis=-1)[None]
-    one = replace(
-        bricks, low=np.zeros(3, np.float32), voxel_m=1.0, index=np.zeros((1, 1, 1), np.int32),
-        voxels=voxels,
-    )  # fmt: skip
-    points = np.random.default_rng(0).uniform(0, 8, (500, 3)).astype(np.float32)
-    rgb, density = sample_bricks(one, points)
+    brick = np.zeros((2, 9, 9, 9, 4), np.uint8)
+    brick[1, :8, :8, :8] = np.stack([ramp, ramp, ramp, np.full_like(ramp, 200)], axis=-1)
+    one = replace(tables.bricks, index=np.ones((1, 1, 1), np.int32), voxels=brick)
+    points = np.random.default_rng(0).uniform(0, 7, (500, 3)).astype(np.float32)
+    count = len(points)
+    segments = RaySegments(
+        ray_offsets=np.arange(count + 1),
+        start=points,
+        slope=np.zeros((count, 3), np.float32),
+        step_m=np.full(count, 0.01, np.float32),
+        count=np.ones(count, np.int32),
+        layer=np.zeros(count, np.int32),
+    )
+    drawn = composite_segments(segments, RenderSettings(), one, VoxelCodes.of(one))
+    rgb, alpha = drawn[:, :3] / drawn[:, 3:], drawn[:, 3]
     np.testing.assert_allclose(rgb[:, 0] * 255, points @ [3, 7, 11] + 5, rtol=1e-4)
-    assert np.ptp(density) < 1e-3 * density.max()
+    assert np.ptp(alpha) < 1e-3 * alpha.max()
 
 
 def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
-    nodes = subdivided_skinning_nodes(tables.skin)
+    nodes = subdivided_skinning_nodes(tables.skinning)
     matrix = np.array([[0.9, 0.2, 0.1], [-0.3, 1.1, 0.0], [0.2, 0.1, 0.8]], dtype=np.float32)
     posed = PosedNodes(nodes, nodes.positions @ matrix.T)
     points = tables.surfels.positions
@@ -283,9 +289,9 @@ def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):
-    likenesses = verify_package(exported.path)
-    assert len(likenesses) == 2
-    assert all(likeness.matches for likeness in likenesses)
+    differences = verify_package(exported.path)
+    assert len(differences) == 2
+    assert all(difference.matches for difference in differences)
 
 
 def test_the_player_needs_numpy_and_onnxruntime_alone(exported):
@@ -294,7 +300,7 @@ import sys
 import numpy as np
 from capture.camera import Camera
 from export.player import Player
-from preprocess.pose import BodyPose
+from preprocess.body.body_pose import BodyPose
 player = Player.load({str(exported.path)!r})
 camera = Camera(focal_px=(60.0, 60.0), center_px=(20.0, 25.0), size_px=(40, 50),
                 camera_from_world=np.diag([1.0, -1.0, -1.0, 1.0]))
@@ -319,7 +325,7 @@ def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player
     assert set(exported.psnr_to_renderer) == {"hq", "lite"}
 
 
-@pytest.mark.parametrize("module", ["export.onnx_session", "apps.animation.player_timing"])
+@pytest.mark.parametrize("module", ["export.player", "apps.animation.player_timing"])
 def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     code = f"import {module}, onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     plain = {key: held for key, held in os.environ.items() if not key.startswith(("ORT_", "XDG_"))}

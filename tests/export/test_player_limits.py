@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.player import PictureDifference, Player, premultiply
+from export.picture_difference import PictureDifference, premultiply
+from export.player import Player
 from export.player_limits import ResolutionLimit, downscale_camera, upscale_picture
 
 
@@ -14,7 +15,7 @@ def player(exported):
 
 @pytest.fixture(scope="module")
 def close_ups(exported, player, tables):
-    return ResolutionLimit(tables, player.manifest.tiers["hq"].rules)
+    return ResolutionLimit(tables, player.manifest.tiers["hq"].settings)
 
 
 def nearer(view, times):
@@ -54,9 +55,9 @@ def test_a_coarser_picture_enlarged_shows_what_the_finer_one_shows(player, stand
     rough = upscale_picture(
         player.render(stand_in.canonical, downscale_camera(view, 1.7)), (160, 160), 1.7
     )
-    likeness = PictureDifference.of(premultiply(fine), premultiply(rough))
+    difference = PictureDifference.of(premultiply(fine), premultiply(rough))
     assert np.abs(premultiply(fine) - premultiply(rough)).mean() < 1.0 / 255.0
-    assert likeness.close_fraction > 0.9
+    assert difference.close_fraction > 0.9
 
 
 def test_enlarging_keeps_ramps_where_they_are():
@@ -72,7 +73,7 @@ def test_enlarging_keeps_ramps_where_they_are():
     assert (fine[..., 1:] == 255).all()
 
 
-def test_colours_do_not_fade_towards_what_is_transparent():
+def test_colors_do_not_fade_towards_what_is_transparent():
     picture = np.zeros((4, 6, 4), dtype=np.uint8)
     picture[:, :3] = [200, 100, 50, 255]
     fine = upscale_picture(picture, (24, 16), 4.0)

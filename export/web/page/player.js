@@ -35,11 +35,11 @@ export class Player {
 
   /** The camera, with fewer pixels where surfels could not cover what is near (export/player_limits.py). */
   drawable({ tier }, pose, camera) {
-    const { settings: rules, layout } = this.avatar.tiers[tier];
+    const { settings, layout } = this.avatar.tiers[tier];
     const seen = this.skeleton.posed(pose).joints.map((joint) => moved(camera.cameraFromWorld, joint));
-    const footprint = Math.max(...camera.focal) * layout.surfel_spacing_m * rules.footprint_spacings;
-    const nearest = Math.max(rules.near_plane_m, nearestOf(camera, seen));
-    const times = footprint / nearest / (rules.max_footprint_px - 1);
+    const footprint = Math.max(...camera.focal) * layout.surfel_spacing_m * settings.footprint_spacings;
+    const nearest = Math.max(settings.near_plane_m, nearestOf(camera, seen));
+    const times = footprint / nearest / (settings.max_footprint_px - 1);
     return times > 1 ? coarser(camera, times) : camera;
   }
 

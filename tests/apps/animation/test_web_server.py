@@ -12,7 +12,8 @@ import pytest
 
 from apps.animation.following_camera import FollowingCamera
 from capture.input_error import InputError
-from export.player import PictureDifference, Player, premultiply
+from export.picture_difference import PictureDifference, premultiply
+from export.player import Player
 from export.web import onnxruntime_web
 from preprocess.poses.pose_file import read_motion
 from tests.apps.browser import Browser, chromium, until

@@ -6,19 +6,16 @@ import pytest
 
 from export.bake.bake_tables import FINER_VOXEL_FACTOR
 from export.bake.fine_tuning import DEEPER_SETTINGS, fine_tune
-from export.bake.render_targets import VoxelCodes
 from export.build import export_field
 from export.package.package_file import read_package
-from export.package.player_tables import BRICK_SIZE
 from export.package.render_settings import QUALITY_TIERS
-from export.reference.ray_segments import RaySegments
+from export.reference.compositor import VoxelCodes, back_project, composite_segments
 from export.reference.reference_player import PlayerInputs, draw_reference, trace_picture
-from export.reference.sirt_kernels import back_project, composite_segments
 
-RULES = QUALITY_TIERS["hq"]
+SETTINGS = QUALITY_TIERS["hq"]
 
 
-def shot_of(rig, pose, camera) -> PlayerInputs:
+def inputs_of(rig, pose, camera) -> PlayerInputs:
     bones = camera.camera_from_world @ rig.world_from_body(pose)
     bones = bones @ rig.body_from_canonical(pose.joint_rotations)
     return PlayerInputs(
@@ -26,30 +23,27 @@ def shot_of(rig, pose, camera) -> PlayerInputs:
         focal=np.array(camera.focal_px, dtype=np.float32),
         center=np.array(camera.center_px, dtype=np.float32),
         size_px=camera.size_px,
-        samples=RULES.samples,
+        samples=SETTINGS.samples,
     )
-
-
-def codes_of(tables) -> VoxelCodes:
-    core = (
-        tables.bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE]
-        .reshape(-1, 4)
-        .astype(np.float32)
-    )
-    return VoxelCodes(core[:, 3].copy(), core[:, :3].copy())
 
 
 @pytest.fixture(scope="module")
 def renderer(stand_in, tables):
     """The player itself, by the tables as they were baked: what it shows can be reached."""
-    return lambda pose, camera: draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
+    return lambda pose, camera: draw_reference(
+        tables, SETTINGS, inputs_of(stand_in.rig, pose, camera)
+    )
 
 
 @pytest.fixture(scope="module")
-def traced(stand_in, tables, views):
-    look = trace_picture(tables, RULES, shot_of(stand_in.rig, *views["bent"]))
-    first = RaySegments.of_first_layer(look.first_rays, look.nodes, tables.bricks, RULES)
-    return look, first.append_layer(RaySegments.of_further_layer(look, 1, tables.bricks, RULES))
+def codes(tables):
+    return VoxelCodes.of(tables.bricks)
+
+
+@pytest.fixture(scope="module")
+def segments(stand_in, tables, codes, views):
+    inputs = inputs_of(stand_in.rig, *views["bent"])
+    return trace_picture(tables, codes, SETTINGS, inputs).segments
 
 
 @pytest.fixture(scope="module")
@@ -65,63 +59,53 @@ def spoilt(tables):
 @pytest.fixture(scope="module")
 def tune(stand_in, views):
     def call(tables, renderer, **more):
-        with ThreadPoolExecutor(1) as beside:
+        with ThreadPoolExecutor(1) as executor:
             return fine_tune(
-                tables, stand_in.rig, RULES, renderer,
-                views=list(views.values()), max_pictures=6, executor=beside, **more,
+                tables, stand_in.rig, SETTINGS, renderer,
+                views=list(views.values()), max_pictures=6, executor=executor, **more,
             )  # fmt: skip
 
     return call
 
 
-def test_what_tuning_thinks_is_shown_is_what_the_player_shows(stand_in, tables, views, traced):
-    look, pieces = traced
-    assert len(look.behind[0].again) > 20
-    assert pieces.layer.max() == 1
-    drawn = draw_reference(tables, RULES, shot_of(stand_in.rig, *views["bent"])).reshape(-1, 4)[
-        look.pixel
-    ]
-    out = composite_segments(pieces, RULES, tables.bricks.index, *codes_of(tables))
-    assert np.abs(out - drawn).max() < 2e-3
+def test_rays_have_segments_of_several_layers(segments):
+    further = np.bincount(segments.layer)[1:]
+    assert further.sum() > 20
+    assert len(further) == SETTINGS.layers - 1
 
 
-def test_colours_are_pushed_against_the_error_s_gradient(tables, traced):
-    pieces = traced[1]
+def test_color_updates_are_the_gradient_of_the_error(tables, segments, codes):
     generator = np.random.default_rng(2)
-    density, color = codes_of(tables)
-    wanted = generator.random((pieces.rays, 4)).astype(np.float32)
-    push = back_project(pieces, RULES, tables.bricks.index, density, color, wanted)
-    way = generator.normal(size=color.shape).astype(np.float32)
+    targets = generator.random((segments.num_rays, 4)).astype(np.float32)
+    update = back_project(segments, SETTINGS, tables.bricks, codes, targets)
+    direction = generator.normal(size=codes.color.shape).astype(np.float32)
 
     def loss(size):
-        out = composite_segments(
-            pieces, RULES, tables.bricks.index, density, color + np.float32(size) * way
-        )
-        return squares(out - wanted)
+        moved = codes._replace(color=codes.color + np.float32(size) * direction)
+        return squares(composite_segments(segments, SETTINGS, tables.bricks, moved) - targets)
 
-    slope = (loss(1.0) - loss(-1.0)) / 2.0  # exact: the error is quadratic in colours
-    assert (push.color * way).sum() * 4.0 / 255.0**2 == pytest.approx(slope, rel=1e-2)
+    slope = (loss(1.0) - loss(-1.0)) / 2.0  # exact: the error is quadratic in colors
+    assert (update.color * direction).sum() * 4.0 / 255.0**2 == pytest.approx(slope, rel=1e-2)
 
 
-def test_densities_are_pushed_against_the_error_s_gradient(tables, traced):
-    pieces = traced[1]
+def test_density_updates_are_the_gradient_of_the_error(tables, segments, codes):
     generator = np.random.default_rng(3)
-    density, color = codes_of(tables)
-    color[:] = [40.0, 120.0, 200.0]  # one colour: it does not matter where it is read
-    density = np.where(density > 0, density - 30.0, 0.0).astype(np.float32)
-    patient = replace(RULES, min_transmittance=-1.0)  # no ray ends, or else what is seen would jump
-    wanted = np.zeros((pieces.rays, 4), dtype=np.float32)
-    push = back_project(pieces, patient, tables.bricks.index, density, color, wanted)
-    way = generator.random(density.shape).astype(np.float32) * (density > 0)
+    # of one color, as where it is read depends on the density, too
+    codes = VoxelCodes(
+        density=np.where(codes.density > 0, codes.density - 30.0, 0.0).astype(np.float32),
+        color=np.broadcast_to(np.float32([40.0, 120.0, 200.0]), codes.color.shape).copy(),
+    )
+    endless = replace(SETTINGS, min_transmittance=-1.0)  # a ray that ends would be a jump
+    targets = np.zeros((segments.num_rays, 4), dtype=np.float32)
+    update = back_project(segments, endless, tables.bricks, codes, targets)
+    direction = generator.random(codes.density.shape).astype(np.float32) * (codes.density > 0)
 
     def loss(size):
-        moved = density + np.float32(size) * way
-        return squares(
-            composite_segments(pieces, patient, tables.bricks.index, moved, color) - wanted
-        )
+        moved = codes._replace(density=codes.density + np.float32(size) * direction)
+        return squares(composite_segments(segments, endless, tables.bricks, moved) - targets)
 
     slope = (loss(0.25) - loss(-0.25)) / 0.5
-    assert (push.density * way).sum() * 2.0 == pytest.approx(slope, rel=2e-2)
+    assert (update.density * direction).sum() * 2.0 == pytest.approx(slope, rel=2e-2)
 
 
 def squares(error) -> float:
@@ -136,10 +120,10 @@ def test_tuning_lowers_the_error_on_a_view_that_it_did_not_see(
     after = tune(spoilt, renderer)
     assert after.psnr[1] > after.psnr[0] + 1.0
     pose = replace(bent, joint_rotations=0.6 * bent.joint_rotations)
-    unseen = shot_of(stand_in.rig, pose, camera(96, 120, distance_m=2.6))
+    unseen = inputs_of(stand_in.rig, pose, camera(96, 120, distance_m=2.6))
     exact = renderer(pose, camera(96, 120, distance_m=2.6))
     errors = [
-        ((draw_reference(t, RULES, unseen) - exact) ** 2).mean() for t in (spoilt, after.tables)
+        ((draw_reference(t, SETTINGS, unseen) - exact) ** 2).mean() for t in (spoilt, after.tables)
     ]
     assert errors[1] < 0.8 * errors[0]
     assert after.tables.surfels is spoilt.surfels
@@ -197,17 +181,17 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
 
 @pytest.mark.slow
 def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
-    more = replace(RULES, **DEEPER_SETTINGS)
+    more = replace(SETTINGS, **DEEPER_SETTINGS)
 
     def deeper(pose, camera):
-        return draw_reference(tables, more, shot_of(stand_in.rig, pose, camera))
+        return draw_reference(tables, more, inputs_of(stand_in.rig, pose, camera))
 
     def as_asked(pose, camera):
-        return draw_reference(tables, RULES, shot_of(stand_in.rig, pose, camera))
+        return draw_reference(tables, SETTINGS, inputs_of(stand_in.rig, pose, camera))
 
-    assert tune(tables, deeper).rules == RULES
-    assert tune(tables, deeper, deepens=True).rules == more
-    assert tune(tables, as_asked, deepens=True).rules == RULES
+    assert tune(tables, deeper).settings == SETTINGS
+    assert tune(tables, deeper, may_add_layers=True).settings == more
+    assert tune(tables, as_asked, may_add_layers=True).settings == SETTINGS
 
 
 @pytest.mark.slow

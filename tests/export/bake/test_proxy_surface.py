@@ -43,10 +43,10 @@ def test_a_ramp_is_read_at_any_step_also_where_the_last_one_is_rounded_to_the_en
 
 
 def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
-    hull = extract_proxy_surface(ball_lattice(soft_ball), level=20.0, spacing_m=0.005)
-    radius = np.linalg.norm(hull.positions, axis=1)
+    surface = extract_proxy_surface(ball_lattice(soft_ball), level=20.0, spacing_m=0.005)
+    radius = np.linalg.norm(surface.positions, axis=1)
     np.testing.assert_allclose(radius, RADIUS_M, atol=6e-4)
-    cosine = (hull.positions / radius[:, None] * hull.normals).sum(axis=1)
+    cosine = (surface.positions / radius[:, None] * surface.normals).sum(axis=1)
     assert cosine.min() > 0.999
     # as many as marching cubes has vertices: about 3/2 of the area in cells
     area_cells = 4 * np.pi * RADIUS_M**2 / 0.005**2
@@ -55,17 +55,17 @@ def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
 
 def test_thickness_is_the_depth_at_which_everything_has_been_seen():
     constant = 200.0
-    lattice = ball_lattice(lambda r: np.where(r < RADIUS_M, constant, 0.0))
-    hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
+    grid = ball_lattice(lambda r: np.where(r < RADIUS_M, constant, 0.0))
+    surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)
     np.testing.assert_allclose(
-        hull.thickness, OPAQUE_OPTICAL_DEPTH / constant + THICKNESS_MARGIN_M, atol=0.006
+        surface.thickness, OPAQUE_OPTICAL_DEPTH / constant + THICKNESS_MARGIN_M, atol=0.006
     )
 
 
 def test_a_hollow_ball_has_no_surfels_inside():
-    lattice = ball_lattice(lambda r: np.where((r < RADIUS_M) & (r > 0.04), 300.0, 0.0))
-    hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
-    assert np.linalg.norm(hull.positions, axis=1).min() > RADIUS_M - 0.006
+    grid = ball_lattice(lambda r: np.where((r < RADIUS_M) & (r > 0.04), 300.0, 0.0))
+    surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)
+    assert np.linalg.norm(surface.positions, axis=1).min() > RADIUS_M - 0.006
 
 
 def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
@@ -77,15 +77,15 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
         large = np.linalg.norm(points - part, axis=-1) < 0.035
         return np.where(small | large, 300.0, 0.0)
 
-    lattice = ball_lattice(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
+    grid = ball_lattice(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
 
     def nearest(place):
-        hull = extract_proxy_surface(lattice, level=20.0, spacing_m=0.005)
-        return np.linalg.norm(hull.positions - place, axis=1).min()
+        surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)
+        return np.linalg.norm(surface.positions - place, axis=1).min()
 
     assert nearest(floater) > 0.05
     assert nearest(part) < 0.04
-    monkeypatch.setattr("export.bake.bake_tables.proxy_surface.MIN_PART_FRACTION", 1e-9)
+    monkeypatch.setattr("export.bake.proxy_surface.MIN_PART_FRACTION", 1e-9)
     assert nearest(floater) < 0.02
 
 

@@ -70,10 +70,10 @@ def test_a_loop_whose_states_shrink_ends_when_nothing_is_left():
 
     def halved(turn, states):
         steps, place, left = states
-        ended = place.compressed(left < 1.0)
-        turns = left.compressed(left < 1.0) * 0.0 + turn.cast(np.float32)
-        steps = steps.scattered(ended, turns)
-        place, left = place.compressed(left > 1.0), left.compressed(left > 1.0)
+        ended = place.compress(left < 1.0)
+        turns = left.compress(left < 1.0) * 0.0 + turn.cast(np.float32)
+        steps = steps.scatter(ended, turns)
+        place, left = place.compress(left > 1.0), left.compress(left > 1.0)
         return graph.size(place) > 0, [steps, place, left * 0.5]
 
     steps = graph.loop_while(graph.constant(np.int64(50)), [x * 0.0 - 1.0, place, x], halved)[0]

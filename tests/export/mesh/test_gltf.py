@@ -119,13 +119,13 @@ class Read:
 def test_the_mesh_is_one_closed_body_at_the_hull(mesh, tables):
     assert is_closed(mesh.faces)
     assert volume(mesh.positions, mesh.faces) > 0.01
-    hull = KDTree(tables.surfels.positions)
-    assert hull.query(mesh.positions)[0].max() < 0.03  # nothing inside, though bricks are hollow
+    surface = KDTree(tables.surfels.positions)
+    assert surface.query(mesh.positions)[0].max() < 0.03  # nothing inside, though bricks are hollow
     assert KDTree(mesh.positions).query(tables.surfels.positions)[0].max() < 0.03
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
 
 
-def test_vertices_are_coloured_and_moved_as_the_avatar_is(mesh, stand_in):
+def test_vertices_are_colored_and_moved_as_the_avatar_is(mesh, stand_in):
     import torch
 
     inside = torch.from_numpy(mesh.positions - 0.004 * mesh.normals)
@@ -195,7 +195,7 @@ def test_another_reader_opens_it(file, mesh):
     assert {"pelvis", "left_hand", "floor"} <= set(scene.graph.nodes)
 
 
-def test_colours_are_linear_light(file, mesh):
+def test_colors_are_linear_light(file, mesh):
     light = Read(file).attribute("COLOR_0")
     back = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(back[:, :3] * 255.0, mesh.colors, atol=0.1)

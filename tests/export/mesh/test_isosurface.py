@@ -1,4 +1,4 @@
-"""The zero set of a lattice: closed forms that it must come close to."""
+"""The zero set of a grid: closed forms that it must come close to."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import pytest
 from export.mesh.isosurface import extract_isosurface
 
 
-def lattice(of, size=33):
-    """A function of points in [-1, 1]³ on a cubic lattice, and the distance between its nodes."""
+def grid(of, size=33):
+    """A function of points in [-1, 1]³ on a cubic grid, and the distance between its nodes."""
     axis = np.linspace(-1.0, 1.0, size)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     return of(points).astype(np.float32), axis[1] - axis[0]
@@ -41,7 +41,7 @@ def euler(vertices, faces):
 
 
 def test_a_sphere_has_its_radius_its_volume_and_faces_that_look_out():
-    values, step = lattice(sphere)
+    values, step = grid(sphere)
     nodes, faces = extract_isosurface(values)
     vertices = nodes * step - 1.0
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.7).max() < 0.1 * step
@@ -51,7 +51,7 @@ def test_a_sphere_has_its_radius_its_volume_and_faces_that_look_out():
 
 @pytest.mark.parametrize(("shape", "characteristic"), [(sphere, 2), (torus, 0)])
 def test_surfaces_are_closed_and_have_as_many_handles_as_they_should(shape, characteristic):
-    vertices, faces = extract_isosurface(lattice(shape)[0])
+    vertices, faces = extract_isosurface(grid(shape)[0])
     assert is_closed(faces)
     assert euler(vertices, faces) == characteristic
 
@@ -66,7 +66,7 @@ def test_a_plane_between_nodes_is_found_where_it_is():
 
 
 def test_a_surface_with_a_hole_is_not_closed():
-    _, faces = extract_isosurface(lattice(sphere)[0])
+    _, faces = extract_isosurface(grid(sphere)[0])
     assert not is_closed(faces[1:])
 
 

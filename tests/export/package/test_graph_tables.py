@@ -5,12 +5,12 @@ from capture.input_error import InputError
 from export.package.graph_tables import skinning_nodes, subdivided_skinning_nodes
 from export.package.player_tables import round_codes
 from export.package.render_settings import RenderSettings
-from export.reference.reference_march import PosedNodes, skin_trilinear
+from export.reference.reference_skinning import PosedNodes, skin_trilinear
 
 
 @pytest.fixture(scope="module")
 def skin(tables):
-    return tables.skin
+    return tables.skinning
 
 
 def test_stored_weights_are_the_rigs_own(stand_in, skin):

@@ -24,16 +24,16 @@ def random_tables(
 ) -> PlayerTables:
     rng = np.random.default_rng(seed)
     nodes = np.array(counts) * 8 + 1
-    lattice = rng.integers(0, 256, (*nodes, 4), dtype=np.uint8)
-    lattice[-1] = lattice[:, -1] = lattice[:, :, -1] = 0  # a lattice ends in emptiness
+    grid = rng.integers(0, 256, (*nodes, 4), dtype=np.uint8)
+    grid[-1] = grid[:, -1] = grid[:, :, -1] = 0  # a grid ends in emptiness
     used = rng.random(counts) < share
     index = np.zeros(counts, np.int32)
     index[used] = np.arange(1, used.sum() + 1)
     for block in np.argwhere(~used):
-        lattice[tuple(slice(8 * b, 8 * b + 8) for b in block)] = 0
+        grid[tuple(slice(8 * b, 8 * b + 8) for b in block)] = 0
     voxels = np.zeros((used.sum() + 1, 9, 9, 9, 4), np.uint8)
     for number, block in enumerate(np.argwhere(used), start=1):
-        voxels[number] = lattice[tuple(slice(8 * b, 8 * b + 9) for b in block)]
+        voxels[number] = grid[tuple(slice(8 * b, 8 * b + 9) for b in block)]
     return PlayerTables(
         surfels=SurfelTable(
             low=rng.normal(size=3).astype(np.float32),

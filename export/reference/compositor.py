@@ -1,31 +1,49 @@
-"""The player's compositing, compiled, and by how much its bricks are wrong: the loops of tuning."""
+"""The player's compositing and its SIRT back-projection, compiled."""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32
 
 from avatar.numba_kernels.kernel_compiler import compile_kernel
-from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
+from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
 from export.package.render_settings import RenderSettings
 from export.reference.ray_segments import RaySegments
 
 F32 = np.float32
 VOXELS_PER_BRICK = BRICK_SIZE**3
+"""Voxels that a brick owns; its far border belongs to its neighbors."""
 LOG_DENSITY_PER_CODE = F32((LOG_DENSITY_RANGE[1] - LOG_DENSITY_RANGE[0]) / 255.0)
-"""Logarithm of the density, per code."""
+"""Step of the natural logarithm of the density from one code to the next."""
 MIN_LOG_DENSITY = F32(LOG_DENSITY_RANGE[0])
+"""Natural logarithm of the density that code 0 would have, were it not empty."""
+
+
+class VoxelCodes(NamedTuple):
+    """Codes of every brick's own voxels, the empty brick's first, not yet rounded."""
+
+    density: Float32[np.ndarray, "voxels"]
+    color: Float32[np.ndarray, "voxels 3"]
+
+    @classmethod
+    def of(cls, bricks: BrickTable) -> "VoxelCodes":
+        """Take a table's codes, without the borders that bricks repeat."""
+        core = bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE].reshape(-1, 4)
+        codes = core.astype(np.float32)
+        return cls(np.ascontiguousarray(codes[:, 3]), np.ascontiguousarray(codes[:, :3]))
 
 
 class SirtUpdate(NamedTuple):
-    """What rays would change in voxels, and how much they have to do with each.
+    """Back-projected errors of rays, and the weights that normalize them, for each voxel.
 
-    One update is `codes - push / (share + damping)`: each ray shares its error among its samples
-    (SIRT), so nothing overshoots, however many rays see a voxel. Per voxel, the empty brick first.
+    A step is `codes - update / (normalizer + damping)`: each ray shares its error among its samples
+    (SIRT), so that nothing overshoots, however many rays see a voxel. The empty brick comes first.
 
     Attributes:
-        color, color_share: Codes × shares, and squared shares of a colour.
-        density, density_share: The same of the density code, in squared colours.
+        color: Color codes × weights.
+        color_normalizer: Squared weights.
+        density: Density codes × squared colors.
+        density_normalizer: Squared colors.
     """
 
     color: Float32[np.ndarray, "voxels 3"]
@@ -35,61 +53,60 @@ class SirtUpdate(NamedTuple):
 
     @classmethod
     def zeros(cls, voxels: int) -> "SirtUpdate":
-        """Nothing yet."""
+        """Start a sum over rays."""
         sizes = ((voxels, 3), (voxels,), (voxels,), (voxels,))
         return cls(*(np.zeros(size, dtype=np.float32) for size in sizes))
 
 
 def composite_segments(
-    pieces: RaySegments,
-    rules: RenderSettings,
-    index: Int32[np.ndarray, "bx by bz"],
-    density: Float32[np.ndarray, "voxels"],
-    color: Float32[np.ndarray, "voxels 3"],
+    segments: RaySegments, settings: RenderSettings, bricks: BrickTable, codes: VoxelCodes
 ) -> Float32[np.ndarray, "rays 4"]:
-    """What the player shows: premultiplied colour and alpha of each ray.
+    """Return premultiplied color and alpha of each ray, as the player draws them.
 
     Args:
-        pieces: Where it samples.
-        rules: When a ray ends, and which of them have a second layer.
-        index: As in `BrickTable`.
-        density, color: Codes of every brick's own voxels, the empty brick first.
+        segments: Where rays sample the bricks.
+        settings: Transmittances at which a ray ends and below which it has no further layer.
+        bricks: Which brick covers each block.
+        codes: What the bricks hold, in place of `bricks.voxels`.
     """
-    out = np.zeros((pieces.num_rays, 4), dtype=np.float32)
-    _run_kernel(pieces, rules, index, density, color, out, out, None)
+    out = np.zeros((segments.num_rays, 4), dtype=np.float32)
+    _run_kernel(segments, settings, bricks, codes, out, out, None)
     return out
 
 
 def back_project(
-    pieces: RaySegments,
-    rules: RenderSettings,
-    index: Int32[np.ndarray, "bx by bz"],
-    density: Float32[np.ndarray, "voxels"],
-    color: Float32[np.ndarray, "voxels 3"],
+    segments: RaySegments,
+    settings: RenderSettings,
+    bricks: BrickTable,
+    codes: VoxelCodes,
     target_colors: Float32[np.ndarray, "rays 4"],
 ) -> SirtUpdate:
-    """Where and how far the codes are from showing what is wanted. The rest as for `shown`."""
-    push = SirtUpdate.zeros(len(density))
-    _run_kernel(
-        pieces, rules, index, density, color, target_colors, np.zeros_like(target_colors), push
-    )
-    return push
+    """Return how the codes have to change for rays to show their targets.
+
+    Args:
+        segments, settings, bricks, codes: As of `composite_segments`.
+        target_colors: Premultiplied color and alpha that each ray should have.
+    """
+    update = SirtUpdate.zeros(len(codes.density))
+    out = np.zeros_like(target_colors)
+    _run_kernel(segments, settings, bricks, codes, target_colors, out, update)
+    return update
 
 
 def _run_kernel(
-    pieces: RaySegments,
-    rules: RenderSettings,
-    index: Int32[np.ndarray, "bx by bz"],
-    density: Float32[np.ndarray, "voxels"],
-    color: Float32[np.ndarray, "voxels 3"],
-    wanted: Float32[np.ndarray, "rays 4"],
+    segments: RaySegments,
+    settings: RenderSettings,
+    bricks: BrickTable,
+    codes: VoxelCodes,
+    target_colors: Float32[np.ndarray, "rays 4"],
     out: Float32[np.ndarray, "rays 4"],
-    push: SirtUpdate | None,
+    update: SirtUpdate | None,
 ) -> None:
-    """Shows every ray in `out`, and adds to `push` what it would change, if there is one."""
-    samples = np.concatenate([[0], np.cumsum(pieces.count, dtype=np.int64)])[pieces.ray_offsets]
-    most = int(np.diff(samples).max(initial=0)) + 1
-    blocks = int(np.diff(pieces.ray_offsets).max(initial=0)) + 1
+    """Composite every ray into `out`; back-project its error into `update` unless that is None."""
+    samples = np.concatenate([[0], np.cumsum(segments.count, dtype=np.int64)])
+    most = int(np.diff(samples[segments.ray_offsets]).max(initial=0)) + 1
+    blocks = int(np.diff(segments.ray_offsets).max(initial=0)) + 1
+    # scratch space of one ray, for all rays in turn
     sampled = (
         np.zeros((most, 4), dtype=np.int32), np.zeros((most, 4), dtype=np.float32),
         np.zeros(most, dtype=np.float32), np.ones(most + 1, dtype=np.float32),
@@ -100,18 +117,20 @@ def _run_kernel(
         np.zeros(blocks + 1, dtype=np.int64),
     )  # fmt: skip
     moves = (np.zeros(most, dtype=np.float32), np.zeros(most, dtype=np.float32))
-    descends = push is not None
-    push = SirtUpdate.zeros(1) if push is None else push
     _composite_rays(
-        (pieces.ray_offsets, pieces.start, pieces.slope, pieces.step_m, pieces.count, pieces.layer),
-        (F32(rules.min_transmittance), F32(rules.layer_min_transmittance)), (index, density, color), wanted, out,
-        sampled, gathered, moves, tuple(push), descends,
+        (
+            segments.ray_offsets, segments.start, segments.slope, segments.step_m,
+            segments.count, segments.layer,
+        ),
+        (F32(settings.min_transmittance), F32(settings.layer_min_transmittance)),
+        (bricks.index, codes.density, codes.color), target_colors, out, sampled, gathered, moves,
+        tuple(SirtUpdate.zeros(1) if update is None else update), update is not None,
     )  # fmt: skip
 
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
 def _voxel_index(index, i, j, k):
-    """Number of a node's voxel; 0, which is empty, where there is no brick."""
+    """Return the number of a node's voxel; 0, which is empty, where there is no brick."""
     if i >> 3 >= index.shape[0] or j >> 3 >= index.shape[1] or k >> 3 >= index.shape[2]:
         return 0
     brick = index[i >> 3, j >> 3, k >> 3]
@@ -120,7 +139,11 @@ def _voxel_index(index, i, j, k):
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
 def _tetrahedron_weights(index, px, py, pz, voxels, shares):
-    """The four voxels about a point of the lattice, and their shares; none in an empty block."""
+    """Write the four voxels about a point of the grid and their weights; none in an empty block.
+
+    A cell is cut into six tetrahedra along its diagonal: four corners are read, not eight, and the
+    largest and the smallest fraction of the point tell which.
+    """
     px = min(max(px, F32(0)), F32(index.shape[0] * BRICK_SIZE) - F32(1e-3))
     py = min(max(py, F32(0)), F32(index.shape[1] * BRICK_SIZE) - F32(1e-3))
     pz = min(max(pz, F32(0)), F32(index.shape[2] * BRICK_SIZE) - F32(1e-3))
@@ -145,16 +168,16 @@ def _tetrahedron_weights(index, px, py, pz, voxels, shares):
 
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
-def _composite_ray(first, last, pieces, limits, bricks, sampled, gathered):
-    """Front to back; leaves samples and pieces in the scratch arrays, returns how many pieces."""
-    _, start, slope, step_m, count, layer = pieces
-    ended, transmitted = limits
+def _composite_ray(first, last, segments, limits, bricks, sampled, gathered):
+    """Composite front to back into the scratch arrays; return the number of segments seen."""
+    _, start, slope, step_m, count, layer = segments
+    min_transmittance, layer_min_transmittance = limits
     index, density, color = bricks
     voxels, shares, depth, light = sampled
     color_voxels, color_shares, colors, weights, bounds = gathered
     there, sample, left, over = 0, 0, F32(1), False
     for p in range(first, last):
-        if over if layer[p] == 0 else left <= transmitted:
+        if over if layer[p] == 0 else left <= layer_min_transmittance:
             continue
         weight, mean = F32(0), F32(0)
         for turn in range(count[p]):
@@ -163,6 +186,7 @@ def _composite_ray(first, last, pieces, limits, bricks, sampled, gathered):
                 index, start[p, 0] + way * slope[p, 0], start[p, 1] + way * slope[p, 1],
                 start[p, 2] + way * slope[p, 2], voxels[sample], shares[sample],
             )  # fmt: skip
+            # below half a code the interpolated density counts as empty
             code = F32(0)
             for corner in range(4):
                 code += density[voxels[sample, corner]] * shares[sample, corner]
@@ -173,6 +197,7 @@ def _composite_ray(first, last, pieces, limits, bricks, sampled, gathered):
             seen = left * (F32(1) - np.exp(-depth[sample]))
             weight, mean, left = weight + seen, mean + seen * way, left - seen
             sample += 1
+        # one color per segment, read at the mean position of what is seen of it
         way = mean / max(weight, F32(1e-9))
         _tetrahedron_weights(
             index, start[p, 0] + way * slope[p, 0], start[p, 1] + way * slope[p, 1],
@@ -186,46 +211,53 @@ def _composite_ray(first, last, pieces, limits, bricks, sampled, gathered):
         weights[there] = weight
         there += 1
         bounds[there] = sample
-        over = over or (layer[p] == 0 and left <= ended)
+        over = over or (layer[p] == 0 and left <= min_transmittance)
     light[sample] = left
     return there
 
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
-def _back_project_color(there, gathered, error, push):
-    """A ray's error on black and on white, shared among the colours that it is made of."""
+def _back_project_color(there, gathered, error, update):
+    """Add a ray's error on black and on white to the colors that it is made of.
+
+    The squared error is quadratic in colors, so this is its exact gradient × 255² / 4.
+    """
     voxels, shares, _, weights, _ = gathered
-    color, color_share = push[0], push[1]
+    color, color_normalizer = update[0], update[1]
     total = F32(0)
-    for piece in range(there):
-        total += weights[piece]
-    for piece in range(there):
+    for segment in range(there):
+        total += weights[segment]
+    for segment in range(there):
         for corner in range(4):
-            share, voxel = shares[piece, corner] * weights[piece], voxels[piece, corner]
+            share, voxel = shares[segment, corner] * weights[segment], voxels[segment, corner]
             for channel in range(3):
                 middle = error[channel] - F32(0.5) * error[3]
                 color[voxel, channel] += F32(255) * share * middle
-            color_share[voxel] += share * total
+            color_normalizer[voxel] += share * total
 
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
-def _back_project_density(there, sampled, gathered, moves, error, push):
-    """The same among densities: how the picture on black and on white moves with each code."""
+def _back_project_density(there, sampled, gathered, moves, error, update):
+    """Add a ray's error on black and on white to the densities that it passes.
+
+    Back to front: a sample's density adds its own color and takes away from all that is behind.
+    """
     voxels, shares, depth, light = sampled
     _, _, colors, _, bounds = gathered
+    # against: error × derivative; size: norm of the derivative, by which SIRT shares the error
     against, size = moves
-    density, density_share = push[2], push[3]
+    density, density_normalizer = update[2], update[3]
     behind = np.zeros(4, dtype=np.float32)
     total = F32(0)
-    for piece in range(there - 1, -1, -1):
-        for sample in range(bounds[piece + 1] - 1, bounds[piece] - 1, -1):
+    for segment in range(there - 1, -1, -1):
+        for sample in range(bounds[segment + 1] - 1, bounds[segment] - 1, -1):
             left = light[sample + 1]
             deeper = depth[sample] * LOG_DENSITY_PER_CODE
             alpha = deeper * (left - behind[3])
             alpha_error = error[3]
             against[sample], squares = F32(0), F32(0)
             for channel in range(3):
-                move = deeper * (left * colors[piece, channel] - behind[channel])
+                move = deeper * (left * colors[segment, channel] - behind[channel])
                 on_white = move - alpha
                 against[sample] += move * error[channel]
                 against[sample] += on_white * (error[channel] - alpha_error)
@@ -234,34 +266,34 @@ def _back_project_density(there, sampled, gathered, moves, error, push):
             total += size[sample]
             seen = light[sample] - left
             for channel in range(3):
-                behind[channel] += seen * colors[piece, channel]
+                behind[channel] += seen * colors[segment, channel]
             behind[3] += seen
     for sample in range(bounds[there]):
         for corner in range(4):
             share, voxel = shares[sample, corner], voxels[sample, corner]
             density[voxel] += share * against[sample]
-            density_share[voxel] += share * size[sample] * total
+            density_normalizer[voxel] += share * size[sample] * total
 
 
 @compile_kernel(nogil=True, error_model="numpy", fastmath=True)
 def _composite_rays(
-    pieces, limits, bricks, wanted, out, sampled, gathered, moves, push, descends
+    segments, limits, bricks, targets, out, sampled, gathered, moves, update, back_projects
 ):  # fmt: skip
     error = np.zeros(4, dtype=np.float32)
     for ray in range(len(out)):
         there = _composite_ray(
-            pieces[0][ray], pieces[0][ray + 1], pieces, limits, bricks, sampled, gathered
+            segments[0][ray], segments[0][ray + 1], segments, limits, bricks, sampled, gathered
         )
         _, _, colors, weights, bounds = gathered
         alpha = F32(1) - sampled[3][bounds[there]]
         for channel in range(3):
             total = F32(0)
-            for piece in range(there):
-                total += weights[piece] * colors[piece, channel]
-            error[channel] = total - wanted[ray, channel]
+            for segment in range(there):
+                total += weights[segment] * colors[segment, channel]
+            error[channel] = total - targets[ray, channel]
             out[ray, channel] = total
-        error[3] = alpha - wanted[ray, 3]
+        error[3] = alpha - targets[ray, 3]
         out[ray, 3] = alpha
-        if descends:
-            _back_project_color(there, gathered, error, push)
-            _back_project_density(there, sampled, gathered, moves, error, push)
+        if back_projects:
+            _back_project_color(there, gathered, error, update)
+            _back_project_density(there, sampled, gathered, moves, error, update)
