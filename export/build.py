@@ -1,4 +1,7 @@
-"""Avatar to package: bakes, builds, checks, and only then writes."""
+"""Exporting an avatar: sample the field, bake, fine-tune, build the graphs, check, write.
+
+report = export_avatar(avatar, Path("avatar.iavatar"), views=[(pose, camera)], metrics={})
+"""
 
 import io
 import time
@@ -21,7 +24,13 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
 from export.bake.field_grid import FieldFunction
-from export.bake.fine_tuning import ExportProgress, FineTuningResult, fine_tune, is_below_target
+from export.bake.fine_tuning import (
+    ExportProgress,
+    FineTuningInputs,
+    FineTuningResult,
+    fine_tune,
+    is_below_target,
+)
 from export.bake.render_targets import PosedView, RenderFunction, RgbaPicture
 from export.graph.player_graph import build_graph
 from export.package.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
@@ -41,30 +50,34 @@ from export.player import Player
 from preprocess.body.body_pose import BodyPose
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
-"""Pictures of each tier's graph that are compared with its meaning in numpy, 0.2 s each. They prove
-the arithmetic of this machine's onnxruntime, and further poses would prove it again."""
+"""Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
+the arithmetic of this machine's onnxruntime; further poses would test the same."""
 MAX_GOLDEN_FRAMES = 4
-BAKING_PROGRESS, FINE_TUNING_PROGRESS = 0.25, 0.55
-"""Of an export's time, baking comes first and fine-tuning follows; the rest are the checks."""
+"""Golden frames of a package."""
+BAKING_PROGRESS = 0.25
+"""Fraction of an export's time after which baking is done."""
+FINE_TUNING_PROGRESS = 0.55
+"""Fraction of an export's time that fine-tuning takes; the rest are the checks."""
 INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
 )
+"""Recorded in the package after Ctrl-C."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExportReport:
-    """What became of an export.
+    """Outcome of an export.
 
     Attributes:
         path: The package.
         bytes: Its size.
-        seconds: Wall time of baking, checking and writing.
-        psnr_to_renderer: Of each tier, dB, mean over the views.
+        seconds: Wall time of sampling, baking, checking and writing.
+        psnr_to_renderer: Mean over the views, dB, by tier.
+        fine_tuning_psnr: PSNR to the renderer before and after fine-tuning, dB, on pictures that it
+            was not trained on; None without fine-tuning.
         largest_difference: Between graph and reference, in 1/255.
-        tuning: PSNR to the volume renderer's before and after fine-tuning, dB, of pictures that
-            it has not seen; None if it was left out.
-        warnings: What the user should know.
+        warnings: Weaknesses that the user should know.
     """
 
     path: Path
@@ -88,25 +101,25 @@ def export_avatar(
     fine_tune_bricks: bool = True,
     progress: ExportProgress = lambda _: None,
 ) -> ExportReport:
-    """Writes an avatar's package, or nothing.
+    """Write an avatar's package, or nothing.
 
     Args:
         avatar: As training left it.
-        path: The `.iavatar` file; replaced at once if it exists.
+        path: The `.iavatar` file; replaced atomically if it exists.
         views: Poses and cameras to check it with, at least one; the first is the preview, and
-            the first few become golden frames. Lens distortion is left out.
-        metrics: What training reported, kept in the manifest (JSON).
-        renderer: The exact picture of an avatar.
-        config: How finely to bake; follows the field's own finest cells if None.
-        hasty: Whether it is wanted at once: coarser, with one quality alone and not fine-tuned.
-        fine_tuned: Whether bricks are fine-tuned against the renderer's pictures, some ten
-            seconds; a hasty package's never are.
-        progress: Gets the share of the export that is done, from 0 to 1, while bricks are
-            fine-tuned. Ctrl-C meanwhile ends that alone.
+            the first few become golden frames. Lens distortion is ignored.
+        metrics: Training metrics, kept in the manifest (JSON).
+        renderer: Renders the exact picture of an avatar.
+        config: Resolution; follows the field's finest cells if None.
+        quick: Bake a coarser package of one tier, not fine-tuned, for a preview during training.
+        fine_tune_bricks: Fine-tune bricks against the renderer's pictures, some ten seconds; has
+            no effect on a quick package.
+        progress: Receives the fraction of the export that is done, from 0 to 1, while bricks are
+            fine-tuned. Ctrl-C meanwhile ends only the fine-tuning.
 
     Raises:
         ExportRefused: If there is nothing to draw, or this machine's onnxruntime does not compute
-            what the graph says.
+            what the graph means.
         OSError: If it cannot be written.
     """
     occupied = avatar.rendering_grid().occupied.cpu().numpy()
@@ -146,94 +159,110 @@ def export_field(
     config: BakeConfig | None = None,
     progress: ExportProgress = lambda _: None,
 ) -> ExportReport:
-    """As `export_avatar`, of any canonical field."""
+    """Write the package of any canonical field; arguments and errors as of `export_avatar`."""
     if not views:
         raise InputError("An avatar cannot be checked without a pose and a camera; give one view.")
     started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
-    # the field, and the renderer with it, is asked on this thread alone
+    # the field, and the renderer with it, is evaluated on this thread alone
     grid = sample_field(field_at, rig, occupied=occupied, config=config)
-    with PackageWriter(path) as draft, ThreadPoolExecutor(2) as executor:
+    with PackageWriter(path) as writer, ThreadPoolExecutor(2) as executor:
         baked = executor.submit(bake_tables, grid, rig, config)
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
-        def finer() -> PlayerTables:
-            better = config.with_finer_voxels()
+        def bake_finer() -> PlayerTables:
+            finer = config.with_finer_voxels()
             return bake_tables(
-                sample_field(field_at, rig, occupied=occupied, config=better), rig, better
+                sample_field(field_at, rig, occupied=occupied, config=finer), rig, finer
             )
 
-        better = _fine_tune(
-            baked.result(), finer, rig, renderer, views, config, executor,
-            lambda share: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * share),
-        )  # fmt: skip
-        tables = better.tables
-        compressed = executor.submit(draft.add_tables, tables)
-        settings = {
-            tier: better.settings if tier == "hq" else QUALITY_TIERS[tier] for tier in config.tiers
-        }
-        package = _unchecked_package(tables, settings, rig, views, metrics)
-        others = {t: executor.submit(Player, package, tier=t) for t in config.tiers if t != "hq"}
-        hq = Player(package)
-        notes, warnings = (
-            {},
-            [INTERRUPTED_WARNING] if config.fine_tuning_pictures and better.psnr is None else [],
-        )
-        for tier in config.tiers:
-            player = hq if tier == "hq" else others[tier].result()
-            looks = slice(None) if tier == "hq" else slice(1)
-            proofs = package.manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
-            worst = check_graph(player, package, tier, proofs)
-            score = mean_psnr_to_renderer(player, views[looks], exact[looks])
-            warnings += quality_warnings(score) if tier == "hq" else []
-            note = package.manifest.tiers[tier]
-            notes[tier] = replace(note, psnr_to_renderer=score, largest_difference=worst)
-        golden = tuple(hq.render(frame.pose, frame.camera) for frame in package.manifest.golden)
-        package = replace(
-            package,
-            manifest=replace(
-                package.manifest, tiers=notes, metrics={**metrics, "warnings": warnings}
+        tuned = _fine_tune(
+            FineTuningInputs(
+                tables=baked.result(), rig=rig, settings=QUALITY_TIERS["hq"], renderer=renderer,
+                views=views, executor=executor,
             ),
-            golden=golden,
-            preview=_encode_png(hq.render(*views[0])),
-        )
+            bake_finer, config.fine_tuning_pictures,
+            lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
+        )  # fmt: skip
+        compressed = executor.submit(writer.add_tables, tuned.tables)
+        settings = {tier: QUALITY_TIERS[tier] for tier in config.tiers} | {"hq": tuned.settings}
+        interrupted = config.fine_tuning_pictures > 0 and tuned.psnr is None
+        package = _checked_package(
+            _unchecked_package(tuned.tables, settings, rig, views, metrics), views, exact, executor,
+            warnings=[INTERRUPTED_WARNING] if interrupted else [],
+        )  # fmt: skip
         compressed.result()
-        size = draft.finish(package)
+        size = writer.finish(package)
+    tiers = package.manifest.tiers
     return ExportReport(
         path=path,
         bytes=size,
         seconds=time.perf_counter() - started,
-        psnr_to_renderer={tier: note.psnr_to_renderer for tier, note in notes.items()},
-        largest_difference=max(note.largest_difference for note in notes.values()),
-        fine_tuning_psnr=better.psnr,
-        warnings=tuple(warnings),
+        psnr_to_renderer={name: tier.psnr_to_renderer for name, tier in tiers.items()},
+        largest_difference=max(tier.largest_difference for tier in tiers.values()),
+        fine_tuning_psnr=tuned.psnr,
+        warnings=tuple(package.manifest.metrics["warnings"]),
     )
 
 
 def _fine_tune(
-    tables: PlayerTables,
-    finer: Callable[[], PlayerTables],
-    rig: Rig,
-    renderer: RenderFunction,
-    views: Sequence[PosedView],
-    config: BakeConfig,
-    executor: Executor,
+    inputs: FineTuningInputs,
+    bake_finer: Callable[[], PlayerTables],
+    max_pictures: int,
     progress: ExportProgress,
 ) -> FineTuningResult:
-    """Fine-tunes, if that is wanted, finer bricks where the player is too far from the renderer.
+    """Fine-tune bricks, finer ones where the player is far from the renderer, until Ctrl-C.
 
-    Ctrl-C leaves the bricks as they are, and goes on.
+    Args:
+        inputs: What is tuned, against what.
+        bake_finer: Bakes tables with finer voxels.
+        max_pictures: Pictures to learn from; 0 for no fine-tuning.
+        progress: Receives the fraction of the fine-tuning that is done.
     """
-    if config.fine_tuning_pictures:
+    if max_pictures:
         with suppress(KeyboardInterrupt):
-            settings = QUALITY_TIERS["hq"]
-            far = is_below_target(tables, rig, settings, renderer, views=views, executor=executor)
-            tables = finer() if far else tables
+            below = is_below_target(inputs)
+            inputs = replace(inputs, tables=bake_finer()) if below else inputs
             return fine_tune(
-                tables, rig, settings, renderer,
-                views=views, max_pictures=config.fine_tuning_pictures, executor=executor, may_add_layers=far, progress=progress,
-            )  # fmt: skip
-    return FineTuningResult(tables=tables, settings=QUALITY_TIERS["hq"], psnr=None)
+                inputs, max_pictures=max_pictures, may_add_layers=below, progress=progress
+            )
+    return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)
+
+
+def _checked_package(
+    package: AvatarPackage,
+    views: Sequence[PosedView],
+    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
+    executor: Executor,
+    warnings: list[str],
+) -> AvatarPackage:
+    """Check every tier; add scores, warnings, golden frames and the preview.
+
+    Args:
+        package: As `_unchecked_package` makes it.
+        views: Poses and cameras.
+        exact: The renderer's pictures of them on white.
+        executor: Opens the other tiers' players while the best one is checked.
+        warnings: Warnings known so far.
+    """
+    manifest = package.manifest
+    others = {t: executor.submit(Player, package, tier=t) for t in manifest.tiers if t != "hq"}
+    hq, tiers = Player(package), {}
+    for tier, info in manifest.tiers.items():
+        player = hq if tier == "hq" else others[tier].result()
+        seen = slice(None) if tier == "hq" else slice(1)
+        frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
+        worst = check_graph(player, package, tier, frames)
+        score = mean_psnr_to_renderer(player, views[seen], exact[seen])
+        warnings = warnings + (quality_warnings(score) if tier == "hq" else [])
+        tiers[tier] = replace(info, psnr_to_renderer=score, largest_difference=worst)
+    metrics = {**manifest.metrics, "warnings": warnings}
+    return replace(
+        package,
+        manifest=replace(manifest, tiers=tiers, metrics=metrics),
+        golden=tuple(hq.render(frame.pose, frame.camera) for frame in manifest.golden),
+        preview=_encode_png(hq.render(*views[0])),
+    )
 
 
 def _unchecked_package(
@@ -243,7 +272,7 @@ def _unchecked_package(
     views: Sequence[PosedView],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
-    """The package as it stands before the checks: no scores, no pictures."""
+    """Build the package without scores and pictures."""
     notes = {
         tier: TierInfo(
             layout=TableLayout.of(tables),

@@ -18,7 +18,7 @@ from export.reference.reference_player import PlayerInputs, TracedPicture, trace
 from preprocess.body.body_pose import BodyPose
 
 MAX_SEGMENTS = 1_600_000
-"""Add no picture beyond this number of segments: rays through fog have many, and need fewer views."""
+"""Add no picture beyond this number of segments; rays through fog have many."""
 
 PosedView = tuple[BodyPose, Camera]
 """A pose and a camera that looks at it."""
@@ -47,7 +47,7 @@ class RenderTargets:
     uncovered_error: Float32[np.ndarray, "pictures"]
 
     def psnr(self, tables: PlayerTables, settings: RenderSettings, codes: VoxelCodes) -> float:
-        """Return the PSNR of the player's pictures to the renderer's on white, dB, mean over them."""
+        """Return the mean PSNR of the player's pictures to the renderer's on white, dB."""
         out = composite_segments(self.segments, settings, tables.bricks, codes)
         error = (picture_on_white(out) - picture_on_white(self.target_colors)) ** 2
         per_ray = np.concatenate([[0.0], np.cumsum(error.sum(axis=1), dtype=np.float64)])

@@ -101,7 +101,7 @@ class PackageWriter:
             OSError: If the folder cannot be written.
         """
         self._draft = AtomicFile(self._path)
-        self._file = self._draft.part.open("wb")
+        self._file = self._draft.temporary_path.open("wb")
         self._archive = zipfile.ZipFile(self._file, "w")
         return self
 

@@ -20,7 +20,7 @@ class RenderSettings:
     uniform_blocks: int = 3
     """Blocks at the nominal spacing; each later block doubles the spacing of the one before."""
     max_blocks: int = 6
-    """Blocks per ray; the last covers what remains. Both counts scale with the number of samples."""
+    """Blocks per ray; the last covers what remains. Both counts grow with the number of samples."""
     further_layer_samples: int = 6
     """Density samples of a ray in each layer after the first, in a single block."""
     min_transmittance: float = 0.01
@@ -49,7 +49,7 @@ class RenderSettings:
     max_entry_margin_m: float = 0.025
     """… and at most this far along the ray, metres."""
     max_entry_shift_m: float = 0.02
-    """Longest distance along the ray between the surfel and the surface point it stands for, metres."""
+    """Longest distance along the ray from the surfel to the surface point it stands for, metres."""
     grazing_factor: float = 1.5
     """Relative lengthening of a segment at grazing incidence (× sin²)."""
     min_cosine: float = 0.1
@@ -66,8 +66,8 @@ class RenderSettings:
     fold_volume_ratio: float = 0.3
     """Posed over canonical volume below which a surfel counts as folded; negative is inside out."""
     fold_depth_offset_m: float = 0.0
-    """Put folded surfels this much deeper into the z-buffer, metres, so that a neighbor with a better
-    conditioned inverse is drawn instead; 0 disables it."""
+    """Put folded surfels this much deeper into the z-buffer, metres, so that a neighbor with a
+    better conditioned inverse is drawn instead; 0 disables it."""
 
     # Layers after the first
     layer_gap_m: float = 0.01

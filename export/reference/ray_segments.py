@@ -144,7 +144,7 @@ _SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != 
 def _march_blocks(
     rays: CanonicalRays, posed: PosedNodes, settings: RenderSettings, samples: int
 ) -> Iterator[tuple[Int64[np.ndarray, "segments"], CanonicalRays, Float32[np.ndarray, "segments"]]]:
-    """Yield, block by block, the numbers of unfinished rays, what is left of them, and their step."""
+    """Yield for each block the numbers of unfinished rays, their remainders and their steps."""
     number, rest = np.arange(len(rays.begin)), rays
     for turn in range(settings.max_blocks * _block_multiple(settings, samples)):
         if turn > 0:

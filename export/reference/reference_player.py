@@ -3,8 +3,8 @@
     traced = trace_picture(tables, codes, settings, inputs)         # rays, as segments of samples
     colors = composite_segments(traced.segments, settings, tables.bricks, codes)
 
-It is written from the tables and the settings alone, with arrays of vectors and numpy's own inverse,
-and shares no code with the graph.
+It is written from the tables and the settings alone, with arrays of vectors and numpy's own
+inverse, and shares no code with the graph.
 """
 
 from dataclasses import dataclass
@@ -342,7 +342,7 @@ def _ray_entries(
     key: Int64[np.ndarray, "pixels"],
     front: _FrontLayer | None,
 ) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"]]:
-    """Return the canonical rays of covered pixels, and the depths at which they enter the surface."""
+    """Return the canonical rays of covered pixels, and the depths at which they enter."""
     surfels, surfel = tables.surfels, _surfel_of_key(key)
     row, column = np.divmod(pixel, inputs.size_px[0])
     plane = (np.stack([column, row], axis=1) + 0.5 - inputs.center) / inputs.focal

@@ -31,7 +31,7 @@ def test_what_surfels_cannot_cover_is_drawn_coarser_and_without_gaps(
     player, close_ups, stand_in, camera, zoom
 ):
     view = nearer(camera(160, 160, distance_m=0.75), zoom)
-    assert close_ups.coarser(player.bones(stand_in.canonical, view), view) > 1.0
+    assert close_ups.downscale_factor(player.bones(stand_in.canonical, view), view) > 1.0
     picture = player.render(stand_in.canonical, view)
     assert picture.shape == (160, 160, 4)
     assert picture[..., 3].min() > 245
@@ -40,13 +40,13 @@ def test_what_surfels_cannot_cover_is_drawn_coarser_and_without_gaps(
 def test_a_usual_picture_is_drawn_as_it_is(player, close_ups, stand_in, bent, camera):
     for pose in (stand_in.canonical, bent):
         for view in (camera(160, 200), camera(1080, 1080), camera(160, 160, distance_m=0.75)):
-            assert close_ups.coarser(player.bones(pose, view), view) == 1.0
+            assert close_ups.downscale_factor(player.bones(pose, view), view) == 1.0
 
 
 def test_what_lies_behind_the_camera_makes_no_close_up(player, close_ups, stand_in, camera):
     view = nearer(camera(160, 160), 60.0)
     behind = replace(stand_in.canonical, root_translation=np.array([0.0, 0.0, 9.0]))
-    assert close_ups.coarser(player.bones(behind, view), view) == 1.0
+    assert close_ups.downscale_factor(player.bones(behind, view), view) == 1.0
 
 
 def test_a_coarser_picture_enlarged_shows_what_the_finer_one_shows(player, stand_in, camera):
@@ -87,6 +87,6 @@ def test_colors_do_not_fade_towards_what_is_transparent():
 def test_the_coarse_camera_sees_the_same_field_of_view(camera):
     view = camera(333, 200)
     rough = downscale_camera(view, 3.3)
-    point = view.directions(np.array([[100.0, 50.0]]))
+    point = view.ray_directions(np.array([[100.0, 50.0]]))
     assert np.allclose(point, rough.ray_directions(np.array([[100.0, 50.0]]) / 3.3))
     assert rough.size_px == (101, 61)

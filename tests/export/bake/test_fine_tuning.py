@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from export.bake.bake_tables import FINER_VOXEL_FACTOR
-from export.bake.fine_tuning import DEEPER_SETTINGS, fine_tune
+from export.bake.fine_tuning import DEEPER_SETTINGS, FineTuningInputs, fine_tune
 from export.build import export_field
 from export.package.package_file import read_package
 from export.package.render_settings import QUALITY_TIERS
@@ -60,10 +60,15 @@ def spoilt(tables):
 def tune(stand_in, views):
     def call(tables, renderer, **more):
         with ThreadPoolExecutor(1) as executor:
-            return fine_tune(
-                tables, stand_in.rig, SETTINGS, renderer,
-                views=list(views.values()), max_pictures=6, executor=executor, **more,
-            )  # fmt: skip
+            inputs = FineTuningInputs(
+                tables=tables,
+                rig=stand_in.rig,
+                settings=SETTINGS,
+                renderer=renderer,
+                views=list(views.values()),
+                executor=executor,
+            )
+            return fine_tune(inputs, max_pictures=6, **more)
 
     return call
 
