@@ -28,6 +28,7 @@ from preprocess.alignment.sanity_checks import sanity_warnings
 from preprocess.alignment.silhouette_objective import (
     SAMPLED_FRAMES,
     SilhouetteObjective,
+    mean_score,
     sample_masks,
 )
 from preprocess.body.silhouette import SkinPoints

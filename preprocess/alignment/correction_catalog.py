@@ -1,7 +1,12 @@
-"""The usual mistakes in a capture, each as the change that would undo it."""
+"""The usual mistakes in a capture, each as the change that would undo it.
 
-from collections.abc import Iterator
+Each function lists corrections of one kind by their descriptions; a change maps a capture's
+geometry to what it should have been.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.corrections import (  # fmt: skip
     Correction,
+    GeometryChange,
     undo_pose_delay,
-    undo_video_mirroring,
     undo_video_offset,
     undo_video_reversal,
     undo_video_rotation,
@@ -20,19 +25,23 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 
 FRAME_OFFSETS = (*range(1, 13), 15, 18, 21, 25, 30, 35, 40, 50, 60)
-"""Frames by which poses may be late or early, at first look."""
+"""Frames by which poses may be late or early, on the coarse grid."""
 MAX_UNMATCHED_OFFSETS = 24
-"""Offsets that are tried, at most, where there are fewer poses than frames."""
+"""Largest number of offsets to try where there are fewer poses than frames."""
 FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
-"""Frames a second that are mistaken for one another."""
+"""Frame rates, Hz, that are mistaken for one another."""
 TRANSLATION_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+"""Metres in each unit that translations may wrongly be given in."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+"""Rotation between camera axes x right, y up, z back and x right, y down, z forward."""
 AXIS_FLIPS = {
     "y has": (1.0, -1.0, 1.0),
     "z has": (1.0, 1.0, -1.0),
     "y and z have": (1.0, -1.0, -1.0),
 }
+"""Signs of the root translation's coordinates, by what is wrong with them."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0])
+"""Reflection that exchanges left and right."""
 MIRRORED_JOINTS = [
     JOINT_NAMES.index(
         name.replace("left", "?").replace("right", "left").replace("?", "right")
@@ -47,12 +56,12 @@ Rotation3 = Float[np.ndarray, "3 3"]
 def body_corrections(
     geometry: CaptureGeometry, pelvis: Float[np.ndarray, "3"], frames: int
 ) -> Iterator[Correction]:
-    """Every discrete mistake that the doctor knows; focal lengths and sizes are fitted instead.
+    """Every discrete mistake between body and masks; focal lengths and sizes are fitted instead.
 
     Args:
-        claim: What the files say.
-        pelvis: Rest place of the pelvis, J0, which the root turns about.
-        frames: How many frames there are.
+        geometry: The capture as its files state it.
+        pelvis: Rest position of the pelvis, J0, about which the root rotates.
+        frames: Number of frames.
     """
     yield Correction(
         cause="mask_polarity",
@@ -61,7 +70,7 @@ def body_corrections(
     )
     yield Correction(
         cause="second_person",
-        description="the masks show somebody else, too, apart from the person whose poses are given",
+        description="the masks show another person, too, apart from the one whose poses are given",
         apply=lambda c: replace(c, keeps_person_only=True),
     )
     yield from _world_frame_corrections(geometry)
@@ -72,9 +81,8 @@ def body_corrections(
         undo_pose_delay(k) for near in FRAME_OFFSETS if near < frames // 2 for k in (near, -near)
     )
     rows = len(geometry.row_frames)
-    if (
-        rows < frames and np.ptp(geometry.row_frames) + 1 == rows
-    ):  # the last frames' poses, or some between
+    consecutive = np.ptp(geometry.row_frames) + 1 == rows
+    if rows < frames and consecutive:  # these may be the last frames' poses, or some in between
         yield from (undo_pose_delay(-k) for k in _spaced_offsets(frames - rows))
     yield from _frame_rate_corrections(geometry, frames)
     yield from _left_right_corrections()
@@ -83,15 +91,15 @@ def body_corrections(
 
 
 def video_corrections(frames: int, mask_count: int, max_offset: int) -> Iterator[Correction]:
-    """Every discrete mistake of a film whose masks and poses agree; crops are fitted instead.
+    """Every discrete mistake of a video whose masks and poses agree; crops are fitted instead.
 
     Args:
-        frames: How many frames the film has.
-        masks: How many masks there are.
-        reach: Frames by which it may be late or early.
+        frames: Number of frames in the video.
+        mask_count: Number of masks.
+        max_offset: Largest number of frames by which the video may be late or early.
     """
     yield from (undo_video_rotation(turns) for turns in (1, 2, 3))
-    yield from (undo_video_mirroring(turns) for turns in range(4))
+    yield from (undo_video_rotation(turns, mirrored=True) for turns in range(4))
     yield from (
         undo_video_offset(k) for near in FRAME_OFFSETS if near <= max_offset for k in (near, -near)
     )
@@ -99,48 +107,55 @@ def video_corrections(frames: int, mask_count: int, max_offset: int) -> Iterator
     yield undo_video_reversal(frames)
 
 
-def _spaced_offsets(most: int) -> list[int]:
-    """Offsets from 1 to `most`, all of them or `MAX_UNMATCHED_OFFSETS`, evenly spread, the last one too."""
-    return (
-        sorted({round(k) for k in np.linspace(1, most, min(most, MAX_UNMATCHED_OFFSETS))})
-        if most > 0
-        else []
-    )
+def _corrections(cause: str, changes: dict[str, GeometryChange]) -> Iterator[Correction]:
+    """Corrections of one cause, from their descriptions and changes."""
+    for description, apply in changes.items():
+        yield Correction(cause=cause, description=description, apply=apply)
+
+
+def _spaced_offsets(largest: int) -> list[int]:
+    """At most `MAX_UNMATCHED_OFFSETS` offsets, evenly spaced from 1 to the largest."""
+    if largest <= 0:
+        return []
+    count = min(largest, MAX_UNMATCHED_OFFSETS)
+    return sorted({round(offset) for offset in np.linspace(1, largest, count)})
 
 
 def _unit_corrections() -> Iterator[Correction]:
-    """Places that are not in metres."""
-    for factor, unit in TRANSLATION_UNITS.items():
-        yield Correction(
-            cause="body_scale",
-            description=f"the poses' translations are in {unit}, not in metres",
-            apply=lambda c, factor=factor: replace(
-                c,
-                motion=replace(c.motion, root_translations=c.motion.root_translations * factor),
-            ),
-        )
+    """Translations that are not in metres."""
+
+    def scaled(motion: Motion, factor: float) -> Motion:
+        return replace(motion, root_translations=motion.root_translations * factor)
+
+    yield from _corrections(
+        "body_scale",
+        {
+            f"the poses' translations are in {unit}, not in metres": _moves(
+                partial(scaled, factor=factor)
+            )
+            for factor, unit in TRANSLATION_UNITS.items()
+        },
+    )
 
 
-def _angle_corrections(claim: CaptureGeometry) -> Iterator[Correction]:
-    """Rotations that are not in radians, of which no joint needs so many."""
-    motion = claim.motion
+def _angle_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
+    """Rotations in degrees, offered where one exceeds a full turn in radians."""
+    motion = geometry.motion
     roots, joints = motion.root_rotations[motion.valid], motion.joint_rotations[motion.valid]
     of_root, of_joints = (_exceeds_full_turn(vectors) for vectors in (roots, joints))
     if of_root or of_joints:
-        yield Correction(
-            cause="root_rotation",
-            description="the rotations are in degrees, not in radians",
-            apply=lambda c: replace(c, motion=_degrees_to_radians(c.motion, of_root, of_joints)),
-        )
+        change = _moves(lambda m: _degrees_to_radians(m, of_root, of_joints))
+        words = "the rotations are in degrees, not in radians"
+        yield from _corrections("root_rotation", {words: change})
 
 
 def _exceeds_full_turn(vectors: Float[np.ndarray, "*rows 3"]) -> bool:
-    """Whether one of the axis-angles turns by more than a whole turn."""
+    """Whether an axis-angle vector turns by more than 2π."""
     return bool((np.linalg.norm(vectors, axis=-1) > 2.0 * np.pi).any())
 
 
 def _degrees_to_radians(motion: Motion, convert_root: bool, convert_joints: bool) -> Motion:
-    """The motion with the root's angles, the joints', or both taken for degrees."""
+    """The motion with the root's angles, the joints', or both converted from degrees."""
     roots, joints = motion.root_rotations, motion.joint_rotations
     return replace(
         motion,
@@ -149,174 +164,162 @@ def _degrees_to_radians(motion: Motion, convert_root: bool, convert_joints: bool
     )
 
 
-def _world_frame_corrections(claim: CaptureGeometry) -> Iterator[Correction]:
-    """Poses and cameras that are told in different worlds."""
-    if not np.allclose(claim.extrinsics, np.eye(4), atol=1e-6):
-        yield Correction(
-            cause="world_frame",
-            description="the poses are in the camera's own frame, and its position is applied twice",
-            apply=lambda c: replace(c, extrinsics=np.broadcast_to(np.eye(4), c.extrinsics.shape)),
-        )
-        yield Correction(
-            cause="world_frame",
-            description="the camera matrices are world-from-camera, not camera-from-world",
-            apply=lambda c: replace(c, extrinsics=np.linalg.inv(c.extrinsics)),
-        )
-        yield Correction(
-            cause="opengl_axes",
-            description="the camera matrices are world-from-camera with OpenGL's axes (y up, z back)",
-            apply=lambda c: replace(
-                c, extrinsics=_rotation_transform(OPENCV_FROM_OPENGL) @ np.linalg.inv(c.extrinsics)
-            ),
-        )
+def _world_frame_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
+    """Poses and cameras in different worlds; none if all cameras are at the origin."""
+    if _cameras_at_origin(geometry):
+        return
+    in_camera = _moves_cameras(lambda e: np.broadcast_to(np.eye(4), e.shape))
+    inverted = _moves_cameras(np.linalg.inv)
+    inverted_opengl = _moves_cameras(lambda e: _transform(OPENCV_FROM_OPENGL) @ np.linalg.inv(e))
+    yield from _corrections(
+        "world_frame",
+        {
+            "the poses are in the camera's own frame, and its position is applied twice": in_camera,
+            "the camera matrices are world-from-camera, not camera-from-world": inverted,
+        },
+    )
+    words = "the camera matrices are world-from-camera with OpenGL's axes (y up, z back)"
+    yield from _corrections("opengl_axes", {words: inverted_opengl})
 
 
-def _axis_corrections(claim: CaptureGeometry) -> Iterator[Correction]:
-    """OpenGL's axes where OpenCV's were expected, in all numbers or in some."""
-    yield Correction(
-        cause="opengl_axes",
-        description="camera space has OpenGL's axes (y up, z back), not OpenCV's (y down, z forward)",
-        apply=lambda c: replace(
-            c, extrinsics=_rotation_transform(OPENCV_FROM_OPENGL) @ c.extrinsics
-        ),
-    )
-    if not np.allclose(claim.extrinsics, np.eye(4), atol=1e-6):
-        yield Correction(
-            cause="opengl_axes",
-            description="the poses' world has y and z the other way round",
-            apply=lambda c: replace(
-                c, extrinsics=c.extrinsics @ _rotation_transform(OPENCV_FROM_OPENGL)
-            ),
+def _axis_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
+    """OpenGL's axes in place of OpenCV's, in all numbers or in some."""
+    flip = OPENCV_FROM_OPENGL
+    changes: dict[str, GeometryChange] = {
+        "camera space has OpenGL's axes (y up, z back), not OpenCV's (y down, z forward)": partial(
+            _rotate_camera_space, turn=flip
         )
-    yield Correction(
-        cause="opengl_axes",
-        description="the roots' rotations and translations have y and z the other way round",
-        apply=lambda c: _rotate_without_pelvis_offset(c, OPENCV_FROM_OPENGL),
+    }
+    if not _cameras_at_origin(geometry):
+        world = partial(_rotate_world_space, turn=flip)
+        changes["the poses' world has y and z the other way round"] = world
+    changes["the roots' rotations and translations have y and z the other way round"] = partial(
+        _rotate_without_pelvis_offset, turn=flip
     )
-    yield Correction(
-        cause="opengl_axes",
-        description="the root's rotation has OpenGL's axes, its translation OpenCV's",
-        apply=lambda c: _rotate_about_pelvis(c, OPENCV_FROM_OPENGL),
+    changes["the root's rotation has OpenGL's axes, its translation OpenCV's"] = partial(
+        _rotate_about_pelvis, turn=flip
     )
     for which, signs in AXIS_FLIPS.items():
-        flip = np.diag(np.array(signs, dtype=np.float64))
-        yield Correction(
-            cause="opengl_axes",
-            description=f"in the root's translation {which} the wrong sign",
-            apply=lambda c, flip=flip: _transform_translations(c, flip),
-        )
+        flipped = partial(_transform_translations, change=np.diag(np.array(signs)))
+        changes[f"in the root's translation {which} the wrong sign"] = flipped
+    yield from _corrections("opengl_axes", changes)
 
 
 def _rotation_corrections() -> Iterator[Correction]:
-    """Quarter turns: pictures that were turned for the tracker, and worlds with another axis up."""
-    for degrees in (90, 180, 270):
-        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-        yield Correction(
-            cause="root_rotation",
-            description=f"the tracker saw the pictures turned by {360 - degrees}°",
-            apply=lambda c, turn=turn: replace(
-                c, extrinsics=_rotation_transform(turn) @ c.extrinsics
-            ),
-        )
-    for axis, degrees in [(a, d) for a in "xyz" for d in (90, 180, 270) if (a, d) != ("x", 180)]:
-        turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-        yield Correction(
-            cause="root_rotation",
-            description=f"the root is turned by {360 - degrees}° about the camera's {axis}",
-            apply=lambda c, turn=turn: _rotate_about_pelvis(c, turn),
-        )
-    for axis, degrees in (("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 180), ("y", 270)):
-        turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-        yield Correction(
-            cause="root_rotation",
-            description=f"the body at rest is turned by {360 - degrees}° about its {axis}",
-            apply=lambda c, turn=turn: _with_root_rotations(c, _root_matrices(c.motion) @ turn),
-        )
+    """Quarter turns: images rotated for the tracker, and worlds with another axis up."""
+    quarters = (90, 180, 270)
+    changes: dict[str, GeometryChange] = {}
+    for degrees in quarters:
+        words = f"the tracker saw the images rotated by {360 - degrees}°"
+        changes[words] = partial(_rotate_camera_space, turn=_rotation("z", degrees))
+    for axis, degrees in [(a, d) for a in "xyz" for d in quarters if (a, d) != ("x", 180)]:
+        words = f"the root is rotated by {360 - degrees}° about the camera's {axis}"
+        changes[words] = partial(_rotate_about_pelvis, turn=_rotation(axis, degrees))
+    for axis, degrees in [(a, d) for a in "xy" for d in quarters]:
+        words = f"the body at rest is rotated by {360 - degrees}° about its {axis}"
+        changes[words] = partial(_rotate_rest_body, turn=_rotation(axis, degrees))
+    yield from _corrections("root_rotation", changes)
+    words = "the poses' world has z up where the camera's has y, or the other way round"
+    converted = f"{words} (rotations and translations were converted without the pelvis's offset)"
     for degrees in (90, 270):
-        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
-        yield Correction(
-            cause="root_rotation",
-            description="the poses' world has z up where the camera's has y, or the other way round",
-            apply=lambda c, turn=turn: replace(
-                c, extrinsics=c.extrinsics @ _rotation_transform(turn)
-            ),
-        )
-        yield Correction(
-            cause="root_rotation",
-            description="the poses' world has z up where the camera's has y, or the other way round "
-            "(rotations and translations were converted without the pelvis's offset)",
-            apply=lambda c, turn=turn: _rotate_without_pelvis_offset(c, turn),
-        )
+        turn = _rotation("x", degrees)
+        world = partial(_rotate_world_space, turn=turn)
+        roots = partial(_rotate_without_pelvis_offset, turn=turn)
+        yield from _corrections("root_rotation", {words: world, converted: roots})
 
 
-def _frame_rate_corrections(claim: CaptureGeometry, frames: int) -> Iterator[Correction]:
-    """Poses of a copy of the video with another number of frames a second, or played backwards."""
-    known = claim.row_frames[np.isfinite(claim.row_frames)]
+def _frame_rate_corrections(geometry: CaptureGeometry, frames: int) -> Iterator[Correction]:
+    """Poses of a copy of the video with another frame rate, or played backwards."""
+
+    def mapped(geometry: CaptureGeometry, factor: float, offset: float) -> CaptureGeometry:
+        return replace(geometry, row_frames=offset + factor * geometry.row_frames)
+
+    known = geometry.row_frames[np.isfinite(geometry.row_frames)]
     if len(known) > 1:
-        ends = known.min() + known.max()
-        yield Correction(
-            cause="frame_rate",
-            description="the film runs backwards against its poses",
-            apply=lambda c: replace(c, row_frames=ends - c.row_frames),
-        )
+        reverse = partial(mapped, factor=-1.0, offset=known.min() + known.max())
+        words = "the video runs backwards against its poses"
+        yield from _corrections("frame_rate", {words: reverse})
     factors = {a / b for a in FRAME_RATES for b in FRAME_RATES if a != b}
-    rows = len(claim.row_frames)
+    rows = len(geometry.row_frames)
     if rows != frames:
         factors.add(frames / rows)
     for factor in sorted(factors):
-        yield Correction(
-            cause="frame_rate",
-            description=f"the poses were made at {1.0 / factor:.3g} times the video's frame rate",
-            apply=lambda c, factor=factor: replace(c, row_frames=c.row_frames * factor),
-        )
+        words = f"the poses were made at {1.0 / factor:.3g} times the video's frame rate"
+        change = partial(mapped, factor=factor, offset=0.0)
+        yield from _corrections("frame_rate", {words: change})
 
 
 def _left_right_corrections() -> Iterator[Correction]:
-    """Left taken for right: in the joints' order, in the body, or in the picture."""
-    yield Correction(
-        cause="left_right",
-        description="the joints of the left and the right side are exchanged",
-        apply=lambda c: replace(
-            c,
-            motion=replace(c.motion, joint_rotations=c.motion.joint_rotations[:, MIRRORED_JOINTS]),
-        ),
-    )
-    yield Correction(
-        cause="left_right",
-        description="the limbs are mirrored",
-        apply=lambda c: replace(c, motion=_mirror_limbs(c.motion)),
-    )
-    yield Correction(
-        cause="left_right",
-        description="the tracker saw the pictures mirrored",
-        apply=lambda c: _mirror_picture(c),
+    """Left and right exchanged: in the joints' order, in the limbs, or in the image."""
+
+    def swapped(motion: Motion) -> Motion:
+        return replace(motion, joint_rotations=motion.joint_rotations[:, MIRRORED_JOINTS])
+
+    yield from _corrections(
+        "left_right",
+        {
+            "the joints of the left and the right side are exchanged": _moves(swapped),
+            "the limbs are mirrored": _moves(_mirror_limbs),
+            "the tracker saw the images mirrored": _mirror_image,
+        },
     )
 
 
 def _root_origin_corrections(pelvis: Float[np.ndarray, "3"]) -> Iterator[Correction]:
-    """EasyMocap turns bodies about the origin, SMPL about the pelvis: R x + t, and back."""
+    """EasyMocap rotates bodies about the origin, SMPL about the pelvis: R x + t, and back."""
 
-    def undo(claim: CaptureGeometry, sign: float) -> CaptureGeometry:
-        moved = sign * (_root_matrices(claim.motion) @ pelvis - pelvis)
-        there = claim.motion.root_translations + moved
-        return replace(claim, motion=replace(claim.motion, root_translations=there))
+    def moved(motion: Motion, sign: float) -> Motion:
+        offset = sign * (_root_matrices(motion) @ pelvis - pelvis)
+        return replace(motion, root_translations=motion.root_translations + offset)
 
-    yield Correction(
-        cause="root_origin",
-        description="the root turns about the origin (EasyMocap, ZJU), not about the pelvis",
-        apply=lambda c: undo(c, 1.0),
-    )
-    yield Correction(
-        cause="root_origin",
-        description="the root's translation was already converted from the origin to the pelvis",
-        apply=lambda c: undo(c, -1.0),
+    about_origin = "the root turns about the origin (EasyMocap, ZJU), not about the pelvis"
+    converted = "the root's translation was already converted from the origin to the pelvis"
+    yield from _corrections(
+        "root_origin",
+        {
+            about_origin: _moves(partial(moved, sign=1.0)),
+            converted: _moves(partial(moved, sign=-1.0)),
+        },
     )
 
 
-def _rotation_transform(rotation: Rotation3) -> Float[np.ndarray, "4 4"]:
+def _moves(change: Callable[[Motion], Motion]) -> GeometryChange:
+    """Lifts a change of the motion to one of the geometry."""
+    return lambda c: replace(c, motion=change(c.motion))
+
+
+def _moves_cameras(
+    change: Callable[[Float[np.ndarray, "cameras 4 4"]], Float[np.ndarray, "cameras 4 4"]],
+) -> GeometryChange:
+    """Lifts a change of the extrinsics to one of the geometry."""
+    return lambda c: replace(c, extrinsics=change(c.extrinsics))
+
+
+def _cameras_at_origin(geometry: CaptureGeometry) -> bool:
+    """Whether world and camera space are the same."""
+    return np.allclose(geometry.extrinsics, np.eye(4), atol=1e-6)
+
+
+def _rotation(axis: str, degrees: int) -> Rotation3:
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+
+def _transform(rotation: Rotation3) -> Float[np.ndarray, "4 4"]:
     transform = np.eye(4)
     transform[:3, :3] = rotation
     return transform
+
+
+def _rotate_camera_space(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
+    return replace(geometry, extrinsics=_transform(turn) @ geometry.extrinsics)
+
+
+def _rotate_world_space(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
+    return replace(geometry, extrinsics=geometry.extrinsics @ _transform(turn))
+
+
+def _rotate_rest_body(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
+    return _with_root_rotations(geometry, _root_matrices(geometry.motion) @ turn)
 
 
 def _root_matrices(motion: Motion) -> Float[np.ndarray, "poses 3 3"]:
@@ -324,55 +327,54 @@ def _root_matrices(motion: Motion) -> Float[np.ndarray, "poses 3 3"]:
 
 
 def _with_root_rotations(
-    claim: CaptureGeometry, roots: Float[np.ndarray, "poses 3 3"]
+    geometry: CaptureGeometry, roots: Float[np.ndarray, "poses 3 3"]
 ) -> CaptureGeometry:
     vectors = Rotation.from_matrix(roots).as_rotvec()
-    return replace(claim, motion=replace(claim.motion, root_rotations=vectors))
+    return replace(geometry, motion=replace(geometry.motion, root_rotations=vectors))
 
 
-def _camera_rotations(claim: CaptureGeometry) -> Float[np.ndarray, "poses 3 3"]:
+def _camera_rotations(geometry: CaptureGeometry) -> Float[np.ndarray, "poses 3 3"]:
     """Rotation from the world into the camera of each row."""
-    return claim.extrinsics[claim.camera_rows(), :3, :3]
+    return geometry.extrinsics[geometry.camera_rows(), :3, :3]
 
 
-def _rotate_about_pelvis(claim: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
-    """The root turned in the camera's axes, about the pelvis, which stays."""
-    cameras = _camera_rotations(claim)
+def _rotate_about_pelvis(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
+    """The root rotated in the camera's axes about the pelvis, which stays."""
+    cameras = _camera_rotations(geometry)
     return _with_root_rotations(
-        claim, np.swapaxes(cameras, 1, 2) @ turn @ cameras @ _root_matrices(claim.motion)
+        geometry, np.swapaxes(cameras, 1, 2) @ turn @ cameras @ _root_matrices(geometry.motion)
     )
 
 
-def _rotate_without_pelvis_offset(claim: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
+def _rotate_without_pelvis_offset(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
     """Root rotations and translations in another world, as converters write them that forget J0.
 
     A pose's pelvis is at J0 + translation, so a correct conversion rotates that sum.
     """
-    motion = claim.motion
+    motion = geometry.motion
     moved = replace(motion, root_translations=motion.root_translations @ turn.T)
-    return _with_root_rotations(replace(claim, motion=moved), turn @ _root_matrices(motion))
+    return _with_root_rotations(replace(geometry, motion=moved), turn @ _root_matrices(motion))
 
 
-def _transform_translations(claim: CaptureGeometry, change: Rotation3) -> CaptureGeometry:
-    """The root's place changed in the camera's axes; its rotation stays."""
-    rows = claim.camera_rows()
-    turned, moved = claim.extrinsics[rows, :3, :3], claim.extrinsics[rows, :3, 3]
-    translations = claim.motion.root_translations
-    seen = np.einsum("cab,cb->ca", turned, translations) + moved
-    back = np.einsum("cba,cb->ca", turned, seen @ change.T - moved)
-    return replace(claim, motion=replace(claim.motion, root_translations=back))
+def _transform_translations(geometry: CaptureGeometry, change: Rotation3) -> CaptureGeometry:
+    """The root translations changed in the camera's axes; the rotations stay."""
+    rows = geometry.camera_rows()
+    rotation, offset = geometry.extrinsics[rows, :3, :3], geometry.extrinsics[rows, :3, 3]
+    in_camera = np.einsum("cab,cb->ca", rotation, geometry.motion.root_translations) + offset
+    in_world = np.einsum("cba,cb->ca", rotation, in_camera @ change.T - offset)
+    return replace(geometry, motion=replace(geometry.motion, root_translations=in_world))
 
 
 def _mirror_limbs(motion: Motion) -> Motion:
-    """Each limb moves as the other side's did in a mirror."""
+    """Each limb takes the mirrored rotations of the other side."""
     limbs = motion.joint_rotations[:, MIRRORED_JOINTS] * np.array([1.0, -1.0, -1.0])
     return replace(motion, joint_rotations=limbs)
 
 
-def _mirror_picture(claim: CaptureGeometry) -> CaptureGeometry:
+def _mirror_image(geometry: CaptureGeometry) -> CaptureGeometry:
     """The person as a mirror shows them, left and right exchanged in the camera's axes."""
-    mirrored = _transform_translations(claim, MIRROR_X)
-    cameras = _camera_rotations(claim)
+    mirrored = _transform_translations(geometry, MIRROR_X)
+    cameras = _camera_rotations(geometry)
     back = np.swapaxes(cameras, 1, 2)
-    roots = back @ MIRROR_X @ cameras @ _root_matrices(claim.motion) @ MIRROR_X
+    roots = back @ MIRROR_X @ cameras @ _root_matrices(geometry.motion) @ MIRROR_X
     return _with_root_rotations(replace(mirrored, motion=_mirror_limbs(mirrored.motion)), roots)

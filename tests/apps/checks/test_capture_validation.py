@@ -123,13 +123,13 @@ def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
 
 FILM_SPOILS = {
     "video_rotation": capture_corruptions.rotate_video(1),
-    "undo_video_mirroring": capture_corruptions.mirror_video,
+    "video_mirrored": capture_corruptions.mirror_video,
     "video_crop": capture_corruptions.crop_video(0.05, 0.05, 0.85),
     "video_offset": capture_corruptions.trim_video(4),
 }
 
 
-@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("undo_video_mirroring",)))
+@pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("video_mirrored",)))
 def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
     folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
     code, said, found = call_check(folder, "--fix", out)

@@ -156,7 +156,7 @@ def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
     write_motion(capture / "poses.npz", back)
     code, said, found = diagnosed("--fix", tmp_path / "mended")
     assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
-    assert "the film runs backwards against its poses" in said
+    assert "the video runs backwards against its poses" in said
     assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
     mended = read_motion(tmp_path / "mended" / "poses.npz")
     np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
