@@ -138,10 +138,11 @@ def _pickles(folder: Path) -> None:
 
     plain = {"a": np.arange(6.0).reshape(2, 3), "l": [1, 2.5, "x", None, (True,)], "s": {1, 2}}
     tensors = {**plain, "t": torch.ones(2, 3)}
+    numbers = {**tensors, "a": torch.ones(3, 2).T}
     files = {f"protocol{n}.pkl": pickle.dumps(plain, n) for n in range(6)}
     files |= {"zlib.pkl": zlib.compress(pickle.dumps(plain)), "object.npy": npy_bytes(tensors)}
-    files |= {"gzip.pkl": gzip.compress(pickle.dumps(plain)), "new.pt": torch_bytes(tensors)}
-    files |= {"old.pt": torch_bytes(tensors, new=False)}
+    files |= {"gzip.pkl": gzip.compress(pickle.dumps(plain)), "new.pt": torch_bytes(numbers)}
+    files |= {"old.pt": torch_bytes(numbers, new=False)}
     files |= {"object.npz": npz_bytes(results=np.array({"deep": plain}, dtype=object))}
     for name, data in files.items():
         (folder / name).write_bytes(data)

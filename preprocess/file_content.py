@@ -1,17 +1,14 @@
-"""Arrays out of .npz archives, with a message for everything that can be wrong with the file.
+"""What a file holds, as dictionaries, lists, numbers, texts and numpy arrays; nothing is run.
 
-What a file of any container holds, as dictionaries, lists, numbers, texts and numpy arrays.
-
-The container is told by the first bytes, not by the file's name: people rename.
+Two readers: `read_npz` for archives of arrays, whose keys are known, and `read_untrusted_file` for
+files of any container. A container is recognised by its first bytes: people rename files.
 """
 
 import io
 import json
-import lzma
 import zipfile
 import zlib
-from bz2 import BZ2Decompressor
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +17,8 @@ from jaxtyping import Shaped
 
 from capture.image_folder import natural_sort_key
 from capture.input_error import InputError
-from preprocess.pickles.pickle_records import product
-from preprocess.pickles.plain_pickle import (
-    MAX_BYTES,
-    explain_failures,
-    load_plain_pickle,
-    read_limited,
-)
+from preprocess.pickle_records import element_count
+from preprocess.safe_pickle import MAX_BYTES, explain_failures, load_pickle, read_limited
 
 MAX_UNPACKED_BYTES = 4 << 30
 """Archives that would unpack to more are refused."""
@@ -48,7 +40,8 @@ def read_npz(
             size = sum(entry.file_size for entry in archive.infolist())
         if size > MAX_UNPACKED_BYTES:
             raise InputError(
-                f"{path} unpacks to {size >> 20} MiB; more than {MAX_UNPACKED_BYTES >> 20} MiB are not read."
+                f"{path} unpacks to {size >> 20} MiB; more than {MAX_UNPACKED_BYTES >> 20} MiB are "
+                "not read."
             )
         with np.load(path, allow_pickle=False) as archive:
             wanted = [key for key in (keys or archive.files) if key in archive.files]
@@ -74,6 +67,8 @@ NON_POSE_SUFFIXES = frozenset(
 """Endings of files that people name by mistake."""
 
 UNSUPPORTED_MAGIC = {
+    b"BZh": "packed by bzip2; unpack it first",
+    b"\xfd7zXZ": "packed by xz; unpack it first",
     b"\x89HDF": "an HDF5 file; of PeopleSnapshot's: python -c \"import h5py, numpy; f = "
     "h5py.File('reconstructed_poses.hdf5'); numpy.savez('poses.npz', **{k: f[k][()] for k in f})\"",
     b"MATLAB": "a .mat of MATLAB; write global_orient, body_pose and transl to an .npz",
@@ -90,7 +85,7 @@ MAX_FOLDER_FILES = 100_000
 
 
 def read_untrusted_file(path: Path) -> Any:
-    """What a file holds; of a folder a dictionary of its files in natural order, by their names.
+    """What a file holds; for a folder a dictionary of its files in natural order, by their names.
 
     Raises:
         InputError: If it is missing, damaged, too large, or asks to run something.
@@ -113,9 +108,10 @@ def _folder(path: Path) -> dict[str, Any]:
         key=natural_sort_key,
     )
     if not files or len(files) > MAX_FOLDER_FILES:
+        endings = ", ".join(sorted(POSE_FILE_SUFFIXES))
         raise InputError(
-            f"{path} is a folder with {len(files)} files ({', '.join(sorted(POSE_FILE_SUFFIXES))}); expected "
-            "a file of poses, or a folder with one for each frame or person."
+            f"{path} is a folder with {len(files)} files ({endings}); expected a file of poses, or "
+            "a folder with one for each frame or person."
         )
     return {file.name: read_untrusted_file(file) for file in files}
 
@@ -129,19 +125,15 @@ def _decode(data: bytes, path: Path) -> Any:
     if data.startswith(b"\x93NUMPY"):
         return _npy(data)
     if data[:1] == b"\x78" and (data[0] * 256 + data[1]) % 31 == 0:
-        return load_plain_pickle(_decompress(lambda: _inflated(data, zlib.MAX_WBITS)))
+        return load_pickle(_inflate(data, zlib.MAX_WBITS))
     if data.startswith(b"\x1f\x8b"):
-        return load_plain_pickle(_decompress(lambda: _inflated(data, 16 + zlib.MAX_WBITS)))
-    if data.startswith(b"BZ"):
-        return load_plain_pickle(_decompress(lambda: _blocks(BZ2Decompressor(), data)))
-    if data.startswith((b"\xfd7zXZ", b"\x5d\x00")):
-        return load_plain_pickle(_decompress(lambda: _blocks(lzma.LZMADecompressor(), data)))
+        return load_pickle(_inflate(data, 16 + zlib.MAX_WBITS))
     for magic, words in UNSUPPORTED_MAGIC.items():
         if data.startswith(magic):
             raise ValueError(words)
     if data[:64].lstrip()[:1] in (b"{", b"["):
         return _json(data, path)
-    return load_plain_pickle(data)
+    return load_pickle(data)
 
 
 def _json(data: bytes, path: Path) -> Any:
@@ -150,7 +142,7 @@ def _json(data: bytes, path: Path) -> Any:
     except (ValueError, RecursionError):
         if path.suffix.lower() == ".json":
             raise
-        return load_plain_pickle(data)  # a pickle may begin with a bracket, too
+        return load_pickle(data)  # a pickle may begin with a bracket, too
 
 
 def _zip(data: bytes) -> Any:
@@ -159,22 +151,10 @@ def _zip(data: bytes) -> Any:
         entries = {entry.filename: entry for entry in archive.infolist()}
         if sum(entry.file_size for entry in entries.values()) > 4 * MAX_BYTES:
             raise ValueError(f"it unpacks to more than {4 * MAX_BYTES >> 20} MiB")
-        program = next((name for name in entries if name.endswith("data.pkl")), None)
-        if program is None:
+        if not any(name.endswith("data.pkl") for name in entries):
             names = [name for name in entries if name.endswith(".npy")]
             return {name.removesuffix(".npy"): _npy(archive.read(name)) for name in names}
-        root = program.removesuffix("data.pkl")
-        order = archive.read(root + "byteorder") if root + "byteorder" in entries else b"little"
-        if order != b"little":
-            raise ValueError("numbers of a big-endian machine")
-
-        def fetch(name: str, length: int) -> bytes:
-            raw = archive.read(f"{root}data/{name}")
-            if len(raw) < length:
-                raise ValueError("a storage that is cut off")
-            return raw or bytes(1)
-
-        return load_plain_pickle(archive.read(program), fetch)
+    return load_pickle(data)
 
 
 def _npy(data: bytes) -> Any:
@@ -188,41 +168,31 @@ def _npy(data: bytes) -> Any:
     )
     shape, by_columns, kind = read(stream)
     if kind.hasobject:
-        return load_plain_pickle(data[stream.tell() :])
+        return load_pickle(data[stream.tell() :])
     if kind.names or kind.subdtype:
         raise ValueError("an array of records")
-    numbers = np.frombuffer(data, kind, product(shape), stream.tell())
+    numbers = np.frombuffer(data, kind, element_count(shape), stream.tell())
     array = numbers.reshape(shape, order="F" if by_columns else "C")
     if kind.kind in "US":
         return array.item() if array.ndim == 0 else array.tolist()
     return array
 
 
-def _decompress(pieces: Callable[[], Iterator[bytes]]) -> bytes:
-    """All pieces as one, once their sizes were counted: what is too large is not kept at all."""
+def _inflate(data: bytes, bits: int) -> bytes:
+    """zlib's and gzip's content; its size is counted before anything of it is kept."""
     size = 0
-    for piece in pieces():
+    for piece in _inflated(data, bits):
         size += len(piece)
         if size > MAX_BYTES:
             raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
-    return b"".join(pieces())
+    return b"".join(_inflated(data, bits))
 
 
 def _inflated(data: bytes, bits: int) -> Iterator[bytes]:
-    """zlib's and gzip's content, piece after piece."""
+    """The content, piece after piece."""
     inflater = zlib.decompressobj(bits)
     for start in range(0, len(data), CHUNK_BYTES):
         packed = data[start : start + CHUNK_BYTES]
         while packed and not inflater.eof:
             yield inflater.decompress(packed, CHUNK_BYTES)
             packed = inflater.unconsumed_tail
-
-
-def _blocks(unpacker: BZ2Decompressor | lzma.LZMADecompressor, data: bytes) -> Iterator[bytes]:
-    """bzip2's and LZMA's content, piece after piece."""
-    for start in range(0, len(data), CHUNK_BYTES):
-        if unpacker.eof:
-            return
-        yield unpacker.decompress(data[start : start + CHUNK_BYTES], CHUNK_BYTES)
-        while not (unpacker.needs_input or unpacker.eof):
-            yield unpacker.decompress(b"", CHUNK_BYTES)

@@ -13,7 +13,7 @@ from capture.input_error import InputError
 from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import BodyModel, ShapedBody
 from preprocess.file_content import read_npz
-from preprocess.pickles.plain_pickle import read_pickled_arrays
+from preprocess.safe_pickle import read_pickled_arrays
 
 REQUIRED_BODY_KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 BODY_KEYS = (*REQUIRED_BODY_KEYS, "J_regressor", "J", "J_shapedirs", "posedirs")

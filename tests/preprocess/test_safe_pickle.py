@@ -20,8 +20,8 @@ from scipy import sparse
 
 from capture.input_error import InputError
 from preprocess.body.body_file import load_body_model
-from preprocess.pickles import plain_pickle as pickles
-from preprocess.pickles.plain_pickle import read_pickled_arrays
+from preprocess import safe_pickle
+from preprocess.safe_pickle import read_pickled_arrays
 
 
 class Python2Pickler(pickle._Pickler):
@@ -191,7 +191,7 @@ def test_records_inside_cannot_be_turned_against_the_reader(tmp_path, chumpy):
 def test_a_file_beyond_the_limit_is_not_even_read(tmp_path, monkeypatch):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"a": np.zeros(1000)}))
-    monkeypatch.setattr(pickles, "MAX_BYTES", 1000)
+    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 1000)
     with pytest.raises(InputError, match="are not read"):
         read_pickled_arrays(path, ("a",))
 

@@ -1,7 +1,7 @@
 """Files that mean harm, and thousands of random ones: refused with a reason, or read; no worse.
 
 A few hundred are tried with every run, and as many as one likes with
-`IA_FUZZ=10000 pytest tests/preprocess/poses -k random`; benchmarks.fuzz_readers tries every reader.
+`IA_FUZZ=10000 pytest tests/preprocess/pose_formats -k random`; benchmarks.fuzz_readers tries every reader.
 """
 
 import gzip
@@ -25,9 +25,9 @@ import torch
 
 from benchmarks.fuzz_mutations import mutate_bytes, random_opcodes
 from capture.input_error import InputError
+from preprocess import safe_pickle
 from preprocess.body.body_file import load_body_model
 from preprocess.file_content import read_untrusted_file
-from preprocess.pickles import plain_pickle as pickles
 from preprocess.pose_formats.pose_format_registry import read_poses
 
 FILES = int(os.environ.get("IA_FUZZ", "300"))
@@ -117,6 +117,7 @@ def containers(thing, joblib_bytes) -> dict[str, bytes]:
 
 
 KINDS = tuple(containers(1, lambda thing: b""))
+TORCH_KINDS = ("torch", "torch, old")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -146,6 +147,8 @@ def test_code_in_a_storage_of_a_tensor_is_refused(tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kind):
     thing = {"n": np.arange(6.0).reshape(2, 3), "t": (1, 2.5, "x", None, True), 3: {"é": [b"b"]}}
+    if kind in TORCH_KINDS:
+        thing |= {"n": torch.from_numpy(thing["n"]), 3: {"é": ["b"]}}
     path = tmp_path / "any"
     path.write_bytes(containers(thing, joblib_bytes)[kind])
     found = read_untrusted_file(path)
@@ -155,6 +158,23 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
     np.testing.assert_array_equal(found["n"], thing["n"])
     assert found["t"] == [1, 2.5, "x", None, True]
     assert found[3] == {"é": ["b"]}
+
+
+@pytest.mark.parametrize("kind", TORCH_KINDS)
+def test_numpy_arrays_beside_tensors_are_refused_with_advice(tmp_path, kind):
+    path = tmp_path / "poses.pt"
+    path.write_bytes(containers(np.zeros(3), lambda thing: b"")[kind])
+    with pytest.raises(InputError, match=r"numpy's objects; save tensors, or use numpy\.savez"):
+        read_untrusted_file(path)
+
+
+@pytest.mark.parametrize("kind", [*TORCH_KINDS, "tensor in an array"])
+def test_without_pytorch_a_file_of_tensors_says_what_to_install(tmp_path, monkeypatch, kind):
+    path = tmp_path / "poses.pt"
+    path.write_bytes(containers(1, lambda thing: b"")[kind])
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match=r"pip install 'instant-avatar-stream\[learn\]'"):
+        read_untrusted_file(path)
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -236,7 +256,7 @@ def sparse_bombs() -> bytes:
 def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
     path = tmp_path / "bomb"
     path.write_bytes(make())
-    monkeypatch.setattr(pickles, "MAX_BYTES", 16 << 20)
+    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 16 << 20)
     monkeypatch.setattr("preprocess.file_content.MAX_BYTES", 16 << 20)
     tracemalloc.start()
     try:
@@ -250,7 +270,7 @@ def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
 def test_many_sparse_matrices_may_not_grow_beyond_the_limit_together(tmp_path, monkeypatch):
     path = tmp_path / "bomb"
     path.write_bytes(sparse_bombs())
-    monkeypatch.setattr(pickles, "MAX_BYTES", 300 << 20)
+    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 300 << 20)
     with pytest.raises(InputError, match="grow beyond 300 MiB"):
         read_poses(path)
 
