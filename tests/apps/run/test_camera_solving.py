@@ -1,9 +1,11 @@
 """Tests for cameras that a run solves: its process, its folder, its report, its end."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -16,10 +18,10 @@ from rich.console import Console as RichConsole
 
 from apps.cli.console import Console
 from apps.cli.exit_codes import CommandExit
-from apps.run import solver_process as solving_module
+from apps.run import solver_process
 from apps.run.camera_solving import CameraSolving, apply_camera_solution
 from apps.run.run_folder import RunFolder
-from apps.run.solver_process import SolveJob, SolverProcess, make_person_mask
+from apps.run.solver_process import SolveJob, SolverProcess, StageProgress, make_person_mask
 from capture.input_error import InputError
 from export.bake.bake_tables import ExportRefused
 from preprocess.alignment.mask_alignment import body_height_m
@@ -150,7 +152,7 @@ def test_a_camera_that_stood_stays_where_it_is(walkaround, solved_run):
 
 
 def test_the_same_job_is_not_solved_twice(walkaround, solved_run, monkeypatch):
-    monkeypatch.setattr(solving_module.subprocess, "Popen", None)
+    monkeypatch.setattr(solver_process, "_environment_of_child", None)  # nothing is started
     with SolverProcess(job_of(walkaround), solved_run) as solving:
         assert (
             solving.wait(quiet()).frame_status.tolist()
@@ -173,30 +175,40 @@ def test_another_job_has_another_folder(walkaround, tmp_path):
     before = moved.key()
     copy.write_bytes(copy.read_bytes() + b" ")
     assert moved.key() != before
-    for one in (job, others[1]):
-        assert SolveJob.of(json.loads(json.dumps(one.as_json()))) == one
 
 
 def test_what_is_stopped_leaves_no_process_and_is_taken_up_again(walkaround, tmp_path):
     stop = threading.Event()
     with SolverProcess(job_of(walkaround), tmp_path) as solving:
         process = solving._process
-        while not (solving.folder / "key frames").exists() and process.poll() is None:
+        while not (solving.folder / "key frames").exists() and process.is_alive():
             time.sleep(0.05)
         stop.set()
         assert solving.wait(quiet(), stop) is None
-        assert process.poll() is not None
+        assert not process.is_alive()
     assert (solving.folder / "key frames").exists()
     assert not (solving.folder / "solved.json").exists()
     with pytest.raises(ProcessLookupError):
         os.kill(process.pid, 0)
 
 
-def test_the_process_ends_with_who_started_it(walkaround, tmp_path):
-    with SolverProcess(job_of(walkaround), tmp_path) as solving:
-        process = solving._process
-        process.stdin.close()  # as the system does for a process that was killed
-        assert process.wait(timeout=30.0) == 130
+def test_the_process_ends_with_a_parent_that_is_killed(walkaround, tmp_path):
+    job = job_of(walkaround)
+    code = (
+        "import os, pathlib, sys; from apps.run.solver_process import *\n"
+        "paths = dict(zip(('video', 'poses', 'masks'), map(pathlib.Path, sys.argv[2:])))\n"
+        "job = SolveJob(paths=CaptureInputs(cameras='solve', **paths), seed=0, threads=1)\n"
+        "solving = SolverProcess(job, pathlib.Path(sys.argv[1]))\n"
+        "print(solving._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    named = [job.paths.video, job.paths.poses, job.paths.masks]
+    words = [sys.executable, "-c", code, str(tmp_path), *map(str, named)]
+    child = int(subprocess.run(words, check=False, capture_output=True, text=True).stdout)
+    deadline = time.monotonic() + 30.0
+    while Path(f"/proc/{child}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{child}").exists()
 
 
 def test_a_process_that_breaks_is_said_with_its_log(walkaround, tmp_path):
@@ -323,11 +335,12 @@ def test_what_is_solved_when_the_run_is_stopped_counts(walkaround, solved_run, t
     stop = threading.Event()
     stop.set()
     with SolverProcess(job_of(walkaround), tmp_path) as solving:
-        ended = subprocess.Popen(["true"])
-        ended.wait()
+        ended = multiprocessing.get_context("spawn").Process(target=int)
+        ended.start()
+        ended.join()
         solving._process = ended
-        solving._lines.put(json.dumps({"stage": "frames between", "share": 1.0}))
-        solving._lines.put(None)
+        solving._messages.put(StageProgress("frames between", 1.0))
+        solving._messages.put(None)
         assert solving.wait(quiet(), stop) is not None
 
 
