@@ -85,6 +85,7 @@ def _tensor(
 ) -> Any:
     """A view of a storage; it may not reach beyond it, for PyTorch would enlarge it then."""
     import torch
+    import torch._utils
 
     if not isinstance(storage, torch.storage.TypedStorage) or len(size) != len(stride):
         raise ValueError("a tensor without its numbers")
