@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 COARSEST_M = 0.13
 """Cells of the coarsest hash level: 16 along a two-metre box."""
@@ -21,13 +20,6 @@ MAX_LOG_DENSITY_STEP = 4.0
 """Logarithm of the density may change by so much along a finest cell, where that is asked."""
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that count as one second where steps are counted instead: what two cores make."""
-SkippingScheme = Literal["canonical", "union", "frame", "none"]
-"""What is known of empty space: our canonical occupancy, the paper's grid in the body frame, one
-for the sequence or one for each frame (InstantAvatar, §3.3), or nothing."""
-RootScheme = Literal["cells", "broyden"]
-"""How samples are warped: by our warp cells, or each by Broyden's method (Fast-SNARF)."""
-EmptySpaceScheme = Literal["occupancy", "global"]
-"""Where density is penalised: in empty cells (InstantAvatar, §3.4), or in the whole box."""
 HELD_OUT_STRIDE = 10
 """Every so manieth frame is held out, unless somebody says otherwise."""
 
@@ -101,31 +93,11 @@ class TrainConfig:
     """Every so manieth frame is held out; 0 for none."""
     seed: int = 0
     """Of everything random."""
-    skipping: SkippingScheme = "canonical"
-    """How empty space is skipped. All but "canonical" are there to repeat the paper's tables."""
-    roots: RootScheme = "cells"
-    """How samples find their canonical points; "broyden" is the paper's way."""
-    empty_term: EmptySpaceScheme = "occupancy"
-    """Where emptiness is asked for; "global" is the prior that the paper argues against."""
 
     def __post_init__(self) -> None:
-        """Derives the seconds of the schedule from the steps; refuses what cannot be combined.
-
-        Raises:
-            ValueError: If two of the choices contradict each other.
-        """
+        """Derives the seconds of the schedule from the steps, where steps are counted."""
         if self.steps:
             object.__setattr__(self, "seconds", self.steps / NOMINAL_STEPS_PER_S)
-        if self.roots == "broyden" and self.refine_poses:
-            raise ValueError(
-                "roots='broyden' warps samples without cells, and it is the cells that carry a "
-                "pose's gradient: set refine_poses=False."
-            )
-        if self.skipping == "none" and self.empty_term == "occupancy" and self.empty_space_weight:
-            raise ValueError(
-                "skipping='none' knows no empty cells that could be kept empty: set "
-                "empty_space_weight=0 or empty_term='global'."
-            )
 
     @property
     def max_log_density_slope_per_m(self) -> float:

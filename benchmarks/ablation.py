@@ -23,6 +23,7 @@ from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.field.avatar_model import Avatar
 from avatar.training.training_frame import TrainingFrame
+from baselines.instant_avatar.samplers import BaselineScheme
 from benchmarks.ablation_page import AblationPage, written
 from benchmarks.hardware import Hardware
 from benchmarks.paired_training import (
@@ -52,30 +53,41 @@ LOSS_VARIANTS = [
         changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0},
     ),
     Variant(name="w/o total variation", changes={**POSES_AS_GIVEN, "density_tv_weight": 0.0}),
-    Variant(name="global sparsity instead", changes={**POSES_AS_GIVEN, "empty_term": "global"}),
-]
-CORRESPONDENCE_VARIANTS = [
-    Variant(name="union grid, cells", changes={**POSES_AS_GIVEN, "skipping": "union"}),
-    Variant(name="per-frame grids, cells", changes={**POSES_AS_GIVEN, "skipping": "frame"}),
     Variant(
-        name="no skipping, cells",
-        changes={**POSES_AS_GIVEN, "skipping": "none", "empty_space_weight": 0.0},
+        name="global sparsity instead",
+        changes=POSES_AS_GIVEN,
+        scheme=BaselineScheme(empty_term="global"),
+    ),
+]
+NO_EMPTY_SPACE = {**POSES_AS_GIVEN, "empty_space_weight": 0.0}
+CORRESPONDENCE_VARIANTS = [
+    Variant(
+        name="union grid, cells", changes=POSES_AS_GIVEN, scheme=BaselineScheme(skipping="union")
+    ),
+    Variant(
+        name="per-frame grids, cells",
+        changes=POSES_AS_GIVEN,
+        scheme=BaselineScheme(skipping="frame"),
+    ),
+    Variant(
+        name="no skipping, cells", changes=NO_EMPTY_SPACE, scheme=BaselineScheme(skipping="none")
     ),
 ]
 BROYDEN_VARIANTS = [
-    Variant(name="canonical occupancy, Broyden", changes={**POSES_AS_GIVEN, "roots": "broyden"}),
+    Variant(
+        name="canonical occupancy, Broyden",
+        changes=POSES_AS_GIVEN,
+        scheme=BaselineScheme(roots="broyden"),
+    ),
     Variant(
         name=PAPER,
-        changes={**POSES_AS_GIVEN, "roots": "broyden", "skipping": "union"},
+        changes=POSES_AS_GIVEN,
+        scheme=BaselineScheme(skipping="union", roots="broyden"),
     ),
     Variant(
         name="no skipping, Broyden",
-        changes={
-            **POSES_AS_GIVEN,
-            "roots": "broyden",
-            "skipping": "none",
-            "empty_space_weight": 0.0,
-        },
+        changes=NO_EMPTY_SPACE,
+        scheme=BaselineScheme(skipping="none", roots="broyden"),
     ),
 ]
 REFINEMENT_VARIANTS = [
@@ -215,14 +227,19 @@ def time_schemes(ours: Avatar, theirs: Avatar, scene: AblationData) -> list[Sche
     step = max(1, len(scene.novel) // TIMED_POSES)
     pictures = scene.novel[::step][:TIMED_POSES]
     rows = [
-        time_scheme("canonical occupancy, cells", ours, pictures, skipping="canonical", roots="cells"),
-        time_scheme("per-frame grid, cells", ours, pictures, skipping="frame", roots="cells"),
-        time_scheme("no skipping, cells", ours, pictures, skipping="none", roots="cells"),
+        time_scheme("canonical occupancy, cells", ours, pictures, scheme=None),
+        time_scheme(
+            "per-frame grid, cells", ours, pictures, scheme=BaselineScheme(skipping="frame")
+        ),
+        time_scheme("no skipping, cells", ours, pictures, scheme=BaselineScheme(skipping="none")),
         time_scheme(
             "per-frame grid, Broyden (the paper)", theirs, pictures,
-            skipping="frame", roots="broyden",
+            scheme=BaselineScheme(skipping="frame", roots="broyden"),
         ),
-        time_scheme("no skipping, Broyden", theirs, pictures, skipping="none", roots="broyden"),
+        time_scheme(
+            "no skipping, Broyden", theirs, pictures,
+            scheme=BaselineScheme(skipping="none", roots="broyden"),
+        ),
     ]  # fmt: skip
     for row in rows:
         print(row, file=sys.stderr, flush=True)

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from avatar.config import TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
@@ -15,6 +16,7 @@ from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from avatar.training.training_step import cosine_decay
 from avatar.training.warmup import warm_up
+from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 from benchmarks.sample_training import training_config
 from benchmarks.stopwatch import limit_threads
 
@@ -26,10 +28,11 @@ SLICE_S = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """A row: what it is called, and what of the recipe it changes."""
+    """A row of a table: its name, its changes to the configuration, and its scheme."""
 
     name: str
     changes: Mapping[str, Any]
+    scheme: BaselineScheme = field(default_factory=BaselineScheme)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +88,15 @@ class VariantRun:
     """A variant under way."""
 
     variant: Variant
-    trainer: Trainer
+    scheme_trainer: BaselineTrainer
     spent_s: float = 0.0
     late_s: float = 0.0
     late_steps: int = 0
+
+    @property
+    def trainer(self) -> Trainer:
+        """The trainer that the scheme drives."""
+        return self.scheme_trainer.trainer
 
     def progress(self, budget: TrainingBudget) -> float:
         """Share of the budget that is used up."""
@@ -100,7 +108,9 @@ class VariantRun:
         """One turn."""
         began = now = time.process_time()
         while now - began < SLICE_S and (done := self.progress(budget)) < 1.0:
-            self.trainer.step(rate=cosine_decay(done), hard_surface_share=min(1.0, 4.0 * done))
+            self.scheme_trainer.step(
+                rate=cosine_decay(done), hard_surface_share=min(1.0, 4.0 * done)
+            )
             before, now = now, time.process_time()
             self.spent_s += now - before
             if done >= LATE_PHASE_START:
@@ -121,15 +131,31 @@ def train_variants(
     runs = []
     for variant in variants:
         seconds = budget.seconds or 60.0
-        trainer = Trainer(rig, training_config(recording, seconds, **variant.changes), device)
+        config = training_config(recording, seconds, **variant.changes)
+        compile_kernels(rig, config, device, variant.scheme, frames[0])
+        trainer = BaselineTrainer(rig, config, device, variant.scheme)
         for frame in frames:
             trainer.add_frame(frame)
-        warm_up(trainer)
-        runs.append(VariantRun(variant=variant, trainer=trainer))
+        runs.append(VariantRun(variant=variant, scheme_trainer=trainer))
     while under_way := [run for run in runs if run.progress(budget) < 1.0]:
         for run in under_way:
             run.train_slice(budget)
     return runs
+
+
+def compile_kernels(
+    rig: Rig,
+    config: TrainConfig,
+    device: torch.device,
+    scheme: BaselineScheme,
+    frame: TrainingFrame,
+) -> None:
+    """Compiles every kernel that a variant uses, in a trainer that is thrown away."""
+    trainer = BaselineTrainer(rig, replace(config, rays=64), device, scheme)
+    trainer.add_frame(frame)
+    warm_up(trainer.trainer)
+    for _ in range(config.occupancy_interval):
+        trainer.step(rate=1.0, hard_surface_share=1.0)
 
 
 def score_variant(

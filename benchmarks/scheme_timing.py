@@ -3,15 +3,16 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from avatar.config import RootScheme, SkippingScheme
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.field.avatar_model import Avatar
 from avatar.render import render
-from baselines.instant_avatar.samplers import render_sampler
+from baselines.instant_avatar.samplers import BaselineScheme
+from baselines.instant_avatar.scheme_rendering import render_sampler, render_samples
 from benchmarks.paired_training import VariantQuality
 
 
@@ -38,26 +39,33 @@ def time_scheme(
     avatar: Avatar,
     pictures: Sequence[HeldOutFrame],
     *,
-    skipping: SkippingScheme,
-    roots: RootScheme,
+    scheme: BaselineScheme | None,
 ) -> SchemeTiming:
-    """Draws every picture; the first is drawn once before, so that kernels are compiled."""
-    ready, draw, scores = [], [], []
+    """Renders every picture by a scheme, or by our renderer where it is None.
+
+    The first picture is rendered once before, which compiles the kernels.
+    """
+    setup_ms, render_ms, scores = [], [], []
     for picture in [pictures[0], *pictures]:
         seen = picture.observation
         began = time.process_time()
         cells = CorrespondenceGrid.solve(avatar.rig, seen.pose.joint_rotations)
-        if roots == "broyden":  # of the cells only their box is used, which costs nothing
+        if (
+            scheme is not None and scheme.roots == "broyden"
+        ):  # of the cells only their box is used, which costs nothing
             began = time.process_time()
-        along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots=roots)
+        draw = render
+        if scheme is not None:
+            sample_rays = render_sampler(avatar, seen.pose, cells, scheme)
+            draw = partial(render_samples, sample_rays=sample_rays)
         prepared = time.process_time()
-        image = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
-        ready.append(1000.0 * (prepared - began))
-        draw.append(1000.0 * (time.process_time() - prepared))
+        image = draw(avatar, seen.pose, seen.camera, cells=cells)
+        setup_ms.append(1000.0 * (prepared - began))
+        render_ms.append(1000.0 * (time.process_time() - prepared))
         scores.append(score_rendering(image, picture))
     return SchemeTiming(
         name=name,
-        setup_ms=float(np.median(ready[1:])),
-        render_ms=float(np.median(draw[1:])),
+        setup_ms=float(np.median(setup_ms[1:])),
+        render_ms=float(np.median(render_ms[1:])),
         quality=VariantQuality.of(scores[1:]),
     )

@@ -46,7 +46,7 @@ def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
     def ours() -> None:
         field.table_grad.zero_()
         compute_gradients(
-            field, seen.trainer.sampler, replay.correspondences, batch, config,
+            avatar, seen.trainer.sampler, replay.correspondences, batch, config,
             hard_surface_share=1.0, generator=_seeded(device),
         )  # fmt: skip
 

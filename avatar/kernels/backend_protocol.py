@@ -4,7 +4,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int32, Int64, Integer, UInt8
+from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from avatar.deformation.rig import Rig
@@ -118,41 +118,6 @@ class SkinningVolume(NamedTuple):
     nodes_per_m: Float32[Tensor, "3"]
 
 
-class PosedOccupancy(NamedTuple):
-    """Which cells of each slot's body frame may hold anything (`baselines.instant_avatar`).
-
-    Attributes:
-        occupied: Above 0 where something may be.
-        low: Corner of each slot's grid, metres.
-        cells_per_m: Along each axis.
-        shape: Cells along each axis.
-        near, far: Corners of the box between whose walls samples lie, metres.
-    """
-
-    occupied: Integer[Tensor, "slots cells"]
-    low: Float32[Tensor, "slots 3"]
-    cells_per_m: Float32[Tensor, "slots 3"]
-    shape: Int32[Tensor, "slots 3"]
-    ray_box_low: Float32[Tensor, "slots 3"]
-    ray_box_high: Float32[Tensor, "slots 3"]
-
-
-class BlendedTransforms(NamedTuple):
-    """Poses as Fast-SNARF keeps them: blended transforms of each, and where searches start.
-
-    Attributes:
-        blended: Σ w_j B_j on the nodes of the canonical box.
-        low: Its corner, metres.
-        nodes_per_m: Nodes per metre along each axis.
-        inverses: From body to canonical frame, of the bones that searches start with.
-    """
-
-    blended: Float32[Tensor, "slots x y z 12"]
-    low: Float32[Tensor, "3"]
-    nodes_per_m: Float32[Tensor, "3"]
-    inverses: Float32[Tensor, "slots starts 12"]
-
-
 class MarchSettings(NamedTuple):
     """How a ray is sampled.
 
@@ -262,19 +227,4 @@ class Backend(Protocol):
         bones: Float32[Tensor, "24 12"],
     ) -> None:
         """Moves a slot's roots, in place, after its pose."""
-        ...
-
-    def sample_occupied_cells(
-        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
-    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        """Samples of the body frame in a grid's occupied cells, and how many each ray has."""
-        ...
-
-    def find_all_roots(
-        self,
-        points: Float32[Tensor, "points 3"],
-        slots: Int32[Tensor, "points"],
-        poses: BlendedTransforms,
-    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-        """Where each of Fast-SNARF's searches ends, and which found a root of its own."""
         ...

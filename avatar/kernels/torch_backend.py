@@ -4,20 +4,18 @@ from typing import final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Float32, Int32
 from torch import Tensor
 
 from avatar.deformation.rig import Rig
 from avatar.kernels import torch_reference, torch_skinning
 from avatar.kernels.backend_protocol import (
-    BlendedTransforms,
     CorrespondenceTables,
     DensityGrid,
     Features,
     HashTable,
     MarchSettings,
     Points,
-    PosedOccupancy,
     PremultipliedPixels,
     RawOutputs,
     RayBatch,
@@ -27,7 +25,6 @@ from avatar.kernels.backend_protocol import (
 )
 from avatar.kernels.hash_levels import HashLevels
 from avatar.kernels.torch_correspondence import solve_correspondences
-from baselines.instant_avatar import broyden_kernels, occupied_samples
 
 
 @final
@@ -137,9 +134,9 @@ class TorchBackend:
     ) -> Float32[Tensor, "rays 24 6"]:
         ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.counts)
         slot = slots[ray].long()
-        broyden_kernels = cells.roots[slot, samples.root_rows.long()]
+        roots = cells.roots[slot, samples.root_rows.long()]
         wrench = torch_skinning.bone_wrenches(
-            samples.points, grad_points, broyden_kernels, bones[slot], *skin
+            samples.points, grad_points, roots, bones[slot], *skin
         )
         return wrench.new_zeros(len(slots), 24, 6).index_add_(0, ray, wrench)
 
@@ -155,16 +152,3 @@ class TorchBackend:
         torch_skinning.update_roots(
             index, cells.low[slot], cells.cell_m, cells.roots[slot], *skin, bones
         )
-
-    def sample_occupied_cells(
-        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
-    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        return occupied_samples.sample_occupied_cells(*rays, step_m, *grid)
-
-    def find_all_roots(
-        self,
-        points: Float32[Tensor, "points 3"],
-        slots: Int32[Tensor, "points"],
-        poses: BlendedTransforms,
-    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-        return broyden_kernels.find_all_roots(points, slots, *poses)

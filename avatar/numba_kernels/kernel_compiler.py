@@ -1,9 +1,7 @@
-"""The one way in which this project compiles Python to machine code.
+"""Compiles Python to machine code with numba, and gives kernels a type of four float32.
 
-Four float32 in one machine register: the entries of the hash grid inside compiled kernels.
-
-LLVM finds vectors in a loop over points, not in four numbers that are gathered and scattered. Said
-outright, they make the hash grid's kernels two to three times faster.
+LLVM vectorises a loop over points, but not four numbers that are gathered and scattered, such as an
+entry of the hash grid. As an explicit vector they make its kernels two to three times faster.
 """
 
 import functools
@@ -20,22 +18,24 @@ from numba.core.types import Type, float32, intp, none
 from numba.extending import intrinsic, models, register_model
 
 FAST_MATH: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
-"""Of a kernel: sums may be reordered, nothing raises on a zero divisor, other threads run on."""
+"""Kernel options: sums may be reordered, division by zero does not raise, the GIL is released."""
+CALLEE_FOLDERS = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "kernels")
+"""Folders whose kernels and constants kernels in any folder may use."""
 NO_ALLOCATION: dict[str, Any] = {**FAST_MATH, "_nrt": False}
-"""Of a kernel that allocates nothing: no array is counted when it is named or passed on. Counting
-is atomic, and takes half of the time where arrays go from one small kernel to the next."""
+"""Kernel options without allocation: arrays are not reference-counted. The counting is atomic and
+takes half of the time where arrays pass from one small kernel to the next."""
 
 
 def compile_kernel(
     *, cache: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator: `numba.njit(**options)` with the machine code kept on disk.
+    """Decorates a kernel: `numba.njit(**options)` with the machine code cached on disk.
 
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
-    wrapper; so the function is unwrapped first. Numba recompiles when the function's own file has
-    changed, but not when a kernel that it calls lies in another; so here the kept code belongs to
-    the sources of the whole folder. Where neither the folder nor the home folder can be written
-    to, nothing is kept, and every process compiles anew.
+    wrapper, so the function is unwrapped first. Numba invalidates its cache when the function's own
+    file changes, but not when a kernel that it calls does; the cache is therefore stamped with the
+    sources of the kernel's folder and of the avatar's kernel folders. Where neither the folder nor
+    the home folder is writable, every process compiles again.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -46,7 +46,7 @@ def compile_kernel(
             kernel = numba.njit(**options)(plain)
         file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if file is not None:
-            file._source_stamp = _source_digest(Path(plain.__code__.co_filename).parent)
+            file._source_stamp = _source_digest(Path(plain.__code__.co_filename).resolve().parent)
         return kernel
 
     return decorate
@@ -54,15 +54,17 @@ def compile_kernel(
 
 @functools.cache
 def _source_digest(folder: Path) -> str:
-    """A digest of every source in a folder."""
+    """Digest of every source that a kernel in a folder may be compiled from."""
     digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in sorted(
+        {source for each in (folder, *CALLEE_FOLDERS) for source in each.glob("*.py")}
+    ):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
 FAST_MATH_FLAGS = ("fast",)
-"""What `avatar.numba_kernels.kernel_compiler.FAST` allows: a product and a sum may be one instruction."""
+"""LLVM flags of `FAST_MATH`: a product and a sum may become one instruction."""
 FLOAT4 = ir.VectorType(ir.FloatType(), 4)
 
 

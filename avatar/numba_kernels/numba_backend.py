@@ -5,19 +5,17 @@ from typing import final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import (
-    BlendedTransforms,
     CorrespondenceTables,
     DensityGrid,
     Features,
     HashTable,
     MarchSettings,
     Points,
-    PosedOccupancy,
     PremultipliedPixels,
     RawOutputs,
     RayBatch,
@@ -32,7 +30,6 @@ from avatar.numba_kernels import (
     numba_rendering,
     numba_skinning,
 )
-from baselines.instant_avatar import broyden_kernels, occupied_samples
 
 _SCRATCH = threading.local()
 MAX_REUSED_SAMPLES = 1 << 20
@@ -205,31 +202,3 @@ class NumbaBackend:
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
             *(part.numpy() for part in skin), bones.numpy(),
         )  # fmt: skip
-
-    def sample_occupied_cells(
-        self, rays: RayBatch, grid: PosedOccupancy, step_m: float
-    ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-        count = torch.empty(len(rays.slots), dtype=torch.int32)
-        given = (
-            *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
-        )  # fmt: skip
-        occupied_samples.count_samples_numba(*given, np.empty((0, 3), np.float32), count.numpy())
-        points = torch.empty(int(count.sum()), 3)
-        first = torch.cumsum(count, 0) - count
-        occupied_samples.write_samples_numba(*given, points.numpy(), first.numpy())
-        return points, count
-
-    def find_all_roots(
-        self,
-        points: Float32[Tensor, "points 3"],
-        slots: Int32[Tensor, "points"],
-        poses: BlendedTransforms,
-    ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-        starts = poses.inverses.shape[1]
-        found = torch.empty(len(points), starts, 3)
-        valid = torch.empty(len(points), starts, dtype=torch.bool)
-        broyden_kernels.find_all_roots_numba(
-            points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
-            found.numpy(), valid.numpy(),
-        )  # fmt: skip
-        return found, valid

@@ -21,6 +21,7 @@ UNLIMITED_STEPS = 10**9
 
 @compile_kernel(inline="always")
 def nonzero(x):
+    """A ray direction's component, kept away from zero so that it can be divided by."""
     return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 

@@ -82,7 +82,7 @@ def fit_test_poses(
     for step in range(steps):
         batch = replay.sample_rays(config.rays, generator)
         compute_gradients(
-            field, sampler, replay.correspondences, batch, config,
+            avatar, sampler, replay.correspondences, batch, config,
             hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
         field.table_grad.zero_()

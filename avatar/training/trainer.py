@@ -23,8 +23,12 @@ from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.optimizer import UncompiledAdam, update_ema
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.training_frame import TrainingFrame
-from avatar.training.training_step import StepResult, compute_gradients
-from baselines.instant_avatar.samplers import sampler_for
+from avatar.training.training_step import (
+    OccupancySampler,
+    RaySampler,
+    StepResult,
+    compute_gradients,
+)
 
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
@@ -65,14 +69,14 @@ class Trainer:
         )  # fmt: skip
         start = torch.Generator().manual_seed(config.seed)
         self.field = RadianceField(levels, self.backend, device, start)
-        learner = Avatar(
+        self.learner = Avatar(
             rig=rig,
             field=self.field,
             occupancy=OccupancyGrid(rig, device),
             sample_step_m=config.sample_step_m,
         )
-        self.sampler = sampler_for(config, learner)
-        self.avatar = replace(learner, field=self.field.clone())
+        self.sampler: RaySampler = OccupancySampler(self.backend, self.learner.occupancy, config)
+        self.avatar = replace(self.learner, field=self.field.clone())
         self.replay = ReplayBuffer(config.replay_capacity, device)
         self.poses = PoseOptimizer(rig, config.replay_capacity, device)
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
@@ -80,7 +84,7 @@ class Trainer:
         self.wall_seconds = self.cpu_seconds = 0.0
         self.step_wall_seconds = self.step_cpu_seconds = 0.0
         self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
-        self._generator = torch.Generator(device=device).manual_seed(config.seed)
+        self.generator = torch.Generator(device=device).manual_seed(config.seed)
         rate = config.learning_rate
         self.optimizer = UncompiledAdam(
             [
@@ -98,12 +102,15 @@ class Trainer:
             return self.steps / NOMINAL_STEPS_PER_S
         return self.wall_seconds
 
-    def add_frame(self, frame: TrainingFrame, *, is_restored: bool = False) -> None:
-        """Takes in a frame to learn from.
+    def add_frame(self, frame: TrainingFrame, *, is_restored: bool = False) -> int:
+        """Adds a frame to the replay buffer and its pose to the optimizer.
 
         Args:
-            frame: Made ready.
-            again: It was learnt from before a checkpoint, and counts no second time.
+            frame: Frame to train on.
+            is_restored: Whether it was trained on before a checkpoint, and is not counted again.
+
+        Returns:
+            The replay slot that holds the frame.
         """
         slot = self.replay.add(frame)
         known = self.pose_corrections.get(frame.index)
@@ -111,10 +118,10 @@ class Trainer:
         self.poses.set_pose(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
             resolve_correspondences(self.avatar.rig, self.replay, self.poses, slot)
-        self.sampler.add_frame(slot, self.replay.correspondences, self.poses.bones[slot])
         self.frames_seen += not is_restored
         if not is_restored:
             self._discard_old_corrections()
+        return slot
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -139,17 +146,16 @@ class Trainer:
         """
         config, field = self.config, self.field
         falling = rate if pose_rate is None else pose_rate
-        batch = self.replay.sample_rays(config.rays, self._generator)
-        remembers = self.steps % config.occupancy_interval < 2
+        batch = self.replay.sample_rays(config.rays, self.generator)
         refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
         refines = refines and self.poses.freeze_converged(self.steps)
         result = compute_gradients(
-            field, self.sampler, self.replay.correspondences, batch, config,
+            self.learner, self.sampler, self.replay.correspondences, batch, config,
             hard_surface_share=hard_surface_share,
             surface_share=1.0 - falling,
-            density_cache=self.avatar.occupancy.density_grid if remembers else None,
+            caches_density=self.steps % config.occupancy_interval < 2,
             poses=self.poses if refines else None,
-            generator=self._generator,
+            generator=self.generator,
         )  # fmt: skip
         for group, base in zip(
             self.optimizer.param_groups, (1.0, NETWORK_RATE_FACTOR), strict=True
@@ -162,7 +168,6 @@ class Trainer:
         self.replay.update_errors(batch.rays.slots.long(), result.loss)
         if self.steps % config.occupancy_interval == 0:
             self._update_occupancy(1.0 - falling)
-        self.sampler.update(self.steps, self.replay.correspondences, self._generator)
         self.steps += 1
         update_ema(self.avatar.field, field, self.steps)
         self.rays += config.rays
@@ -193,7 +198,7 @@ class Trainer:
             min_density=self.config.min_occupied_density * surface_share,
             drop_floaters=not clearing,
             sample_step_m=self.config.sample_step_m,
-            generator=self._generator,
+            generator=self.generator,
         )
 
 

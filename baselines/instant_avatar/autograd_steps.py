@@ -191,7 +191,7 @@ def _skin_points(
 
 
 @torch.no_grad()
-def find_roots_in_torch(
+def find_start_roots(
     scene: PaperStepInputs, targets: Float32[Tensor, "points 3"]
 ) -> tuple[Float32[Tensor, "bones points 3"], Bool[Tensor, "bones points"]]:
     """A root from each bone for every sample, and which came to rest at a place of their own."""
@@ -228,7 +228,7 @@ def paper_step(
 ) -> tuple[int, int]:
     """Gradients of the loss; how many samples survived, and how many roots were asked."""
     points, count, step = stratified_samples(scene, batch)
-    roots, valid = find_roots_in_torch(scene, points)
+    roots, valid = find_start_roots(scene, points)
     raw = field.raw_outputs_at(torch.cat([roots[valid], empty]))
     asked = int(valid.sum())
     candidates = raw.new_full((*valid.shape, 4), -30.0)

@@ -1,26 +1,63 @@
-"""What it means to find all canonical roots of a sample, as Fast-SNARF does, in plain torch.
+"""All canonical roots of posed samples by Broyden's method (Fast-SNARF): in torch, and compiled."""
 
-All canonical roots of samples by Broyden's method, as in Fast-SNARF, compiled for the CPU.
-"""
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from numba import prange
 from torch import Tensor
 
+from avatar.kernels.backend_protocol import Backend
 from avatar.kernels.torch_skinning import broyden_roots
 from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.numba_kernels.numba_broyden import solve_root
 from avatar.numba_kernels.numba_skinning import MATRIX_LANES, transform_point
 
+F32 = np.float32
 START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
-"""Fast-SNARF's: a search starts where each of these bones alone would carry the sample."""
+"""Joints of Fast-SNARF: a search starts where each bone's inverse transform puts the sample."""
 SAME_ROOT_M = 1e-3
-"""Roots closer than this are one."""
+"""Distance below which two roots are the same, metres."""
+SAMPLES_PER_CHUNK = 256
+"""Samples of a parallel task, which share its buffers."""
+
+
+class BlendedTransforms(NamedTuple):
+    """Blended skinning transforms of several poses, and the bones at which searches start.
+
+    Attributes:
+        blended: Σ w_j B_j at the nodes of the canonical box.
+        low: Corner of the box, metres.
+        nodes_per_m: Nodes per metre along each axis.
+        inverses: Transforms from the body to the canonical frame of `START_BONES`.
+    """
+
+    blended: Float32[Tensor, "slots x y z 12"]
+    low: Float32[Tensor, "3"]
+    nodes_per_m: Float32[Tensor, "3"]
+    inverses: Float32[Tensor, "slots starts 12"]
 
 
 def find_all_roots(
+    backend: Backend,
+    points: Float32[Tensor, "points 3"],
+    slots: Int32[Tensor, "points"],
+    poses: BlendedTransforms,
+) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
+    """The point at which each of Fast-SNARF's searches ends, and whether it is a new root."""
+    if backend.name == "torch":
+        return find_roots_in_torch(points, slots, *poses)
+    roots = torch.empty(len(points), poses.inverses.shape[1], 3)
+    valid = torch.empty(roots.shape[:2], dtype=torch.bool)
+    find_all_roots_numba(
+        points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
+        roots.numpy(), valid.numpy(),
+    )  # fmt: skip
+    return roots, valid
+
+
+def find_roots_in_torch(
     points: Float[Tensor, "points 3"],
     slots: Int32[Tensor, "points"],
     blended: Float[Tensor, "slots x y z 12"],
@@ -31,19 +68,19 @@ def find_all_roots(
     """Every canonical point that skinning carries to a sample, by Broyden's method (§3.2).
 
     Args:
-        points: Samples, each in the body frame of its slot.
-        slots: Which pose each belongs to.
-        blended: Σ w_j B_j on the nodes of the canonical box, for each slot.
-        low, nodes_per_m: Where those nodes are.
-        inverses: From body to canonical frame, of the bones that searches start with.
+        points: Samples, each in the body frame of its slot, metres.
+        slots: Pose of each sample.
+        blended: Σ w_j B_j at the nodes of the canonical box, for each slot.
+        low, nodes_per_m: Corner of that box, metres, and density of its nodes.
+        inverses: Transforms from the body to the canonical frame of the start bones.
 
     Returns:
-        Where each search ended, and whether that is a root which no earlier search had found.
+        The point at which each search ends, and whether no earlier search found the same root.
     """
     starts = inverses.shape[1]
     roots = points.new_zeros(len(points), starts, 3)
     valid = torch.zeros(len(points), starts, dtype=torch.bool, device=points.device)
-    # a volume of blended transforms is one of twelve weights, whose bones are unit vectors
+    # blended transforms are a volume of twelve "weights" whose "bones" are unit vectors
     unit = torch.eye(12).to(points)
     for slot in slots.unique().tolist():
         here = (slots == slot).nonzero()[:, 0]
@@ -61,14 +98,9 @@ def find_all_roots(
     return roots, valid
 
 
-F32 = np.float32
-SAMPLES_PER_CHUNK = 256
-"""Samples that share a thread's buffers."""
-
-
 @compile_kernel(parallel=True, **FAST_MATH)
 def find_all_roots_numba(points, slots, blended, low, nodes_per_m, inverses, roots, valid):
-    """Where each search of each sample ends, and whether no earlier one had found that root."""
+    """The point at which each search of each sample ends, and whether it is a new root."""
     count = points.shape[0]
     for chunk in prange((count + SAMPLES_PER_CHUNK - 1) // SAMPLES_PER_CHUNK):
         blend, inverse = np.empty(MATRIX_LANES, np.float32), np.empty(9, np.float32)

@@ -1,12 +1,7 @@
-"""What it means to place samples through a grid of the body frame, in plain torch.
-
-Samples along rays in the occupied cells of a body frame's grid, compiled for the CPU.
-
-The lattice is walked twice: once to count, once to write, for nobody knows before how many
-samples a ray will have.
-"""
+"""Lattice samples along rays in the occupied cells of a body-frame grid: in torch, and compiled."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,11 +9,53 @@ from jaxtyping import Bool, Float32, Int32, Integer
 from numba import prange
 from torch import Tensor
 
+from avatar.kernels.backend_protocol import Backend, RayBatch
 from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.numba_kernels.numba_rendering import nonzero
 
+F32, I32 = np.float32, np.int32
+
+
+class PosedOccupancy(NamedTuple):
+    """Occupied cells in the body frame of each slot.
+
+    Attributes:
+        occupied: Above 0 where a cell is occupied.
+        low: Corner of each slot's grid, metres.
+        cells_per_m: Cells per metre along each axis.
+        shape: Cells along each axis.
+        ray_box_low, ray_box_high: Corners of the box that bounds the samples of a ray, metres.
+    """
+
+    occupied: Integer[Tensor, "slots cells"]
+    low: Float32[Tensor, "slots 3"]
+    cells_per_m: Float32[Tensor, "slots 3"]
+    shape: Int32[Tensor, "slots 3"]
+    ray_box_low: Float32[Tensor, "slots 3"]
+    ray_box_high: Float32[Tensor, "slots 3"]
+
 
 def sample_occupied_cells(
+    backend: Backend, rays: RayBatch, grid: PosedOccupancy, step_m: float
+) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
+    """Body-frame samples of rays in a grid's occupied cells, and their number for each ray.
+
+    The compiled kernels walk the lattice twice, to count and to write, since the number of samples
+    of a ray is unknown before.
+    """
+    if backend.name == "torch":
+        return sample_in_torch(*rays, step_m, *grid)
+    counts = torch.empty(len(rays.slots), dtype=torch.int32)
+    given = (
+        *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
+    )  # fmt: skip
+    count_samples_numba(*given, np.empty((0, 3), np.float32), counts.numpy())
+    points = torch.empty(int(counts.sum()), 3)
+    write_samples_numba(*given, points.numpy(), (torch.cumsum(counts, 0) - counts).numpy())
+    return points, counts
+
+
+def sample_in_torch(
     origins: Float32[Tensor, "rays 3"],
     directions: Float32[Tensor, "rays 3"],
     slots: Int32[Tensor, "rays"],
@@ -33,11 +70,11 @@ def sample_occupied_cells(
 ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
     """Samples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
 
-    A ray enters the box between `near` and `far`, and ends where it leaves it. Beyond the grid its
-    outermost cells count.
+    A ray is sampled inside the box between `near` and `far`. Outside the grid the nearest cell of
+    its border counts.
 
     Returns:
-        Points of the body frame, ray by ray, and how many each ray has.
+        Points in the body frame, ray by ray, and the number of samples of each ray.
     """
     slot = slots.long()
     towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
@@ -56,14 +93,11 @@ def sample_occupied_cells(
     return points[kept], kept.sum(dim=1).int()
 
 
-F32, I32 = np.float32, np.int32
-
-
 @compile_kernel(**FAST_MATH)
 def _march_ray_numba(
     origin, towards, jitter, step_m, occupied, low, cells_per_m, shape, near, far, points, first
 ):
-    """Samples of one ray; they are written from row `first` on, unless it is negative."""
+    """Counts one ray's samples, and writes them from row `first` on unless that is negative."""
     enter, leave = F32(0), F32(1e9)
     for axis in range(3):
         direction = nonzero(towards[axis])
@@ -106,7 +140,7 @@ def count_samples_numba(
     nowhere,
     counts,
 ):
-    """How many samples each ray has."""
+    """Counts the samples of each ray."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
         counts[ray] = _march_ray_numba(
@@ -131,7 +165,7 @@ def write_samples_numba(
     points,
     first,
 ):
-    """Writes each ray's samples, from its own row on."""
+    """Writes the samples of each ray from its first row on."""
     for ray in prange(origins.shape[0]):
         slot = slots[ray]
         _march_ray_numba(

@@ -15,14 +15,17 @@ from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
-    BlendedTransforms,
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
     RayBatch,
 )
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
-from baselines.instant_avatar.broyden_kernels import START_BONES
+from baselines.instant_avatar.broyden_kernels import (
+    START_BONES,
+    BlendedTransforms,
+    find_all_roots,
+)
 
 ONE_SAMPLE_STEP_M = 1e3
 """A step that leaves every box at once: a ray is asked at its origin alone."""
@@ -136,7 +139,7 @@ class BroydenWarp:
         cells: CorrespondenceTables,
     ) -> CanonicalPoints:
         """The densest root of each sample; the field is asked only where there are several."""
-        roots, valid = self._field.backend.find_all_roots(points, slots, self.poses)
+        roots, valid = find_all_roots(self._field.backend, points, slots, self.poses)
         valid &= self._is_accepted(roots)
         several = (valid.sum(dim=1) > 1).nonzero()[:, 0]
         best = valid.int().argmax(dim=1)

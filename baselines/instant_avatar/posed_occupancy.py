@@ -17,7 +17,8 @@ from torch import Tensor
 
 from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid
-from avatar.kernels.backend_protocol import CorrespondenceTables, PosedOccupancy
+from avatar.kernels.backend_protocol import CorrespondenceTables
+from baselines.instant_avatar.occupied_samples import PosedOccupancy
 from baselines.instant_avatar.posed_field import PosedField
 
 

@@ -1,17 +1,18 @@
-"""The paper's order of things: skip in the body frame, warp what is left, ask all of it.
+"""The baselines' samplers, and the training step that keeps their grids up to date.
 
-Which sampler a recipe asks for, in training and in rendering.
+The paper skips empty space in the body frame and finds the canonical root of each sample that is
+left; the field is queried at all of them.
 """
 
-from collections.abc import Callable
-from typing import final
+from dataclasses import dataclass
+from typing import Literal, final
 
 import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.config import RootScheme, SkippingScheme, TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.config import TrainConfig
+from avatar.deformation.rig import Rig
 from avatar.field.avatar_model import Avatar
 from avatar.kernels.backend_protocol import (
     Backend,
@@ -20,8 +21,10 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.render import correspondence_tables
-from avatar.training.training_step import OccupancySampler, RaySampler
+from avatar.training.trainer import Trainer
+from avatar.training.training_frame import TrainingFrame
+from avatar.training.training_step import OccupancySampler, RaySampler, StepResult
+from baselines.instant_avatar.occupied_samples import sample_occupied_cells
 from baselines.instant_avatar.posed_field import (
     BroydenWarp,
     CanonicalWarp,
@@ -35,37 +38,36 @@ from baselines.instant_avatar.posed_occupancy import (
     PosedEmptySpace,
     SequenceGrid,
 )
-from preprocess.body.body_pose import BodyPose
 
 
 @final
 class PosedSampler:
-    """Samples of the body frame that are not known to be empty, each warped on its own.
+    """Samples the occupied cells of the body frame and warps each sample on its own.
 
-    No ray ends early: every sample up to the far wall of the person's box is there.
+    A ray does not end at a surface: its samples reach to the far wall of the person's box.
     """
 
     def __init__(
         self, backend: Backend, emptiness: PosedEmptySpace, warp: CanonicalWarp, step_m: float
     ) -> None:
-        """A sampler.
+        """Combines a body-frame occupancy with a warp.
 
         Args:
-            backend: Places samples.
-            emptiness: Where none need be.
-            warp: Carries them to canonical space.
+            backend: Selects torch or the compiled kernels.
+            emptiness: Occupancy in the body frame.
+            warp: Carries samples to canonical space.
             step_m: Distance between samples along a ray, metres.
         """
         self._backend, self._emptiness = backend, emptiness
         self._warp, self._step_m = warp, step_m
 
-    def sample_rays(self, rays: RayBatch, cells: CorrespondenceTables) -> RaySamples:
-        """Canonical samples along rays; what has no canonical point is left out."""
-        points, placed = self._backend.sample_occupied_cells(
-            rays, self._emptiness.posed_occupancy(cells), self._step_m
+    def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
+        """Canonical samples along rays; a sample without a canonical point is left out."""
+        points, placed = sample_occupied_cells(
+            self._backend, rays, self._emptiness.posed_occupancy(correspondences), self._step_m
         )
         slots = rays.slots.repeat_interleave(placed)
-        warped = self._warp(points, slots, cells)
+        warped = self._warp(points, slots, correspondences)
         before = torch.nn.functional.pad(torch.cumsum(warped.has_root.int(), 0), (1, 0))
         last = torch.cumsum(placed, 0)
         first = before[last - placed]
@@ -73,177 +75,163 @@ class PosedSampler:
         return RaySamples(warped.points, first, count.int(), warped.root_rows)
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """What is known to be empty."""
+        """Canonical points in cells that are known to be empty, at most `count`."""
         return self._emptiness.sample_empty(count, generator)
 
-    def sample_interior(
-        self, count: int, generator: torch.Generator
-    ) -> Float32[Tensor, "points 3"]:
-        """None: the paper asks nothing of them."""
-        return torch.zeros(0, 3, device=generator.device)
-
-    def sample_inner_leg(
-        self, count: int, generator: torch.Generator
-    ) -> Float32[Tensor, "points 3"]:
-        """None, likewise."""
-        return torch.zeros(0, 3, device=generator.device)
-
     def add_frame(
-        self, slot: int, cells: CorrespondenceTables, bones: Float32[Tensor, "24 12"]
+        self, slot: int, correspondences: CorrespondenceTables, bones: Float32[Tensor, "24 12"]
     ) -> None:
-        """Both parts learn of the frame."""
-        self._warp.set_pose(slot, bones)
-        self._emptiness.add_frame(slot, cells)
+        """Registers the frame that a slot holds from now on.
 
-    def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
-        """Grids are renewed when it is time."""
-        self._emptiness.update(steps, cells, generator)
+        Args:
+            slot: Slot of the frame.
+            correspondences: Correspondence grids of all slots.
+            bones: Transforms from the canonical to the body frame in the frame's pose.
+        """
+        self._warp.set_pose(slot, bones)
+        self._emptiness.add_frame(slot, correspondences)
+
+    def update(
+        self, steps: int, correspondences: CorrespondenceTables, generator: torch.Generator
+    ) -> None:
+        """Renews the grids, if it is time.
+
+        Args:
+            steps: Steps before the one that has just been made.
+            correspondences: Correspondence grids of all slots.
+            generator: Source of random numbers, on the field's device.
+        """
+        self._emptiness.update(steps, correspondences, generator)
 
 
 @final
 class GlobalSparsitySampler:
-    """Another sampler, but emptiness is asked for everywhere: the paper's Global Sparsity.
+    """Samples rays as another sampler does, and penalises density in the whole box.
 
-    The prior that the paper's Fig. 5 compares with: it biases the density of every point towards
-    zero, the person's own included.
+    This is the prior that the paper's Fig. 5 compares with: it biases the density of every point
+    towards zero, the person's own included.
     """
 
     def __init__(
         self, sampler: RaySampler, low: Float32[Tensor, "3"], high: Float32[Tensor, "3"]
     ) -> None:
-        """Asks for emptiness anywhere in the box between two corners."""
+        """Penalises density anywhere between two corners of a box, metres."""
         self._sampler, self._low, self._high = sampler, low, high
 
-    def sample_rays(self, rays: RayBatch, cells: CorrespondenceTables) -> RaySamples:
-        """The other's."""
-        return self._sampler.sample_rays(rays, cells)
+    def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
+        """Samples of the other sampler."""
+        return self._sampler.sample_rays(rays, correspondences)
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of the whole box."""
         place = torch.rand(count, 3, generator=generator, device=generator.device)
         return self._low + place.to(self._low.device) * (self._high - self._low)
 
-    def sample_interior(
-        self, count: int, generator: torch.Generator
-    ) -> Float32[Tensor, "points 3"]:
-        """The other's."""
-        return self._sampler.sample_interior(count, generator)
 
-    def sample_inner_leg(
-        self, count: int, generator: torch.Generator
-    ) -> Float32[Tensor, "points 3"]:
-        """The other's."""
-        return self._sampler.sample_inner_leg(count, generator)
+@dataclass(frozen=True, kw_only=True)
+class BaselineScheme:
+    """How empty space is skipped, how canonical roots are found, and where density is penalised."""
 
-    def add_frame(
-        self, slot: int, cells: CorrespondenceTables, bones: Float32[Tensor, "24 12"]
-    ) -> None:
-        """The other learns of it."""
-        self._sampler.add_frame(slot, cells, bones)
+    skipping: Literal["canonical", "union", "frame", "none"] = "canonical"
+    """Occupancy: ours in canonical space, the paper's in the body frame (one grid for the sequence
+    or one for each frame, §3.3), or none."""
+    roots: Literal["cells", "broyden"] = "cells"
+    """Root finding: our correspondence grid, or Broyden's method for each sample (Fast-SNARF)."""
+    empty_term: Literal["occupancy", "global"] = "occupancy"
+    """Density penalty: in empty cells (§3.4), or in the whole box."""
 
-    def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
-        """The other is renewed."""
-        self._sampler.update(steps, cells, generator)
+    def check(self, config: TrainConfig) -> None:
+        """Refuses a combination that cannot be trained.
 
-
-PROBES_PER_RENDERED_POSE = 5
-"""Probes of each cell when a pose is rendered, as in the released code."""
-
-
-def sampler_for(config: TrainConfig, avatar: Avatar) -> RaySampler:
-    """The sampler that a recipe asks for."""
-    sampler: RaySampler
-    if config.skipping == "canonical" and config.roots == "cells":
-        sampler = OccupancySampler(avatar.field.backend, avatar.occupancy, config)
-    else:
-        sampler = _posed_sampler(config, avatar)
-    if config.empty_term == "occupancy":
-        return sampler
-    low, high = (torch.from_numpy(corner) for corner in (avatar.rig.box_low, avatar.rig.box_high))
-    device = avatar.field.table.device
-    return GlobalSparsitySampler(sampler, low.to(device), high.to(device))
-
-
-def _posed_sampler(config: TrainConfig, avatar: Avatar) -> PosedSampler:
-    device = avatar.field.table.device
-    kept_in = avatar.occupancy.density_grid if config.skipping == "canonical" else None
-    warp = _warp(config.roots, avatar, config.replay_capacity, kept_in)
-    field = PosedField(avatar.field, warp)
-    emptiness: PosedEmptySpace
-    match config.skipping:
-        case "union":
-            emptiness = SequenceGrid(
-                avatar.rig, field, interval=config.occupancy_interval, device=device
+        Raises:
+            ValueError: If the scheme and the configuration contradict each other.
+        """
+        if self.roots == "broyden" and config.refine_poses:
+            raise ValueError(
+                "roots='broyden' warps samples without the correspondence grid, which carries a "
+                "pose's gradient: set refine_poses=False."
             )
-        case "frame":
-            emptiness = PerFrameGrids(field, config.replay_capacity, device)
-        case "none":
-            emptiness = NoSkipping()
-        case "canonical":
-            emptiness = CorrespondenceBand(avatar.occupancy)
-    return PosedSampler(avatar.field.backend, emptiness, warp, config.sample_step_m)
+        if self.skipping == "none" and self.empty_term == "occupancy" and config.empty_space_weight:
+            raise ValueError(
+                "skipping='none' has no empty cells whose density could be penalised: set "
+                "empty_space_weight=0 or empty_term='global'."
+            )
+
+    def posed_sampler(self, avatar: Avatar, config: TrainConfig) -> PosedSampler | None:
+        """The scheme's body-frame sampler; None where it samples canonical occupancy, as ours."""
+        if self.skipping == "canonical" and self.roots == "cells":
+            return None
+        device = avatar.field.table.device
+        grid = avatar.occupancy.density_grid if self.skipping == "canonical" else None
+        warp = self.warp(avatar, config.replay_capacity, kept_in=grid)
+        field = PosedField(avatar.field, warp)
+        emptiness: PosedEmptySpace
+        match self.skipping:
+            case "union":
+                emptiness = SequenceGrid(
+                    avatar.rig, field, interval=config.occupancy_interval, device=device
+                )
+            case "frame":
+                emptiness = PerFrameGrids(field, config.replay_capacity, device)
+            case "none":
+                emptiness = NoSkipping()
+            case "canonical":
+                emptiness = CorrespondenceBand(avatar.occupancy)
+        return PosedSampler(avatar.field.backend, emptiness, warp, config.sample_step_m)
+
+    def warp(self, avatar: Avatar, slots: int, *, kept_in: DensityGrid | None) -> CanonicalWarp:
+        """The scheme's warp for a number of slots.
+
+        Args:
+            avatar: Avatar whose samples are warped.
+            slots: Number of poses that the warp can hold.
+            kept_in: Occupancy outside which Broyden's roots are dropped; None to keep them all.
+        """
+        if self.roots == "broyden":
+            return BroydenWarp(avatar.field, avatar.rig, slots, kept_in=kept_in)
+        return CorrespondenceWarp(avatar.field, avatar.occupancy)
 
 
-def _warp(
-    roots: RootScheme, avatar: Avatar, slots: int, kept_in: DensityGrid | None
-) -> CanonicalWarp:
-    if roots == "broyden":
-        return BroydenWarp(avatar.field, avatar.rig, slots, kept_in=kept_in)
-    return CorrespondenceWarp(avatar.field, avatar.occupancy)
+@final
+class BaselineTrainer:
+    """Trains an avatar with a baseline's scheme.
 
-
-def render_sampler(
-    avatar: Avatar,
-    pose: BodyPose,
-    cells: CorrespondenceGrid,
-    *,
-    skipping: SkippingScheme,
-    roots: RootScheme = "cells",
-) -> Callable[[RayBatch, CorrespondenceTables], RaySamples] | None:
-    """Where samples lie when a pose is rendered by one of the schemes, for `avatar.render.render`.
-
-    Args:
-        avatar: Who is rendered.
-        pose: Whose grid is filled, if the scheme has one.
-        cells: The pose's warp.
-        skipping: "frame" is the paper's way (§3.3, inference). "union" needs a sequence, which a
-            new pose has none of, and is refused.
-        roots: How samples are warped.
-
-    Returns:
-        None for our own scheme, which the renderer has already.
-
-    Raises:
-        ValueError: If the scheme is none of rendering.
+    Attributes:
+        trainer: The trainer, whose sampler is the scheme's.
     """
-    if skipping == "union":
-        raise ValueError(
-            "A new pose belongs to no sequence, so there is no union over it: render with "
-            "skipping='frame', as the paper does, or 'canonical' or 'none'."
-        )
-    if skipping == "canonical" and roots == "cells":
-        return None
-    device = avatar.field.table.device
-    kept_in = avatar.rendering_grid() if skipping == "canonical" else None
-    warp = _warp(roots, avatar, 1, kept_in)
-    bones = avatar.rig.body_from_canonical(pose.joint_rotations)[:, :3].reshape(24, 12)
-    warp.set_pose(0, torch.from_numpy(bones).float().to(device))
-    emptiness: PosedEmptySpace = NoSkipping()
-    if skipping == "frame":
-        emptiness = _filled_grids(
-            PerFrameGrids(PosedField(avatar.field, warp), 1, device), cells, device
-        )
-    elif skipping == "canonical":
-        emptiness = CorrespondenceBand(avatar.occupancy)
-    return PosedSampler(avatar.field.backend, emptiness, warp, avatar.sample_step_m).sample_rays
 
+    def __init__(
+        self, rig: Rig, config: TrainConfig, device: torch.device, scheme: BaselineScheme
+    ) -> None:
+        """Starts without frames.
 
-def _filled_grids(
-    grids: PerFrameGrids, cells: CorrespondenceGrid, device: torch.device
-) -> PerFrameGrids:
-    tables = correspondence_tables(cells, device)
-    generator = torch.Generator(device=device).manual_seed(0)
-    grids.add_frame(0, tables)
-    for _ in range(PROBES_PER_RENDERED_POSE):
-        grids.probe(0, tables, generator)
-    return grids
+        Raises:
+            ValueError: If the scheme and the configuration contradict each other.
+        """
+        scheme.check(config)
+        self.trainer = trainer = Trainer(rig, config, device)
+        self._posed_sampler = scheme.posed_sampler(trainer.learner, config)
+        trainer.sampler = self._posed_sampler or OccupancySampler(
+            trainer.backend, trainer.learner.occupancy, config
+        )
+        if scheme.empty_term == "global":
+            low, high = (torch.from_numpy(part).to(device) for part in (rig.box_low, rig.box_high))
+            trainer.sampler = GlobalSparsitySampler(trainer.sampler, low, high)
+
+    def add_frame(self, frame: TrainingFrame) -> None:
+        """Adds a frame to train on."""
+        trainer = self.trainer
+        slot = trainer.add_frame(frame)
+        if self._posed_sampler is not None:
+            bones = trainer.poses.bones[slot]
+            self._posed_sampler.add_frame(slot, trainer.replay.correspondences, bones)
+
+    def step(self, *, rate: float, hard_surface_share: float) -> StepResult:
+        """Makes one training step, then renews the scheme's grids (`Trainer.step`)."""
+        trainer = self.trainer
+        result = trainer.step(rate=rate, hard_surface_share=hard_surface_share)
+        if self._posed_sampler is not None:
+            self._posed_sampler.update(
+                trainer.steps - 1, trainer.replay.correspondences, trainer.generator
+            )
+        return result

@@ -1,7 +1,5 @@
 """The recipe follows from the waiting time, the picture's size and the number of frames."""
 
-import dataclasses
-
 import pytest
 
 from avatar.config import COARSEST_M, FULL_DETAIL_FRAMES, TrainConfig
@@ -30,35 +28,6 @@ def test_few_frames_determine_less_detail():
 
     assert finest(6) == pytest.approx(0.004 * (FULL_DETAIL_FRAMES / 6) ** 0.5)
     assert finest(6) > finest(12) > finest(24) == finest(300) == finest(None)
-
-
-@pytest.mark.parametrize(
-    ("choices", "advice"),
-    [
-        ({"roots": "broyden"}, "refine_poses=False"),
-        ({"skipping": "none"}, "empty_space_weight=0 or empty_term='global'"),
-    ],
-)
-def test_what_contradicts_itself_is_refused_with_advice(choices, advice):
-    with pytest.raises(ValueError, match=advice):
-        TrainConfig(**choices)
-    with pytest.raises(ValueError, match=advice):
-        dataclasses.replace(TrainConfig(), **choices)
-
-
-@pytest.mark.parametrize(
-    "choices",
-    [
-        {},
-        {"roots": "broyden", "refine_poses": False},
-        {"skipping": "none", "empty_space_weight": 0.0},
-        {"skipping": "none", "empty_term": "global"},
-        {"skipping": "union"},
-        {"skipping": "frame", "roots": "broyden", "refine_poses": False},
-    ],
-)
-def test_what_goes_together_is_taken(choices):
-    assert vars(TrainConfig(**choices)).items() >= choices.items()
 
 
 def test_the_fewer_the_frames_the_smoother_surfaces_are_asked_to_be():

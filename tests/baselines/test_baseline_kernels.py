@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.kernels.backend_protocol import PosedOccupancy, RayBatch
+from avatar.kernels.backend_protocol import RayBatch
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.training.trainer import Trainer
-from baselines.instant_avatar.broyden_kernels import SAME_ROOT_M
+from baselines.instant_avatar.broyden_kernels import SAME_ROOT_M, find_all_roots
+from baselines.instant_avatar.occupied_samples import PosedOccupancy, sample_occupied_cells
 from baselines.instant_avatar.posed_field import BroydenWarp
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
@@ -49,7 +50,7 @@ def boxes(generator):
 def test_both_twins_place_the_same_samples(boxes, generator):
     rays = rays_at(boxes, 400, generator)
     (points, counts), (expected, expected_counts) = (
-        backend.sample_occupied_cells(rays, boxes, STEP_M) for backend in (NUMBA, TORCH)
+        sample_occupied_cells(backend, rays, boxes, STEP_M) for backend in (NUMBA, TORCH)
     )
     # a sample on a cell's wall may fall to either side
     same = counts == expected_counts
@@ -66,7 +67,7 @@ def test_both_twins_place_the_same_samples(boxes, generator):
 def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, generator):
     full = boxes._replace(occupied=torch.ones_like(boxes.occupied))
     rays = rays_at(full, 100, generator)
-    points, counts = backend.sample_occupied_cells(rays, full, STEP_M)
+    points, counts = sample_occupied_cells(backend, rays, full, STEP_M)
     size = (full.shape / full.cells_per_m)[rays.slots.long()]
     low = full.low[rays.slots.long()]
     near = (low - rays.origins) / rays.directions
@@ -88,7 +89,7 @@ def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
         ray_box_high=boxes.ray_box_high + 0.1,
     )
     rays = rays_at(full, 200, generator)
-    points, counts = backend.sample_occupied_cells(rays, full, STEP_M)
+    points, counts = sample_occupied_cells(backend, rays, full, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     assert len(points) > 500
     assert (points > full.ray_box_low[slot] - 1e-5).all()
@@ -99,7 +100,7 @@ def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
 @BACKENDS
 def test_an_empty_cell_has_no_samples(backend, boxes, generator):
     rays = rays_at(boxes, 300, generator)
-    points, counts = backend.sample_occupied_cells(rays, boxes, STEP_M)
+    points, counts = sample_occupied_cells(backend, rays, boxes, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     cell = ((points - boxes.low[slot]) * boxes.cells_per_m[slot]).long()
     cell = torch.minimum(cell.clamp(min=0), boxes.shape[slot] - 1)
@@ -112,7 +113,7 @@ def test_no_rays_have_no_samples(backend, boxes):
     none = RayBatch(
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
     )
-    points, counts = backend.sample_occupied_cells(none, boxes, STEP_M)
+    points, counts = sample_occupied_cells(backend, none, boxes, STEP_M)
     assert points.shape == (0, 3)
     assert counts.shape == (0,)
 
@@ -147,7 +148,7 @@ def posed(rig):
 @BACKENDS
 def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
     canonical, carried, slots, poses = posed
-    roots, valid = backend.find_all_roots(carried, slots, poses)
+    roots, valid = find_all_roots(backend, carried, slots, poses)
     off = torch.where(valid, (roots - canonical[:, None]).norm(dim=-1), torch.inf).amin(dim=1)
     assert (off < 1e-3).float().mean() >= 0.99
 
@@ -155,7 +156,7 @@ def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
 @BACKENDS
 def test_no_root_is_found_twice(backend, posed):
     _, carried, slots, poses = posed
-    roots, valid = backend.find_all_roots(carried, slots, poses)
+    roots, valid = find_all_roots(backend, carried, slots, poses)
     gap = (roots[:, :, None] - roots[:, None]).norm(dim=-1)
     both = valid[:, :, None] & valid[:, None] & ~torch.eye(roots.shape[1], dtype=torch.bool)
     assert gap[both].min() >= SAME_ROOT_M
@@ -164,7 +165,7 @@ def test_no_root_is_found_twice(backend, posed):
 def test_both_twins_find_the_same_roots(posed):
     _, carried, slots, poses = posed
     (roots, valid), (expected, rests) = (
-        b.find_all_roots(carried, slots, poses) for b in (NUMBA, TORCH)
+        find_all_roots(b, carried, slots, poses) for b in (NUMBA, TORCH)
     )
     gap = (roots[:, :, None] - expected[:, None]).norm(dim=-1)
     gap = torch.where(valid[:, :, None] & rests[:, None], gap, torch.inf)
@@ -177,8 +178,8 @@ def test_both_twins_find_the_same_roots(posed):
 def test_nothing_is_found_of_nothing(posed):
     poses = posed[-1]
     for backend in (NUMBA, TORCH):
-        roots, valid = backend.find_all_roots(
-            torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), poses
+        roots, valid = find_all_roots(
+            backend, torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), poses
         )
         assert roots.shape == (0, 9, 3)
         assert valid.shape == (0, 9)

@@ -1,55 +1,59 @@
-"""The paper's ways of rendering beside ours: the same picture."""
+"""Every scheme of the baselines renders the same image as our renderer."""
 
 import numpy as np
 import pytest
-import torch
 
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
-from avatar.render import render
-from baselines.instant_avatar.samplers import render_sampler
+from baselines.instant_avatar.samplers import BaselineScheme
+from baselines.instant_avatar.scheme_rendering import render_sampler, render_samples
 
-CPU = torch.device("cpu")
+
+def draw(avatar, seen, cells, **choices):
+    """An image of a pose by one of the baselines' schemes."""
+    sample_rays = render_sampler(avatar, seen.pose, cells, BaselineScheme(**choices))
+    return render_samples(avatar, seen.pose, seen.camera, cells=cells, sample_rays=sample_rays)
+
+
+def psnr_between(one, other):
+    return -10.0 * np.log10(np.mean((one - other) ** 2) + 1e-12)
 
 
 @pytest.mark.parametrize(
-    ("skipping", "roots", "least_db"),
+    ("choices", "least_db"),
     [
-        ("none", "cells", 45.0),
-        ("frame", "cells", 40.0),
-        ("canonical", "broyden", 33.0),
+        ({"skipping": "none"}, 45.0),
+        ({"skipping": "frame"}, 40.0),
+        ({"skipping": "canonical", "roots": "broyden"}, 33.0),
     ],
+    ids=["no skipping", "frame grid", "broyden"],
 )
-def test_every_scheme_draws_the_same_picture(avatar, novel, skipping, roots, least_db):
+def test_every_scheme_renders_the_same_image(avatar, novel, choices, least_db):
     """Cells are exact to a millimetre; a step of 15 mm through a coarse field leaves the rest."""
     ours, seen, cells = novel
-    along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots=roots)
-    theirs = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
+    theirs = draw(avatar, seen, cells, **choices)
     assert theirs[..., 3].max() > 0.99
-    assert -10.0 * np.log10(np.mean((ours - theirs) ** 2) + 1e-12) > least_db
+    assert psnr_between(ours, theirs) > least_db
 
 
-def test_the_pictures_of_broyden_do_not_change_with_the_grid(avatar, novel):
-    """Beside ours both have a haze: roots far from the skin, where nothing was ever learnt."""
+def test_broydens_images_do_not_depend_on_the_grid(avatar, novel):
+    """Both show a haze that ours lacks: roots far from the skin, where the field is untrained."""
     _, seen, cells = novel
-    pictures = []
-    for skipping in ("frame", "none"):
-        along = render_sampler(avatar, seen.pose, cells, skipping=skipping, roots="broyden")
-        pictures.append(render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along))
-    assert -10.0 * np.log10(np.mean((pictures[0] - pictures[1]) ** 2) + 1e-12) > 35.0
+    images = [draw(avatar, seen, cells, skipping=s, roots="broyden") for s in ("frame", "none")]
+    assert psnr_between(*images) > 35.0
 
 
-def test_the_paper_s_way_of_rendering_scores_as_ours_does(avatar, novel):
+def test_the_papers_rendering_scores_as_ours_does(avatar, novel):
     ours, seen, cells = novel
-    along = render_sampler(avatar, seen.pose, cells, skipping="frame")
-    theirs = render(avatar, seen.pose, seen.camera, cells=cells, sample_rays=along)
     held = HeldOutFrame(observation=seen)
-    assert score_rendering(theirs, held).psnr == pytest.approx(
+    assert score_rendering(draw(avatar, seen, cells, skipping="frame"), held).psnr == pytest.approx(
         score_rendering(ours, held).psnr, abs=0.3
     )
 
 
-def test_our_own_scheme_is_the_renderer_s_and_a_union_is_refused(avatar, novel):
+@pytest.mark.parametrize(
+    ("choices", "advice"), [({"skipping": "union"}, "skipping='frame'"), ({}, "avatar.render")]
+)
+def test_schemes_that_cannot_render_a_new_pose_are_refused(avatar, novel, choices, advice):
     _, seen, cells = novel
-    assert render_sampler(avatar, seen.pose, cells, skipping="canonical") is None
-    with pytest.raises(ValueError, match="skipping='frame'"):
-        render_sampler(avatar, seen.pose, cells, skipping="union")
+    with pytest.raises(ValueError, match=advice):
+        render_sampler(avatar, seen.pose, cells, BaselineScheme(**choices))

@@ -9,10 +9,9 @@ import torch
 from avatar.config import TrainConfig
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame
-from avatar.training.training_step import compute_gradients
-from baselines.instant_avatar.samplers import sampler_for
+from avatar.training.training_step import OccupancySampler, compute_gradients
+from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 
 CPU = torch.device("cpu")
 
@@ -21,32 +20,61 @@ SMALL = TrainConfig(
     rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=64,
     occupancy_interval=8, refine_poses=False, replay_capacity=4,
 )  # fmt: skip
-VARIANTS = {
+SCHEMES = {
     "union": {"skipping": "union"},
     "frame": {"skipping": "frame"},
-    "none": {"skipping": "none", "empty_space_weight": 0.0},
+    "none": {"skipping": "none"},
     "broyden": {"roots": "broyden"},
     "union, broyden": {"skipping": "union", "roots": "broyden"},
     "global": {"empty_term": "global"},
+}
+LOSSES = {
+    "none": {"empty_space_weight": 0.0},
     "no alpha": {"alpha_weight": 0.0},
     "no hard surface": {"hard_surface_weight": 0.0},
 }
-SCHEMES = {name: choices for name, choices in VARIANTS.items() if not name.startswith("no ")}
-"""Where samples lie, what warps them, where density is asked; losses are our own, tested there."""
 QUICK = ("none", "union, broyden")
-"""No scheme, and the paper's own."""
+"""Schemes whose first step is compared in every run: no skipping at all, and the paper's own."""
 
 
-def trainer_of(rig, clip, **choices):
-    trainer = Trainer(rig, dataclasses.replace(SMALL, **choices), CPU)
+def trainer_of(rig, clip, name, **changes):
+    """A trainer of a named scheme or loss variant that has taken in four frames."""
+    config = dataclasses.replace(SMALL, **LOSSES.get(name, {}), **changes)
+    trainer = BaselineTrainer(rig, config, CPU, BaselineScheme(**SCHEMES.get(name, {})))
     for observation in clip.observations[:8:2]:
         trainer.add_frame(prepare_frame(observation, rig))
     return trainer
 
 
-@pytest.mark.parametrize("choices", VARIANTS.values(), ids=VARIANTS.keys())
-def test_every_variant_learns(rig, clip, choices):
-    trainer = trainer_of(rig, clip, **choices)
+@pytest.mark.parametrize(
+    ("choices", "changes", "advice"),
+    [
+        ({"roots": "broyden"}, {"refine_poses": True}, "refine_poses=False"),
+        ({"skipping": "none"}, {}, "empty_space_weight=0 or empty_term='global'"),
+    ],
+)
+def test_contradictory_choices_are_refused_with_advice(choices, changes, advice):
+    with pytest.raises(ValueError, match=advice):
+        BaselineScheme(**choices).check(dataclasses.replace(SMALL, **changes))
+
+
+@pytest.mark.parametrize(
+    ("choices", "changes"),
+    [
+        ({}, {"refine_poses": True}),
+        ({"roots": "broyden"}, {}),
+        ({"skipping": "none"}, {"empty_space_weight": 0.0}),
+        ({"skipping": "none", "empty_term": "global"}, {}),
+        ({"skipping": "frame", "roots": "broyden"}, {}),
+    ],
+)
+def test_compatible_choices_are_accepted(choices, changes):
+    BaselineScheme(**choices).check(dataclasses.replace(SMALL, **changes))
+
+
+@pytest.mark.parametrize("name", sorted({*SCHEMES, *LOSSES}))
+def test_every_variant_learns(rig, clip, name):
+    trainer = trainer_of(rig, clip, name)
     color = []
     for _ in range(30):
         result = trainer.step(rate=1.0, hard_surface_share=0.0)
@@ -56,18 +84,15 @@ def test_every_variant_learns(rig, clip, choices):
 
 
 @pytest.mark.parametrize(
-    "choices",
-    [
-        pytest.param(choices, id=name, marks=() if name in QUICK else pytest.mark.slow)
-        for name, choices in SCHEMES.items()
-    ],
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SCHEMES],
 )
-def test_every_scheme_takes_the_same_first_step_in_plain_torch(rig, clip, choices, monkeypatch):
+def test_every_scheme_takes_the_same_first_step_in_plain_torch(rig, clip, name, monkeypatch):
     """The reference path, on any device that torch knows."""
     samples, losses = [], []
     for backend in ("numba", "torch"):
         monkeypatch.setenv("IA_BACKEND", backend)
-        result = trainer_of(rig, clip, rays=60, **choices).step(rate=1.0, hard_surface_share=0.0)
+        result = trainer_of(rig, clip, name, rays=60).step(rate=1.0, hard_surface_share=0.0)
         samples.append(result.sample_count)
         losses.append(result.loss)
     assert samples[0] == pytest.approx(samples[1], rel=0.03)
@@ -83,16 +108,17 @@ def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping
     slot = replay.add(frame)
     config = dataclasses.replace(learnt.trainer.config, empty_space_weight=0.0)
     found = []
-    for choice in ("canonical", skipping):
-        chosen = dataclasses.replace(config, skipping=choice)
+    ours = OccupancySampler(avatar.field.backend, avatar.occupancy, config)
+    theirs = BaselineScheme(skipping=skipping).posed_sampler(avatar, config)
+    for sampler in (ours, theirs):
         poses = PoseOptimizer(rig, 1, CPU)
         poses.set_pose(slot, frame.pose)
-        sampler = sampler_for(chosen, avatar)
-        sampler.add_frame(0, replay.correspondences, poses.bones[0])
-        sampler.update(0, replay.correspondences, torch.Generator().manual_seed(0))
+        if sampler is theirs:
+            theirs.add_frame(0, replay.correspondences, poses.bones[0])
+            theirs.update(0, replay.correspondences, torch.Generator().manual_seed(0))
         batch = replay.sample_rays(2000, torch.Generator().manual_seed(1))
         compute_gradients(
-            avatar.field, sampler, replay.correspondences, batch, chosen,
+            avatar, sampler, replay.correspondences, batch, config,
             hard_surface_share=0.0, poses=poses, generator=torch.Generator().manual_seed(2),
         )  # fmt: skip
         avatar.field.table_grad.zero_()
@@ -101,8 +127,8 @@ def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping
 
 
 def test_global_sparsity_is_asked_for_in_the_whole_box(rig, clip):
-    trainer = trainer_of(rig, clip, empty_term="global")
-    points = trainer.sampler.sample_empty(4000, torch.Generator().manual_seed(2))
+    trainer = trainer_of(rig, clip, "global")
+    points = trainer.trainer.sampler.sample_empty(4000, torch.Generator().manual_seed(2))
     low, high = torch.from_numpy(rig.box_low), torch.from_numpy(rig.box_high)
     assert (points >= low).all()
     assert (points <= high).all()
@@ -113,10 +139,11 @@ def test_global_sparsity_is_asked_for_in_the_whole_box(rig, clip):
 
 def test_global_sparsity_pulls_as_the_opacity_of_its_points_does(rig, clip):
     """Its gradient for the network's last bias, against central differences in double."""
-    trainer = trainer_of(rig, clip, empty_term="global")
+    trainer = trainer_of(rig, clip, "global")
     for _ in range(10):
         trainer.step(rate=1.0, hard_surface_share=0.0)
-    field, config = trainer.avatar.field, trainer.config
+    trainer = trainer.trainer
+    field, config = trainer.field, trainer.config
     batch = trainer.replay.sample_rays(config.rays, torch.Generator().manual_seed(1))
     pulls = []
     for weight in (
@@ -125,7 +152,7 @@ def test_global_sparsity_pulls_as_the_opacity_of_its_points_does(rig, clip):
     ):  # not 0: the points must be drawn all the same
         field.table_grad.zero_()
         compute_gradients(
-            field, trainer.sampler, trainer.replay.correspondences, batch,
+            trainer.learner, trainer.sampler, trainer.replay.correspondences, batch,
             dataclasses.replace(config, empty_space_weight=weight),
             hard_surface_share=0.0, generator=torch.Generator().manual_seed(2),
         )  # fmt: skip

@@ -4,6 +4,7 @@ import torch
 
 from avatar.kernels.backend_protocol import MarchSettings
 from avatar.render import correspondence_tables
+from baselines.instant_avatar.broyden_kernels import find_all_roots
 from baselines.instant_avatar.posed_field import BroydenWarp, CorrespondenceWarp
 from baselines.instant_avatar.posed_occupancy import NoSkipping
 from baselines.instant_avatar.samplers import PosedSampler
@@ -21,7 +22,7 @@ def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bone
     points = low + torch.rand(4000, 3, generator=generator) * size
     slots = torch.zeros(4000, dtype=torch.int32)
     warped = warp(points, slots, correspondence_tables(cells, CPU))
-    roots, valid = avatar.field.backend.find_all_roots(points, slots, warp.poses)
+    roots, valid = find_all_roots(avatar.field.backend, points, slots, warp.poses)
     box = [torch.from_numpy(corner) for corner in (rig.box_low, rig.box_high)]
     valid &= ((roots >= box[0]) & (roots <= box[1])).all(dim=-1)
     score = torch.full(valid.shape, -torch.inf)

@@ -32,7 +32,7 @@ def cut(frame, near, far):
     """The same frame with fewer pixels."""
     kept = np.r_[:near, frame.near_count : frame.near_count + far]
     return dataclasses.replace(
-        frame, directions=frame.directions[kept], colors=frame.colors[kept], near_person_bits=near
+        frame, directions=frame.directions[kept], colors=frame.colors[kept], near_count=near
     )
 
 

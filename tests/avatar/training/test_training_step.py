@@ -85,7 +85,8 @@ def one_step(trainer, backend):
     generator = torch.Generator().manual_seed(4)
     field.table_grad.zero_()
     compute_gradients(
-        field, OccupancySampler(backend, occupancy, CONFIG), trainer.replay.correspondences, batch, CONFIG,
+        trainer.avatar, OccupancySampler(backend, occupancy, CONFIG),
+        trainer.replay.correspondences, batch, CONFIG,
         hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
