@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from avatar.evaluation.held_out import HeldOutFrame, composite_on_white
-from avatar.evaluation.image_metrics import psnr
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.kernels.backend_protocol import RayBatch
 from avatar.render import correspondence_tables, render
 from avatar.training.replay_buffer import ReplayBuffer

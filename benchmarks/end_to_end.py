@@ -18,8 +18,7 @@ import numpy as np
 import tyro
 
 from apps.report.learning_curve import CurvePoint, largest_drop
-from avatar.evaluation.held_out import composite_on_white, ground_truth_on_white
-from avatar.evaluation.image_metrics import psnr, ssim
+from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
 from export.picture_difference import premultiply
 from export.player import Player

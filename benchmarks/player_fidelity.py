@@ -8,15 +8,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from avatar.config import HELD_OUT_STRIDE
-from avatar.evaluation.held_out import (
-    HeldOutFrame,
-    composite_on_white,
-    ground_truth_on_white,
-    prepare_stream,
-)
-from avatar.evaluation.image_metrics import psnr
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr
 from avatar.field.avatar_model import Avatar
 from avatar.render import render
+from avatar.training.frame_stream import prepare_stream
 from benchmarks.end_to_end import novel_observations
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample

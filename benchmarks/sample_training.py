@@ -9,7 +9,8 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.deformation.rig import Rig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import Trainer
 from avatar.training.training_frame import TrainingFrame
 from avatar.training.training_step import cosine_decay

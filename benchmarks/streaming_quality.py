@@ -10,8 +10,9 @@ from torch import Tensor
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
-from avatar.evaluation.held_out import HeldOutFrame, is_held_out, prepare_stream, subsample_evenly
+from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.field.avatar_model import Avatar
+from avatar.training.frame_stream import is_held_out, prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_step import cosine_decay

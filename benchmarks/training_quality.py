@@ -11,8 +11,9 @@ import torch
 from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.field.avatar_model import Avatar
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import Trainer, train
 from avatar.training.warmup import warm_up
 from benchmarks.end_to_end import novel_observations

@@ -19,7 +19,7 @@ try:
     from studio.shoot import ShootConfig, film_capture
     from avatar.config import TrainConfig
     from avatar.events import Evaluated, Finished, Warned
-    from avatar.evaluation.held_out import prepare_stream
+    from avatar.training.frame_stream import prepare_stream
     from avatar.deformation.rig import Rig
     from avatar.training.train import train
     from avatar.training.trainer import Trainer

@@ -10,9 +10,10 @@ import torch
 from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.kernels.hash_levels import HashLevels
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import Trainer
 from avatar.training.training_step import cosine_decay
 from capture.camera import Camera

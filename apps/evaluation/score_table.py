@@ -12,14 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from apps.report.report_schema import finite_mean
-from avatar.evaluation.held_out import (
-    MASK_THRESHOLD,
-    HeldOutFrame,
-    composite_on_white,
-    ground_truth_on_white,
-    score_rendering,
-)
-from avatar.evaluation.image_metrics import psnr
+from avatar.evaluation.held_out import MASK_THRESHOLD, HeldOutFrame, score_rendering
+from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr
 from avatar.evaluation.sharpness import SharpnessVerdict, overall_verdict
 from preprocess.observation import Observation
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar, final
 
 from apps.report.report_schema import DroppedFrameEntry, Percentiles, StreamStats
-from avatar.evaluation.held_out import RedundantFrame
+from avatar.training.frame_stream import RedundantFrame
 from capture.frame import Frame
 from capture.process_metrics import ReservoirSample
 from capture.source import FrameSource

@@ -35,7 +35,8 @@ from apps.report.report_schema import (
 from apps.run.package_snapshot import PackageSnapshot
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
-from avatar.evaluation.held_out import composite_on_white, ground_truth_on_white, subsample_evenly
+from avatar.evaluation.held_out import subsample_evenly
+from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
 from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
 from avatar.render import render
 from capture.atomic_files import write_text_atomically

@@ -5,11 +5,11 @@ from typing import Protocol, runtime_checkable
 
 from apps.report.learning_curve import CurvePoint
 from avatar.evaluation.coverage import Coverage
-from avatar.evaluation.held_out import HeldOutFrame, is_held_out
+from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import TrainEvent
+from avatar.training.frame_stream import SplitItem
 from avatar.training.trainer import Trainer
 from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
 
 
 @runtime_checkable
@@ -55,26 +55,21 @@ class TrainingObserver(Protocol):
 
 
 def notify_observers(
-    observations: Iterator[Observation | DroppedFrame],
-    coverage: Coverage,
-    observers: Sequence[TrainingObserver],
-    *,
-    hold_every: int,
-    frame_count: int | None,
-) -> Iterator[Observation | DroppedFrame]:
-    """Passes observations on; watchers see them, and what will be trained on has been seen.
+    items: Iterator[SplitItem], coverage: Coverage, observers: Sequence[TrainingObserver]
+) -> Iterator[SplitItem]:
+    """Passes items on; observers see every observation, coverage those that are trained on.
 
     Args:
-        observations: As they are found.
-        coverage: Takes in those that are not held out.
-        watchers: See all of them.
-        every, total: Which are held out (`is_held_out`).
+        items: Observations, of which the held-out ones are wrapped.
+        coverage: Adds the observations that are not held out.
+        observers: Receive all observations.
     """
-    for position, item in enumerate(observations):
+    for item in items:
         if isinstance(item, Observation):
-            held_out = is_held_out(position, stride=hold_every, total=frame_count)
-            if not held_out:
-                coverage.add(item)
-            for watcher in observers:
-                watcher.on_frame(item, held_out=held_out)
+            coverage.add(item)
+            for observer in observers:
+                observer.on_frame(item, held_out=False)
+        elif isinstance(item, HeldOutFrame):
+            for observer in observers:
+                observer.on_frame(item.observation, held_out=True)
         yield item

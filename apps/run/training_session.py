@@ -24,16 +24,11 @@ from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
-from avatar.evaluation.held_out import (
-    HeldOutFrame,
-    StreamItem,
-    add_held_out,
-    prepare_stream,
-    score_frame,
-)
+from avatar.evaluation.held_out import HeldOutFrame, add_held_out, score_frame
 from avatar.evaluation.sharpness import overall_verdict
 from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
 from avatar.training import checkpoint
+from avatar.training.frame_stream import StreamItem, prepare_items, separate_held_out
 from avatar.training.held_out_pose_fitting import score_with_fitted_poses
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
@@ -216,12 +211,9 @@ class TrainingSession:
         found = self.meter.count_observations(map(self._recording.observation_builder(), frames))
         rig, every = self.trainer.avatar.rig, self.trainer.config.held_out_stride
         total = self._recording.source.frame_count
-        observations = notify_observers(
-            found, self.coverage, self._observers, hold_every=every, frame_count=total
-        )
-        return self.meter.measure_preparation(
-            prepare_stream(observations, rig, stride=every, total=total)
-        )
+        items = separate_held_out(found, stride=every, total=total)
+        items = notify_observers(items, self.coverage, self._observers)
+        return self.meter.measure_preparation(prepare_items(items, rig))
 
     def _restore_frames(self, inbox: Inbox[StreamItem], count: int) -> int:
         """Puts frames back into the memory of a trainer that has learnt from them before."""

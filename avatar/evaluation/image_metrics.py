@@ -1,8 +1,23 @@
-"""How far a picture is from the truth."""
+"""Image metrics: PSNR, SSIM and soft IoU, and the white background they are taken on."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Float32, Shaped
 from scipy.ndimage import correlate1d
+
+from preprocess.observation import Observation
+
+
+def composite_on_white(
+    premultiplied: Float32[np.ndarray, "height width 4"],
+) -> Float32[np.ndarray, "height width 3"]:
+    """Composites a premultiplied image over white."""
+    return premultiplied[..., :3] + (1.0 - premultiplied[..., 3:])
+
+
+def ground_truth_on_white(observation: Observation) -> Float32[np.ndarray, "height width 3"]:
+    """Ground truth of a rendering on white: alpha · image + (1 - alpha) · white."""
+    alpha = observation.alpha[..., None]
+    return alpha * (observation.frame.rgb.astype(np.float32) / 255.0) + (1.0 - alpha)
 
 
 def psnr(
@@ -10,11 +25,11 @@ def psnr(
     truth: Float[np.ndarray, "height width 3"],
     mask: Bool[np.ndarray, "height width"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB of pictures in [0, 1]; infinite if they are the same.
+    """Peak signal-to-noise ratio in dB of images in [0, 1]; infinite if they are equal.
 
     Args:
-        image, truth: The pictures.
-        mask: Pixels that count; all if None. With none set the result is NaN.
+        image, truth: Images to compare.
+        mask: Pixels that count; all if None. An empty mask gives NaN.
     """
     error = (image.astype(np.float64) - truth) ** 2
     if mask is not None:
@@ -28,9 +43,9 @@ def psnr(
 def soft_iou(
     rendered: Shaped[np.ndarray, "height width"], truth: Shaped[np.ndarray, "height width"]
 ) -> float:
-    """Intersection over union of two silhouettes, in [0, 1]; 1 if there is none in either.
+    """Intersection over union of two silhouettes, in [0, 1]; 1 if both are empty.
 
-    Of two alphas it is the sum of the smaller over the sum of the larger: low for fog, too.
+    Alphas count by Σ min / Σ max, so that fog lowers the value as well.
     """
     union = float(np.maximum(rendered, truth).sum())
     return float(np.minimum(rendered, truth).sum()) / union if union else 1.0

@@ -7,8 +7,6 @@ from typing import final
 from avatar.evaluation.held_out import (
     FRAMES_PER_EVALUATION,
     HeldOutFrame,
-    RedundantFrame,
-    StreamItem,
     add_held_out,
     coarse_to_fine_order,
     score_frame,
@@ -24,6 +22,7 @@ from avatar.events import (
     WaitingForFrame,
     Warned,
 )
+from avatar.training.frame_stream import RedundantFrame, StreamItem
 from avatar.training.trainer import Trainer
 from avatar.training.training_step import cosine_decay
 from capture.inbox import Inbox

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import Evaluated, Finished
 from avatar.pose import gauss_newton
 from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.training import checkpoint, held_out_pose_fitting
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox

@@ -18,7 +18,7 @@ from apps.evaluation.score_table import (
     markdown_table,
     score_frame,
 )
-from avatar.evaluation.held_out import ground_truth_on_white
+from avatar.evaluation.image_metrics import ground_truth_on_white
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.apps.conftest import Outcome

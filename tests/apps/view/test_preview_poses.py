@@ -13,6 +13,7 @@ from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import Coverage
 from avatar.render import render
+from avatar.training.frame_stream import separate_held_out
 from avatar.training.trainer import Trainer
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
@@ -107,19 +108,17 @@ def test_watchers_see_every_frame_and_coverage_those_that_are_learnt(recording, 
         def __init__(self):
             self.frames = []
 
-        def frame(self, observation, *, held_out):
+        def on_frame(self, observation, *, held_out):
             self.frames.append((observation.frame.index, held_out))
 
-        def heard(self, event): ...
+        def on_event(self, event): ...
 
-        def tend(self, lesson): ...
+        def between_steps(self, session): ...
 
     stream = [*observations[:4], DroppedFrame(index=4, reason="lost"), *observations[5:24]]
     watcher, coverage = Seen(), Coverage(recording.shaped)
-    passed = list(
-        notify_observers(iter(stream), coverage, [watcher], hold_every=10, frame_count=24)
-    )
-    assert passed == stream
+    split = list(separate_held_out(stream, stride=10, total=24))
+    assert list(notify_observers(iter(split), coverage, [watcher])) == split
     held = [index for index, held_out in watcher.frames if held_out]
     assert held == [9, 19]
     assert len(watcher.frames) == 23

@@ -15,14 +15,11 @@ from avatar.evaluation.held_out import (
     HeldOutFrame,
     add_held_out,
     coarse_to_fine_order,
-    composite_on_white,
-    ground_truth_on_white,
-    is_held_out,
-    prepare_stream,
     score_frame,
     subsample_evenly,
 )
-from avatar.evaluation.image_metrics import psnr, ssim
+from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
+from avatar.training.frame_stream import is_held_out, prepare_stream
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from capture.camera import Camera

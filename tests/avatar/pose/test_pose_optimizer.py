@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels import torch_skinning
 from avatar.kernels.backend_protocol import CorrespondenceTables, RaySamples
 from avatar.kernels.hash_levels import FEATURES_PER_LEVEL
@@ -24,6 +24,7 @@ from avatar.pose.pose_optimizer import (
 )
 from avatar.render import correspondence_tables
 from avatar.training import checkpoint
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.held_out_pose_fitting import score_with_fitted_poses
 from avatar.training.trainer import Trainer
 from avatar.training.training_step import cosine_decay

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from avatar.evaluation.held_out import HeldOutFrame, RedundantFrame, prepare_stream
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.training.frame_stream import RedundantFrame, prepare_stream
 from avatar.training.keyframe_selection import (
     JOINT_ANGLE_WEIGHT,
     MAX_KEYFRAME_INTERVAL_S,

@@ -14,9 +14,10 @@ import torch
 
 from avatar.backends import backend_for
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.field.radiance_field import RadianceField
 from avatar.training import optimizer
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import EMA_HORIZON_STEPS, EMA_INTERVAL, UncompiledAdam, update_ema
 from avatar.training.trainer import Trainer
 

@@ -16,7 +16,7 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.deformation.rig import Rig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import soft_iou
 from avatar.field.avatar_model import Avatar
 from avatar.field.occupancy_grid import MIN_STEP_OPACITY, OCCUPANCY_DECAY, OccupancyGrid
@@ -30,9 +30,11 @@ from avatar.kernels.torch_backend import TorchBackend
 from avatar.kernels.torch_reference import OPAQUE_DEPTH
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.render import render
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from avatar.training.training_step import cosine_decay
+from baselines.instant_avatar.scheme_rendering import render_samples
 from capture.frame import Frame
 from preprocess.observation import Observation
 from studio import actor_motions

@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, prepare_stream
+from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import Evaluated, Finished, FrameArrived, Stepped, WaitingForFrame, Warned
 from avatar.render import render
 from avatar.training import train as train_module
+from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame

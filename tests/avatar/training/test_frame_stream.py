@@ -1,0 +1,32 @@
+"""The stream decides once which frames are held out, and layers in between cannot change it."""
+
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.training.frame_stream import prepare_items, prepare_stream, separate_held_out
+from avatar.training.training_frame import TrainingFrame
+
+
+def indices_of(items, kind):
+    """Source indices of the items of one type."""
+    return [
+        item.observation.frame.index if isinstance(item, HeldOutFrame) else item.index
+        for item in items
+        if isinstance(item, kind)
+    ]
+
+
+def test_both_stages_together_are_the_prepared_stream(rig, clip):
+    observations = clip.observations[:8]
+    split = separate_held_out(observations, stride=3, total=None)
+    by_stages = list(prepare_items(split, rig))
+    at_once = list(prepare_stream(observations, rig, stride=3, total=None))
+    for kind in (HeldOutFrame, TrainingFrame):
+        assert indices_of(by_stages, kind) == indices_of(at_once, kind)
+    assert indices_of(by_stages, HeldOutFrame) == [2, 5]
+
+
+def test_an_item_that_is_dropped_in_between_moves_no_held_out_frame(rig, clip):
+    split = separate_held_out(clip.observations[:8], stride=3, total=None)
+    kept = (item for position, item in enumerate(split) if position != 1)
+    items = list(prepare_items(kept, rig))
+    assert indices_of(items, HeldOutFrame) == [2, 5]
+    assert 1 not in indices_of(items, TrainingFrame)
