@@ -12,6 +12,7 @@ import tyro
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, run_command
+from apps.cli.output_paths import check_output_folder
 from studio.shoot_config import ShootConfig
 
 
@@ -65,6 +66,8 @@ def _film(config: SampleArguments, console: Console) -> int:
 def _film_with_progress(config: SampleArguments, console: Console) -> None:
     from studio.shoot import film_capture
 
+    config.shoot.validate()
+    check_output_folder(config.out, "OUT")
     with console.progress("filming", 1.0) as bar:
 
         def advance(done: int, total: int) -> None:

@@ -1,7 +1,4 @@
-"""The stage: the actor before a backdrop or in a room, seen by cameras that stand or walk.
-
-The shoot: the actor in front of the camera, written as a native capture folder.
-"""
+"""Film the actor before a backdrop or in a room, and write a native capture folder."""
 
 import errno
 from collections import deque
@@ -16,8 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from apps.cli.output_paths import check_output_folder
-from capture.atomic_files import atomic_folder
+from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
 from capture.image_folder import silence_opencv
 from capture.input_error import InputError
@@ -115,7 +111,7 @@ def film_capture(
 
 
 def _check_output(out: Path, *, overwrite: bool) -> None:
-    check_output_folder(out, "OUT")
+    check_replaceable_folder(out)
     if not overwrite and out.exists() and any(out.iterdir()):
         raise InputError(f"{out} already exists. Choose another OUT, or give --overwrite.")
 

@@ -16,7 +16,7 @@ from preprocess.body.kinematics import rotation_matrices
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 
-NEWEST, STANDING, FILMED, DANCE = "Newest", "PersonInCameras", "Filmed", "Dance"
+NEWEST, STANDING, FILMED, DANCE = "Newest", "Standing", "Filmed", "Dance"
 POSE_CHOICES = (NEWEST, STANDING, FILMED, DANCE)
 DEFAULT_FPS = 30.0
 """Of a motion that does not say how fast it is."""

@@ -127,7 +127,7 @@ def without_baking(monkeypatch) -> None:
     Nor is it about how good the avatar is, for which half a second may not be enough.
     """
 
-    def export_nothing(avatar, path, *, views, metrics, hasty, fine_tuned, progress):
+    def export_nothing(avatar, path, *, views, metrics, quick, fine_tune_bricks, progress):
         write_text_atomically(path, "stand-in")
         return ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
@@ -136,7 +136,7 @@ def without_baking(monkeypatch) -> None:
 
     monkeypatch.setattr(package_snapshot, "export_avatar", export_nothing)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
-    monkeypatch.setattr(report_writer, "novel", lambda player: "data:,")
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player: "data:,")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)
 
 

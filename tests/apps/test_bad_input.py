@@ -23,7 +23,7 @@ def refused(call_ingest, tmp_path, monkeypatch):
 
     What might mend the capture takes ten seconds to find; tests of ia-check ask for that.
     """
-    monkeypatch.setattr(ingest, "hint", lambda wanted: "")
+    monkeypatch.setattr(ingest, "correction_hint", lambda inputs: "")
 
     def check(*arguments, words):
         outcome = call_ingest(*arguments, "--out", tmp_path / "run")

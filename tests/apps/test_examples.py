@@ -43,7 +43,9 @@ def test_what_is_missing_is_one_line(file, tmp_path, monkeypatch):
 def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):
     example = load("1_learn_from_python.py")
     monkeypatch.setattr(example, "STEPS", 150)
-    monkeypatch.setattr(example, "shoot", lambda out, config, overwrite: shutil.copytree(film, out))
+    monkeypatch.setattr(
+        example, "film_capture", lambda out, config, overwrite: shutil.copytree(film, out)
+    )
     monkeypatch.setattr(training_session.Rig, "from_shaped_body", lambda shaped: rig)
     example.main(tmp_path)
     said = capsys.readouterr().out

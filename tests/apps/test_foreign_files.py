@@ -185,7 +185,7 @@ import os, shutil, signal, sys
 from pathlib import Path
 
 from apps.run.run_folder import RunFolder
-from capture.atomic_files import Draft, atomic_folder, write_text_atomically
+from capture.atomic_files import AtomicFile, atomic_folder, write_text_atomically
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
 folder, left = Path(sys.argv[1]), -1
@@ -199,14 +199,14 @@ def count(event, arguments):
 
 def work():
     run = RunFolder(path=folder)
-    run.check([], resume=False, overwrite=True)
-    run.begin(resume=False)
+    run.check_usable([], resume=False, overwrite=True)
+    run.start_run(resume=False)
     for _ in range(2):
         write_text_atomically(run.checkpoint / "state.pt", "learnt")
     package = AtomicFile(run.package)
     package.temporary_path.write_bytes(b"avatar")
     package.finish()
-    write_text_atomically(run.report, "{}")
+    write_text_atomically(run.report_json, "{}")
     with atomic_folder(folder / "frames") as part:
         (part / "0000.png").write_bytes(b"new")
 
@@ -227,8 +227,8 @@ while True:
     killed = os.waitpid(child, 0)[1] != 0
     assert all((folder / name).read_bytes() == b"mine" for name in others), events
     run = RunFolder(path=folder)
-    run.check([], resume=False, overwrite=True)
-    run.begin(resume=False)
+    run.check_usable([], resume=False, overwrite=True)
+    run.start_run(resume=False)
     rest = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     rest -= {name for name in rest if "frames" in name or name.endswith(".instant-avatar-files")}
     assert rest == set(others), (events, rest)

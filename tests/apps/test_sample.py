@@ -59,5 +59,5 @@ def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(shoot, "shoot", fail)
+    monkeypatch.setattr(shoot, "film_capture", fail)
     assert run(tmp_path / "c") == code

@@ -49,17 +49,17 @@ def capture(tmp_path_factory):
 
 def points_seen(camera, depth):
     """The world's point in the middle of each pixel, from its depth."""
-    rays = camera.directions(camera.pixel_centers())
+    rays = camera.ray_directions(camera.pixel_centers())
     along = rays @ camera.camera_from_world[2, :3]
     return camera.center_world + rays * (depth / along)[..., None]
 
 
 def in_box(solids, solid, points):
     """Points of the world in the frame of a box, which the test turns by itself."""
-    cosine, sine = solids.turns[solid]
+    cosine, sine = solids.yaw_cos_sin[solid]
     turn = np.array([[cosine, -sine], [sine, cosine]])
     own = points.copy()
-    middle = solids.middles[solid]
+    middle = solids.centers_xz[solid]
     own[..., [0, 2]] = (points[..., [0, 2]] - middle) @ turn.T + middle
     return own
 
@@ -67,7 +67,7 @@ def in_box(solids, solid, points):
 def test_every_pixel_shows_the_nearest_face_of_the_room(room, cameras):
     solids = room.solids
     for camera in cameras[::4]:
-        seen = room.seen(camera)
+        seen = room.view_from(camera)
         points = points_seen(camera, seen.depth)
         for face in np.unique(seen.face):
             solid, axis, side = face // 6, face % 6 // 2, face % 2
@@ -88,18 +88,18 @@ def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, c
     """Around the projection of a free upper corner lie three faces or two and what is behind."""
     solids, met = room.solids, 0
     for camera in cameras:
-        seen = room.seen(camera)
+        seen = room.view_from(camera)
         for solid in (2, 5, 6, 15):
             low, high = solids.low[solid], solids.high[solid]
-            cosine, sine = solids.turns[solid]
+            cosine, sine = solids.yaw_cos_sin[solid]
             for x, z in (
                 (low[0], low[2]),
                 (low[0], high[2]),
                 (high[0], low[2]),
                 (high[0], high[2]),
             ):
-                away = np.array([x, z]) - solids.middles[solid]
-                x, z = np.array([[cosine, sine], [-sine, cosine]]) @ away + solids.middles[solid]
+                away = np.array([x, z]) - solids.centers_xz[solid]
+                x, z = np.array([[cosine, sine], [-sine, cosine]]) @ away + solids.centers_xz[solid]
                 corner = np.array([x, high[1], z])
                 depth = camera.camera_from_world[2] @ [*corner, 1.0]
                 column, row = camera.project(corner)
@@ -117,7 +117,7 @@ def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, c
 
 def test_a_place_of_the_wall_has_one_colour_from_everywhere(room):
     near = studio_cameras.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
-    first, second = (room.seen(camera) for camera in near)
+    first, second = (room.view_from(camera) for camera in near)
     first = type(first)(rgb=first.rgb.copy(), depth=first.depth, face=first.face)
     points = points_seen(near[0], first.depth)
     pixels = near[1].project(points).astype(np.float32) - np.float32(0.5)
@@ -216,8 +216,8 @@ def test_the_person_is_drawn_over_the_room_unchanged(capture):
         mask = cv2.imread(str(capture / "masks" / f"{row:04d}.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(mask, alpha)
         np.testing.assert_array_equal(frame[mask == 255], rgb[mask == 255])
-        behind = room.seen(track[row]).rgb
-        free = (mask == 0) & (room.seen(track[row]).face != 2)
+        behind = room.view_from(track[row]).rgb
+        free = (mask == 0) & (room.view_from(track[row]).face != 2)
         assert abs((frame.astype(float) - behind)[free]).std() < 2.0 * SENSOR_NOISE
 
 

@@ -68,10 +68,10 @@ def png(path):
 
 
 def test_every_layer_is_there_and_hangs_from_the_body(actor):
-    assert set(actor.kinds) == {SKIN, SHIRT, TROUSERS, SHOE, HAIR, EYE}
-    assert actor.faces.max() < len(actor.rest)
+    assert set(actor.materials) == {SKIN, SHIRT, TROUSERS, SHOE, HAIR, EYE}
+    assert actor.faces.max() < len(actor.rest_vertices)
     bare = actor.vertices(BodyPose.rest())
-    np.testing.assert_allclose(bare, actor.rest, atol=1e-9)
+    np.testing.assert_allclose(bare, actor.rest_vertices, atol=1e-9)
 
 
 def test_the_shirt_stands_off_the_body_by_one_to_four_centimetres():
@@ -90,9 +90,11 @@ def test_the_shirt_stands_off_the_body_by_one_to_four_centimetres():
 def test_skinning_is_the_bodys_own(actor):
     """The bare skin's vertices are the body's vertices, in any pose."""
     pose = actor_motions.novel_poses(actor)[3]
-    skin = np.unique(actor.faces[actor.kinds == SKIN])
+    skin = np.unique(actor.faces[actor.materials == SKIN])
     body = actor.shaped.with_pose(pose).vertices()
-    np.testing.assert_allclose(actor.vertices(pose)[skin], body[actor.source[skin]], atol=1e-5)
+    np.testing.assert_allclose(
+        actor.vertices(pose)[skin], body[actor.body_vertices[skin]], atol=1e-5
+    )
 
 
 def test_colours_stick_to_the_body(actor):
@@ -107,12 +109,12 @@ def test_colours_stick_to_the_body(actor):
             joint_rotations=bowed,
         ),
     )
-    shirt = np.unique(actor.faces[actor.kinds == SHIRT])
-    x, y, z = actor.place[shirt].T
+    shirt = np.unique(actor.faces[actor.materials == SHIRT])
+    x, y, z = actor.template_points[shirt].T
     chest = shirt[(np.abs(x + 0.07) < 0.03) & (np.abs(y - 0.06) < 0.09) & (z > 0.08)]
     colours = []
     for pose in poses:
-        rgb, _ = actor.render_rgb_alpha(pose, camera, fine=1)
+        rgb, _ = actor.render_rgb_alpha(pose, camera, supersampling=1)
         column, row = camera.project(actor.vertices(pose)[chest]).astype(int).T
         colours.append(rgb[row, column])
     assert len(chest) > 20
@@ -135,7 +137,7 @@ def test_the_turning_person_fills_78_to_85_percent_of_the_height(actor):
     camera = static_camera(actor, 270)
     motion = actor_motions.turning_motion(actor, frames=40, fps=30.0, turns=2.0, seed=3)
     for row in range(0, 40, 4):
-        _, alpha = actor.render_rgb_alpha(motion[row], camera, fine=1)
+        _, alpha = actor.render_rgb_alpha(motion[row], camera, supersampling=1)
         rows = np.flatnonzero(alpha.any(axis=1))
         assert 0.78 <= (rows[-1] + 1 - rows[0]) / 270 <= 0.85
 
@@ -156,7 +158,7 @@ def test_all_of_every_motion_is_in_the_picture(actor):
 def test_feet_stand_on_the_floor(actor):
     motion = actor_motions.turning_motion(actor, frames=4, fps=30.0, turns=1.0, seed=0)
     for row in range(4):
-        assert abs(actor.lowest(motion[row])) < 1e-9
+        assert abs(actor.sole_height_m(motion[row])) < 1e-9
 
 
 def test_the_turn_turns_as_often_as_asked(actor):
@@ -304,9 +306,9 @@ def test_the_same_seed_films_the_same_and_another_seed_does_not(capture, tmp_pat
 def test_dressing_twice_gives_the_same_actor_and_a_seed_gives_another():
     dress = Actor.of.__wrapped__
     first, again, other = dress(1, 3), dress(1, 3), dress(1, 4)
-    np.testing.assert_array_equal(first.rest, again.rest)
-    np.testing.assert_array_equal(first.light, again.light)
-    assert np.abs(first.rest - other.rest).max() > 1e-3
+    np.testing.assert_array_equal(first.rest_vertices, again.rest_vertices)
+    np.testing.assert_array_equal(first.baked_light, again.baked_light)
+    assert np.abs(first.rest_vertices - other.rest_vertices).max() > 1e-3
     assert np.abs(first.palette - other.palette).max() > 1e-3
 
 

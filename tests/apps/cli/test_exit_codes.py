@@ -96,8 +96,8 @@ def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
     code = (
         "import os, signal, threading, time\n"
         "from apps.cli.console import Console\n"
-        "from apps.cli.interrupt import nothing_to_save\n"
-        "with nothing_to_save(Console(), 'ia-test'):\n"
+        "from apps.cli.interrupt import exit_on_interrupt\n"
+        "with exit_on_interrupt(Console(), 'ia-test'):\n"
         "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
         "    time.sleep(60)\n"
@@ -133,12 +133,12 @@ def test_work_goes_on_when_nobody_listens_any_more():
     code = (
         "import sys\n"
         "from apps.cli.console import Console\n"
-        "from apps.cli.exit_codes import Stop, exit_code\n"
+        "from apps.cli.exit_codes import CommandExit, run_command\n"
         "def work():\n"
-        "    for _ in range(99): Console().say('x' * 999)\n"
+        "    for _ in range(99): Console().info('x' * 999)\n"
         "    print('done', flush=True)\n"
-        "    raise Stop('too late', 2)\n"
-        "sys.exit(exit_code('ia-test', work))\n"
+        "    raise CommandExit('too late', 2)\n"
+        "sys.exit(run_command('ia-test', work))\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -168,7 +168,7 @@ def test_a_log_gets_plain_lines_and_few(monkeypatch):
     with console.progress("learning", 60.0) as bar:
         for step in range(100):
             bar.update(float(step), f"step {step}")
-        monkeypatch.setattr("apps.cli.console.LOG_EVERY_S", 0.0)
+        monkeypatch.setattr("apps.cli.console.LOG_INTERVAL_S", 0.0)
         bar.update(60.0, "the end")
     assert said.getvalue() == "learning\nlearning: the end\n"
 

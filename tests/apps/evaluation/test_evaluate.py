@@ -113,17 +113,17 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     ended = call(10)
     assert ended.code == 0, ended.err
     frames = json.loads((out / place.name / "report.json").read_text())["frames"]
-    assert (frames["used"] + frames["alike"], frames["held_out"]) == (8, 0)
+    assert (frames["used"] + frames["near_duplicates"], frames["held_out"]) == (8, 0)
     row = rows_of(tmp_path / "t")["renderer", "given"]
     assert [frame["frame"] for frame in row["frames"]] == [16, 19, 22]
     assert "InstantAvatar (paper)" in ended.out
     assert "29.65" in ended.out
     again = call(10)
-    assert "was learnt before" in again.err
+    assert "was trained before" in again.err
     assert psnrs(again) == psnrs(ended)
     longer = call(15)
-    assert "Going on after 10 steps" in longer.err
-    assert "was learnt before" not in longer.err
+    assert "Resuming after 10 steps" in longer.err
+    assert "was trained before" not in longer.err
 
 
 @pytest.mark.slow

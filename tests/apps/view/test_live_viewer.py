@@ -84,7 +84,7 @@ def test_somebody_watches_pauses_saves_and_lets_it_dance(film, tmp_path):
         process.wait()
     said = log.read_text()
     assert "Traceback" not in said
-    assert "Ctrl-C ends it" in said
+    assert "Ctrl-C closes it" in said
     assert (out / "report.html").exists()
 
 
