@@ -19,11 +19,11 @@ from apps.checks.capture_validation import (
 from apps.checks.contact_sheet import write_contact_sheet
 from apps.checks.corrected_capture import check_new_or_empty, write_corrected_capture
 from apps.checks.preflight_check import check_command
+from apps.cli.capture_options import mask_inversion, parse_frame_range
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import BAD_INPUT, DONE, run_command
 from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file
-from apps.run.ingest_arguments import mask_inversion, parse_frame_range
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from apps.cli.capture_options import parse_frame_range
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
@@ -152,7 +153,6 @@ def _evaluate_subject(
     """A subject of the dataset that was learnt, in the paper's frames."""
     from apps.evaluation.evaluation_frames import capture_frames
     from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TEST_POSES, subject_poses
-    from apps.run.ingest_arguments import parse_frame_range
 
     wanted = replace(
         arguments.capture_inputs(folder),

@@ -63,8 +63,8 @@ def measure_realtime(capture: Path, run: Path) -> Iterator[Measurement]:
         value=held["psnr"],
         context=f"in the mask {held['psnr_mask']:.2f}; {report['training']['steps']:,} steps, "
         f"{report['training']['rays_per_second'] / 1000:.0f} k rays/s; "
-        f"{report['frames']['used']} frames learnt from, {len(report['frames']['dropped'])} left "
-        f"out; {report['frames']['alike']} alike, {report['frames']['not_replayed']} not kept",
+        f"{report['frames']['used']} frames trained on, {len(report['frames']['dropped'])} left "
+        f"out; {report['frames']['near_duplicates']} near-duplicates, {report['frames']['not_replayed']} not kept",
     )
     yield Measurement(
         name="preparing a frame, p95, ms",

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from apps.cli.capture_options import parse_frame_range
 from apps.cli.output_paths import check_output_file
-from apps.run.ingest_arguments import parse_frame_range
 from capture.input_error import InputError
 from preprocess.capture_session import CaptureInputs
 

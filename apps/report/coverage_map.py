@@ -1,4 +1,4 @@
-"""A small map of the body as an SVG: where it was seen well, at a slant, or never."""
+"""Coverage map: an SVG of the body from four sides, by how well each place was seen."""
 
 from dataclasses import dataclass
 from typing import final
@@ -14,13 +14,19 @@ from preprocess.body.body_surface import visible_points
 from preprocess.body.parametric_body import ShapedBody
 
 VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (2, 1.0)}
-"""What each view calls right in its picture: an axis of the body and its sign."""
+"""Axis of the body, and its sign, that points right in each view."""
 DOT_SPACING_CM = 2.7
-"""From one dot to the next; rows are shifted by half of it in turn."""
-PATCHES_PER_DOT, MAX_PATCH_DISTANCE_CM = 3, 3.2
-"""A dot stands for so many visible patches, the nearest of them no farther than that."""
-GAP_CM, LABEL_CM = 14.0, 12.0
+"""Distance of neighboring dots of the hexagonal grid, centimeters."""
+PATCHES_PER_DOT = 3
+"""Visible skin patches whose median decides the level of a dot."""
+MAX_PATCH_DISTANCE_CM = 3.2
+"""Distance to the nearest visible patch beyond which a dot lies off the body, centimeters."""
+GAP_CM = 14.0
+"""Gap between two views, centimeters."""
+LABEL_CM = 12.0
+"""Height of the line of labels, centimeters."""
 LEVELS = ("never", "slant", "well")
+"""CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,8 +34,8 @@ class _MapView:
     """The dots of one view.
 
     Attributes:
-        places: In centimetres of the map, y down.
-        patches: Those that each stands for.
+        positions_cm: Position on the map, y down.
+        patches: Indices of the skin patches of each dot.
     """
 
     positions_cm: Float[np.ndarray, "dots 2"]
@@ -38,10 +44,10 @@ class _MapView:
 
 @final
 class CoverageMap:
-    """One person in the A-pose from four sides, as dots; made once, drawn as often as needed."""
+    """Coverage of one person in the A-pose from four sides, as dots."""
 
     def __init__(self, shaped: ShapedBody, coverage: Coverage) -> None:
-        """Finds out which patches each dot stands for."""
+        """Assign skin patches to dots; `svg` draws their state at any time."""
         pose = BodyPose(
             root_rotation=np.zeros(3),
             root_translation=np.zeros(3),
@@ -63,14 +69,14 @@ class CoverageMap:
         self._size = left - GAP_CM, max(v.positions_cm[:, 1].max() for v in self._views.values())
 
     def svg(self) -> str:
-        """The map as it is now; colours are those of the classes never, slant and well."""
+        """Draw the coverage in its current state; the CSS classes in `LEVELS` give the colors."""
         level = np.digitize(self._coverage.cosines, [1e-6, MIN_WELL_SEEN_COSINE])
         width, height = self._size
         margin = 1.5 * DOT_SPACING_CM
         parts = [
             f'<svg class="body-map" viewBox="{-margin:.1f} {-margin:.1f} '
             f'{width + 2 * margin:.1f} {height + 2 * margin + LABEL_CM:.1f}" role="img" '
-            'aria-label="The body from four sides: where it was seen">'
+            'aria-label="Body coverage from four sides">'
         ]
         for name, view in self._views.items():
             dots = _dot_levels(view, level)
@@ -102,7 +108,7 @@ def _map_view(
 
 
 def _hexagonal_grid(places: Float[np.ndarray, "visible 2"]) -> Float[np.ndarray, "grid 2"]:
-    """A hexagonal grid that covers some places."""
+    """Return a hexagonal grid that covers the positions."""
     low, high = places.min(axis=0) - DOT_SPACING_CM, places.max(axis=0) + DOT_SPACING_CM
     rows = np.arange(low[1], high[1], DOT_SPACING_CM * 0.866)
     columns = np.arange(low[0], high[0], DOT_SPACING_CM)
@@ -112,5 +118,5 @@ def _hexagonal_grid(places: Float[np.ndarray, "visible 2"]) -> Float[np.ndarray,
 
 
 def _dot_levels(view: _MapView, level: Int[np.ndarray, "patches"]) -> Int[np.ndarray, "dots"]:
-    """How well each dot was seen: the middle one of its patches' levels."""
+    """Return the level of each dot: the median of its patches."""
     return np.median(level[view.patches], axis=1).astype(np.int64)

@@ -1,9 +1,8 @@
-"""CPU time that a process waited for because other programs held the processor.
+"""CPU contention: time for which threads were ready to run while other programs held the cores.
 
-Waiting for frames does not count: only threads that were ready to run are counted. Linux says for
-every thread how long it was ready and did not run (schedstat), and how long a quota of its control
-group held it back (cpu.stat). Elsewhere it is what steps of training lack to one busy core: while
-a step lasts, at least one thread has work.
+Linux reports how long each thread was ready without running (schedstat), and how long a quota of
+its control group throttled it (cpu.stat). Elsewhere contention is estimated as wall time minus CPU
+time of training steps: at least one thread has work during a step. Waiting for frames never counts.
 """
 
 from contextlib import suppress
@@ -14,23 +13,25 @@ from typing import final
 from avatar.training.trainer import Trainer
 
 THREADS_FOLDER = Path("/proc/self/task")
+"""Holds one folder per thread of this process (Linux)."""
 CGROUP_FILE, CGROUP_ROOT = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+"""The control group of this process, and where groups are mounted (Linux)."""
 MIN_CPU_SHARE = 0.5
-"""A run that gets less than this share of the CPU time that it could use is warned of."""
+"""Share of the usable CPU time below which the user is warned."""
 MIN_CONTENTION_S = 5.0
-"""Less waiting than this is not worth a word."""
+"""Contention below which the user is not warned, seconds."""
 
 
 @final
 class CpuContentionMeter:
-    """Measures from its making on."""
+    """Measures contention from its construction on."""
 
     def __init__(self, trainer: Trainer, threads_folder: Path = THREADS_FOLDER) -> None:
-        """Begins now.
+        """Start to measure.
 
         Args:
-            trainer: Whose steps are looked at where the system does not say how long threads wait.
-            tasks: A folder for each thread.
+            trainer: Its steps are timed where the system does not report waiting threads.
+            threads_folder: Holds one folder per thread.
         """
         self._trainer, self._tasks = trainer, threads_folder
         self._waited = _thread_wait_s(threads_folder)
@@ -39,7 +40,7 @@ class CpuContentionMeter:
         self._stepping = trainer.step_wall_seconds, trainer.step_cpu_seconds
 
     def measure(self) -> "CpuTime":
-        """What was got and what was waited for so far."""
+        """Return the CPU time used and the contention since construction."""
         trainer, now = self._trainer, _thread_wait_s(self._tasks)
         steps = trainer.steps - self._steps
         got_s = trainer.cpu_seconds - self._cpu_s
@@ -54,12 +55,12 @@ class CpuContentionMeter:
 
 @dataclass(frozen=True, kw_only=True)
 class CpuTime:
-    """CPU time of a stretch of training.
+    """CPU time of a period of training.
 
     Attributes:
-        got_s: CPU seconds that the process used.
-        waited_s: Seconds for which its threads were ready to run and had no core, summed.
-        steps: Training steps made meanwhile.
+        used_s: CPU seconds that the process used.
+        waited_s: Seconds for which its threads were ready to run without a core, summed.
+        steps: Training steps in this period.
     """
 
     used_s: float
@@ -68,26 +69,24 @@ class CpuTime:
 
     @property
     def granted_share(self) -> float:
-        """What was got of what could have been used, in [0, 1]."""
+        """CPU time used, as a fraction of the CPU time that could have been used, in [0, 1]."""
         wanted_s = self.used_s + self.waited_s
         return self.used_s / wanted_s if wanted_s > 0.0 else 1.0
 
     def warning(self) -> str | None:
-        """What it means and what to do; None if the machine gave enough."""
+        """Return a warning with advice; None if the process got enough CPU time."""
         if self.granted_share >= MIN_CPU_SHARE or self.waited_s < MIN_CONTENTION_S:
             return None
         usual = self.steps / max(self.granted_share, 1e-3)
         return (
-            f"This machine gave the run {self.used_s:.0f} of the {self.used_s + self.waited_s:.0f} "
-            "core-seconds that it could have used, because other programs are running: it made "
-            f"{self.steps} steps instead of about {usual:.0f}, so the avatar is less sharp than it "
-            "can be. Close other programs and learn on (the same command with --resume and more "
-            "--seconds)."
+            f"Other programs used the CPU: this run got {self.used_s:.0f} of "
+            f"{self.used_s + self.waited_s:.0f} core-seconds and made {self.steps} instead of "
+            f"about {usual:.0f} steps. Close them and continue with --resume and more --seconds."
         )
 
 
 def _thread_wait_s(tasks: Path) -> dict[str, float]:
-    """For each thread, how long it was ready to run and did not, seconds; empty if unknown."""
+    """Return for each thread how long it was ready without running, seconds; empty if unknown."""
     waited = {}
     for task in tasks.glob("*"):
         with suppress(OSError, ValueError, IndexError):  # a thread may just have ended
@@ -96,7 +95,7 @@ def _thread_wait_s(tasks: Path) -> dict[str, float]:
 
 
 def _throttled_s() -> float:
-    """How long a quota has held this process's control group back, seconds; 0 if unknown."""
+    """Return how long a quota throttled this process's control group, seconds; 0 if unknown."""
     with suppress(OSError, ValueError, IndexError):
         group = CGROUP_FILE.read_text().rsplit("::", 1)[1].strip().lstrip("/")
         for line in (CGROUP_ROOT / group / "cpu.stat").read_text().splitlines():

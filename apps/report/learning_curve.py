@@ -1,7 +1,4 @@
-"""The learning curve: scores of held-out frames over training time.
-
-The learning curve as an SVG that takes its colours from the page.
-"""
+"""Learning curve: scores of held-out frames over training time, and its SVG."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,17 +7,18 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class CurvePoint:
-    """How well held-out frames were rendered at some second of training.
+    """One evaluation of held-out frames during training.
 
     Attributes:
-        wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: Frames trained on so far.
-        psnr, psnr_mask: Means over the frames that were scored at this mark, dB.
-        verdict: What the scores mean, in a word (`avatar.evaluation.sharpness`).
-        frames: Which those were, by their numbers in the video, each with its own PSNR of the whole
-            picture: they need not be the same at every mark, so that only a frame's own scores tell
-            whether it fell.
-        video: Whose frames they are: 1 for the video that was learnt first.
+        wall_seconds: Training time up to here, wall clock.
+        cpu_seconds: Training time up to here, CPU.
+        frames_seen: Frames trained on up to here.
+        psnr: Mean PSNR of the whole images of the frames scored here, dB.
+        psnr_mask: Mean PSNR inside their masks, dB.
+        verdict: Verdict on the scores (`avatar.evaluation.sharpness`).
+        frames: Frame number in the video and PSNR of the whole image of each frame scored here.
+            Evaluations may score different frames, so only a frame's own scores show a drop.
+        video: Number of the video that the frames are from, 1 for the first.
     """
 
     wall_seconds: float
@@ -34,46 +32,46 @@ class CurvePoint:
 
     @classmethod
     def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":
-        """From what a checkpoint kept."""
+        """Restore a point from a checkpoint."""
         frames = content.get("frames", [])
         return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
 
 
 def largest_drops(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
-    """How far each held-out frame fell below its own best by a later mark, dB; 0 if it did not.
+    """Return each frame's largest drop below its own earlier best, dB; 0 if it never dropped.
 
-    By video and number, of the frames that were scored more than once.
+    Keys are video and frame number, of the frames that were scored more than once.
     """
     best: dict[tuple[int, int], float] = {}
-    falls: dict[tuple[int, int], float] = {}
+    drops: dict[tuple[int, int], float] = {}
     for point in curve:
         for number, value in point.frames:
             frame = point.video, number
             if frame in best:
-                falls[frame] = max(falls.get(frame, 0.0), best[frame] - value)
+                drops[frame] = max(drops.get(frame, 0.0), best[frame] - value)
             best[frame] = max(best.get(frame, value), value)
-    return falls
+    return drops
 
 
 def largest_drop(curve: Sequence[CurvePoint]) -> float | None:
-    """The largest of `largest_drops`, dB; None if no frame was scored twice."""
+    """Return the largest of `largest_drops`, dB; None if no frame was scored twice."""
     return max(largest_drops(curve).values(), default=None)
 
 
 SVG_WIDTH, SVG_HEIGHT = 720, 320
+"""Size of the plot with its margins, in SVG units."""
 LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
-"""Room around the plot for its labels."""
+"""Margins of the plot, for its labels, in SVG units."""
 
 AxisScale = Callable[[float], float]
 ScoredPoints = list[tuple[CurvePoint, float]]
 
 
 def curve_svg(curve: Sequence[CurvePoint]) -> str:
-    """PSNR of held-out frames over seconds of training: whole picture, and inside the mask.
+    """Plot held-out PSNR over training time: whole image, and inside the mask.
 
-    Each video has a line of its own: what was held out of one cannot be compared with another's.
-
-    An empty string if nothing was measured.
+    Each video has its own line, because its held-out frames cannot be compared with another's.
+    Return an empty string if nothing was scored.
     """
     whole = [(p, p.psnr) for p in curve if p.psnr is not None]
     masked = [(p, p.psnr_mask) for p in curve if p.psnr_mask is not None]
@@ -95,7 +93,7 @@ def curve_svg(curve: Sequence[CurvePoint]) -> str:
         *_axes(x, y, low, high, end),
         *_video_labels(whole, x),
         *_polylines(masked, x, y, "masked", "inside the mask"),
-        *_polylines(whole, x, y, "whole", "whole picture"),
+        *_polylines(whole, x, y, "whole", "whole image"),
         "</svg>",
     ]
     return "\n".join(parts)

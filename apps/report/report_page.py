@@ -1,4 +1,4 @@
-"""report.html: one page without a second file, that shows what report.json says."""
+"""report.html: a self-contained page that shows report.json."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,13 +12,14 @@ from apps.report.report_schema import Report, format_percent, format_psnr
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonPair:
-    """A held-out frame: what the video shows, and what the avatar shows.
+    """A held-out frame and its rendering.
 
     Attributes:
-        frame: Its number in the video.
-        psnr: Of the whole picture, dB.
-        verdict: What that means, in a word.
-        truth, render: Pictures as addresses.
+        frame: Frame number in the video.
+        psnr: PSNR of the whole image, dB.
+        verdict: Verdict on the frame.
+        truth: The video's image as a data URI.
+        render: The avatar's rendering as a data URI.
     """
 
     frame: int
@@ -40,18 +41,18 @@ def report_page(
     present_files: Collection[str] = (),
     play_command: str | None = None,
 ) -> str:
-    """The page.
+    """Return the page as HTML.
 
     Args:
-        report: The figures.
-        name: Of the video, for the heading.
-        body_map: An SVG of what was seen (`CoverageMap.svg`).
-        pairs: Held-out frames, to look at.
-        novel: A moving picture of poses that the video does not show, as an address.
-        warnings: What the user was told.
-        failure: Why the result is no avatar of the person, if it is none.
-        present: Names of what lies beside the page; nothing else is named as being there.
-        play: The command that plays the package, if there is one.
+        report: The values to show.
+        name: Name of the video, for the heading.
+        body_map: SVG of the body coverage (`CoverageMap.svg`).
+        pairs: Held-out frames and their renderings.
+        animation: Animation of novel poses as a data URI.
+        warnings: Warnings shown to the user.
+        failure: Why the avatar has failed, if it has.
+        present_files: Names of the files next to the page; the page refers to no others.
+        play_command: Command that plays the package, if there is one.
     """
     playing = (
         "" if play_command is None else f" Play the avatar: <code>{escape(play_command)}</code>"
@@ -63,16 +64,16 @@ def report_page(
             f'<p class="lead">{escape(_summary(report))}</p>',
             f'<p class="failure">{escape(failure)}</p>' if failure else "",
             _tiles(report),
-            _section("How it learnt", _curve(report)),
-            _section("The video before", _earlier_videos(report)),
-            _section("What the camera has seen", _coverage(report, body_map)),
-            _section("Where the camera was", _cameras(report, present_files)),
-            _section("Frames it was never trained on", _pairs(pairs)),
-            _section("Poses that the video does not show", _animation(animation)),
-            _section("Worth knowing", _warnings(report, warnings)),
-            _section("All figures", _all_values(report)),
-            "<footer>Written by ia-ingest of instant-avatar-stream. The same figures for machines: "
-            f"report.json.{playing}</footer>",
+            _section("Learning curve", _curve(report)),
+            _section("Earlier videos", _earlier_videos(report)),
+            _section("Body coverage", _coverage(report, body_map)),
+            _section("Cameras", _cameras(report, present_files)),
+            _section("Held-out frames", _pairs(pairs)),
+            _section("Novel poses", _animation(animation)),
+            _section("Warnings", _warnings(report, warnings)),
+            _section("All values", _all_values(report)),
+            "<footer>Written by ia-ingest of instant-avatar-stream. Machine-readable: report.json."
+            f"{playing}</footer>",
         ]
     )
     return (
@@ -87,15 +88,13 @@ def _summary(report: Report) -> str:
     training, machine = report.training, report.machine
     threads = "one thread" if machine.threads == 1 else f"{machine.threads} threads"
     where = f"a CPU, {threads}" if machine.device == "cpu" else "a GPU"
-    earlier, learnt = report.earlier_videos, f"{training.wall_seconds:.0f} seconds"
+    earlier, duration = report.earlier_videos, f"{training.wall_seconds:.0f} seconds"
     frames = f"{report.frames.used} frames"
     if earlier is not None:
-        frames += (
-            f" of this video, and {earlier.frames_trained} of {_join_names(earlier.videos)} before"
-        )
+        frames += f" of this video, and {earlier.frames_trained} of {_join_names(earlier.videos)}"
         now_s = training.wall_seconds - earlier.wall_seconds
-        learnt += f" ({now_s:.0f} on this video)"
-    return f"An avatar from {frames}, learnt in {learnt} on {where}."
+        duration += f" ({now_s:.0f} on this video)"
+    return f"An avatar from {frames}, trained for {duration} on {where}."
 
 
 def _join_names(names: Sequence[str]) -> str:
@@ -103,31 +102,32 @@ def _join_names(names: Sequence[str]) -> str:
 
 
 def _earlier_videos(report: Report) -> str:
-    """Two sentences, if the video was added to an avatar."""
+    """Describe replay and forgetting, if the video was added to an avatar."""
     earlier = report.earlier_videos
     if earlier is None:
         return ""
-    told = f"{earlier.replayed_key_frames} frames of {_join_names(earlier.videos)} were learnt from again. "
+    videos = _join_names(earlier.videos)
+    text = f"{earlier.replayed_key_frames} key frames of {videos} were replayed. "
     if earlier.psnr_before is None or earlier.psnr_after is None or earlier.largest_drop is None:
-        told += "None of its frames had been held out, so what it lost cannot be said."
+        text += "None of its frames had been held out, so forgetting could not be measured."
     else:
-        told += (
-            f"Held-out frames there ({len(earlier.frames)}): {earlier.psnr_before:.2f} dB before "
-            f"this video, {earlier.psnr_after:.2f} dB now; none of them lost more than "
-            f"{earlier.largest_drop:.2f} dB."
+        text += (
+            f"PSNR of its {len(earlier.frames)} held-out frames: {earlier.psnr_before:.2f} dB "
+            f"before this video, {earlier.psnr_after:.2f} dB now (largest drop "
+            f"{earlier.largest_drop:.2f} dB)."
         )
-    return f'<p class="legend">{escape(told)}</p>'
+    return f'<p class="legend">{escape(text)}</p>'
 
 
 def _tiles(report: Report) -> str:
     held, package = report.held_out, report.package
     tiles = [
-        (report.verdict or "not scored", "how it looks"),
+        (report.verdict or "not scored", "verdict"),
         (_format_value(held.psnr, "dB"), _with_verdict("held-out PSNR, on white", held.verdict)),
-        (_format_value(held.psnr_mask, "dB"), "inside the mask"),
+        (_format_value(held.psnr_mask, "dB"), "PSNR inside mask"),
         (_format_value(held.ssim, "", digits=3), "SSIM"),
         (f"{report.training.steps:,}", "steps"),
-        (f"{report.training.rays_per_second / 1000.0:,.0f} k", "rays a second"),
+        (f"{report.training.rays_per_second / 1000.0:,.0f} k", "rays/s"),
         (f"{package.bytes / 1e6:.1f} MB" if package else "none", "package"),
     ]
     cells = (
@@ -153,74 +153,74 @@ def _curve(report: Report) -> str:
     if not svg:
         return ""
     return (
-        f'<div class="card">{svg}<p class="legend">Mean PSNR of the held-out frames so far'
-        '<i style="background:var(--whole)"></i>whole picture'
+        f'<div class="card">{svg}<p class="legend">Mean PSNR of the held-out frames'
+        '<i style="background:var(--whole)"></i>whole image'
         '<i style="background:var(--masked)"></i>inside the mask. '
         f"{_curve_caption(report.curve)}</p></div>"
     )
 
 
 def _curve_caption(curve: Sequence[CurvePoint]) -> str:
-    """How the frames themselves fared, where marks are means over different frames."""
+    """Describe the drops of single frames, as points may average different frames."""
     scored = [len(point.frames) for point in curve if point.frames]
-    falls = largest_drops(curve)
-    told = ""
+    drops = largest_drops(curve)
+    text = ""
     sets = {(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}
     if len(sets) > len({video for video, _ in sets}):
-        told = (
-            f"Marks are means over different frames ({min(scored)} to {max(scored)} of them), so "
-            "the line can fall where no frame does. "
+        text = (
+            f"Points average different sets of frames ({min(scored)} to {max(scored)}), so the "
+            "curve can drop although no frame got worse. "
         )
-    if falls:
-        were = "was" if len(falls) == 1 else "were"
-        told += (
-            f"Of the held-out frames, {len(falls)} {were} scored more than once; none was at any "
-            f"later mark more than {max(falls.values()):.1f} dB below its own best."
+    if drops:
+        frames = "frame was" if len(drops) == 1 else "frames were"
+        text += (
+            f"{len(drops)} held-out {frames} scored repeatedly; the largest drop from a frame's "
+            f"best is {max(drops.values()):.1f} dB."
         )
     elif scored:
-        told += "No frame was scored more than once, so whether one got worse cannot be said."
-    return told
+        text += "No frame was scored repeatedly, so drops could not be measured."
+    return text
 
 
 def _cameras(report: Report, present: Collection[str]) -> str:
-    """A sentence, if cameras were to be solved."""
+    """Describe the solved cameras, if any were requested."""
     found = report.cameras
     if found is None:
         return ""
-    told = {
-        "still": "The camera stood still; there was nothing to solve.",
-        "stopped": "Solving was stopped; the same command with --resume goes on.",
+    text = {
+        "still": "The camera did not move; there was nothing to solve.",
+        "stopped": "Solving was stopped; the same command with --resume continues it.",
         "refused": found.get("reason", ""),
     }.get(found["verdict"])
-    if told is None:
+    if text is None:
         frames, scale = found["frames"], found["scale"]
-        told = (
-            f"Solved from {frames['key']} key frames; {frames['placed']} were placed between "
-            f"them, {frames['interpolated']} interpolated, {frames['missing']} are missing. Focal "
-            f"length {found['focal_px']:.0f} px; the size of the room is told by "
-            f"{' and '.join(scale['cues'])}."
+        text = (
+            f"Solved from {frames['key']} key frames; {frames['placed']} frames placed between "
+            f"them, {frames['interpolated']} interpolated, {frames['missing']} missing. Focal "
+            f"length {found['focal_px']:.0f} px; metric scale from: {', '.join(scale['cues'])}."
         )
         if {"cameras.npz", "poses.npz"} <= set(present):
-            told += " cameras.npz and poses.npz hold the cameras and the poses in their world."
-    return f'<p class="legend">{escape(told)}</p>'
+            text += " cameras.npz and poses.npz hold the cameras and the poses in their world."
+    return f'<p class="legend">{escape(text)}</p>'
 
 
 def _coverage(report: Report, body_map: str) -> str:
-    """The sentence, the map, and every part and side in figures."""
+    """Advice, coverage map, and the fraction seen of each body part and side."""
     note = report.coverage
     if note is None:
         return ""
     rows = "".join(
-        f"<tr><td>{escape(part)}</td><td>{format_percent(shares['seen'])}</td><td>{_by_side(shares)}</td></tr>"
+        f"<tr><td>{escape(part)}</td><td>{format_percent(shares['seen'])}</td>"
+        f"<td>{_by_side(shares)}</td></tr>"
         for part, shares in note.parts.items()
     )
     return (
         f'<div class="card"><p class="advice">{escape(note.advice)}</p>{body_map}'
         f'<p class="legend">{format_percent(note.seen)} of the skin seen'
-        '<i style="background:var(--whole)"></i>well'
-        '<i style="background:var(--whole);opacity:0.4"></i>at a slant'
-        '<i style="background:var(--masked)"></i>never. Left and right are the person\'s.</p>'
-        f"<details><summary>Part by part</summary><table>{rows}</table></details></div>"
+        '<i style="background:var(--whole)"></i>frontal'
+        '<i style="background:var(--whole);opacity:0.4"></i>grazing'
+        '<i style="background:var(--masked)"></i>unseen. Left and right are the person\'s.</p>'
+        f"<details><summary>By body part</summary><table>{rows}</table></details></div>"
     )
 
 
@@ -240,24 +240,23 @@ def _pairs(pairs: Sequence[ComparisonPair]) -> str:
     return f'<div class="pairs">{"".join(figures)}</div>' if pairs else ""
 
 
-def _animation(novel: str | None) -> str:
-    if novel is None:
+def _animation(data_uri: str | None) -> str:
+    if data_uri is None:
         return ""
     return (
-        f'<figure class="novel"><img src="{novel}" alt="the avatar in poses of its own">'
-        "<figcaption>Drawn by the player, from the package</figcaption></figure>"
+        f'<figure class="novel"><img src="{data_uri}" alt="the avatar in novel poses">'
+        "<figcaption>Rendered by the player from the package</figcaption></figure>"
     )
 
 
 def _warnings(report: Report, warnings: Sequence[str]) -> str:
-    told = list(warnings)
+    messages = [warning for warning in warnings if not warning.startswith("Frame ")]
     reasons: dict[str, list[int]] = {}
     for drop in report.frames.dropped:
         reasons.setdefault(drop.reason, []).append(drop.index)
-    told = [w for w in told if not w.startswith("Frame ")]
     for reason, frames in reasons.items():
-        told.append(f"Left out, {reason}: frame {', '.join(str(frame) for frame in frames)}.")
-    items = "".join(f"<li>{escape(message)}</li>" for message in told)
+        messages.append(f"Skipped, {reason}: frame {', '.join(str(frame) for frame in frames)}.")
+    items = "".join(f"<li>{escape(message)}</li>" for message in messages)
     return f'<ul class="warnings">{items}</ul>' if items else ""
 
 
@@ -265,7 +264,7 @@ def _all_values(report: Report) -> str:
     content = asdict(report)
     shown = ("frames", "training", "held_out", "stream", "package", "machine")
     tables = [f'<div class="card"><table>{_rows({key: content[key] for key in shown})}</table>']
-    for key, heading in (("recipe", "The recipe"), ("command", "The command")):
+    for key, heading in (("recipe", "Configuration"), ("command", "Command")):
         rows = _rows(content[key])
         tables.append(f"<details><summary>{heading}</summary><table>{rows}</table></details>")
     return "".join(tables) + "</div>"
@@ -279,7 +278,7 @@ def _rows(content: Mapping[str, Any]) -> str:
 
 
 def _flatten(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
-    """Names with dots and what they hold, in words; lists of records are left out."""
+    """Yield dotted names and formatted values; lists of records are skipped."""
     for key, value in content.items():
         name = f"{before}{key}".replace("_", " ")
         if isinstance(value, Mapping):

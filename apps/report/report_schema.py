@@ -1,4 +1,4 @@
-"""report.json: what a run was given, what it did and how well it came out."""
+"""report.json: the inputs of a run, its cost and the quality of its avatar."""
 
 import dataclasses
 import json
@@ -21,11 +21,12 @@ from avatar.events import HeldOutScore
 from capture.process_metrics import ReservoirSample
 
 REPORT_FORMAT = 1
+"""Version of the format of report.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MachineInfo:
-    """What it ran on: device ("cpu", "cuda"), backend of the kernels, threads."""
+    """Device ("cpu", "cuda"), backend of the kernels, and number of threads."""
 
     device: str
     backend: str
@@ -34,7 +35,7 @@ class MachineInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class DroppedFrameEntry:
-    """A frame that was left out, and why."""
+    """A dropped frame and the reason."""
 
     index: int
     reason: str
@@ -42,15 +43,15 @@ class DroppedFrameEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStats:
-    """What became of the frames.
+    """Number of frames by use.
 
     Attributes:
-        read: Frames that came out of the video.
+        read: Read from the video.
         used: Trained on.
-        held_out: Scored, and never trained on.
-        dropped: Left out.
-        alike: Not trained on, because each looks like the one before it.
-        not_replayed: Trained on when they came, but not among the key frames that stayed.
+        held_out: Scored, never trained on.
+        dropped: Skipped, each with its reason.
+        near_duplicates: Skipped because they resemble the previous frame.
+        not_replayed: Trained on when they arrived, but not kept as key frames.
     """
 
     read: int
@@ -63,18 +64,19 @@ class FrameStats:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingStats:
-    """What training cost.
+    """Cost of training.
 
     Attributes:
         wall_seconds: From the first frame handed to the trainer to the last step.
         cpu_seconds: CPU time of the whole process in that time.
-        cpu_contention_seconds: For how long threads of this run were ready and had no core, because
-            other programs held them, summed; a resumed run counts only its own.
-        startup_seconds: Before it: imports, reading and checking, kernels.
-        steps, rays: How much was done.
-        rays_per_second: By the wall clock.
-        samples_per_ray: Mean.
-        peak_memory_mb: Of the process, so far.
+        cpu_contention_seconds: Time for which threads were ready to run while other programs held
+            the cores, summed over threads; a resumed run counts its own part only.
+        startup_seconds: Before training: imports, opening and checking the capture, kernels.
+        steps: Training steps.
+        rays: Rays trained on.
+        rays_per_second: Rays per second of wall time.
+        samples_per_ray: Mean number of samples per ray.
+        peak_memory_mb: Peak resident memory of the process.
     """
 
     wall_seconds: float
@@ -90,22 +92,22 @@ class TrainingStats:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutStats:
-    """How well frames are rendered that were never trained on, on white.
+    """Scores of the held-out frames, composited on white.
 
     Attributes:
-        frames: Their numbers in the video.
+        frames: Frame numbers in the video.
         size: Width and height in pixels.
-        psnr: Mean of the frames' PSNR over the whole picture, dB; null if nothing was scored.
-        psnr_mask: The same over alpha > 0.5.
-        ssim: Mean.
-        verdict: What these figures mean: sharp, soft, blurred or failed (`avatar.evaluation.sharpness`); null
-            if nothing was scored.
-        blur: Equivalent blur that half of the frames stay within, as a share of the person's
-            height; null if it is beyond the widest that is measured.
-        overlap: Of the rendered alpha with the mask, reached by half of the frames.
+        psnr: Mean PSNR of the whole image, dB; null if nothing was scored.
+        psnr_mask: Mean PSNR where alpha > 0.5, dB.
+        ssim: Mean SSIM of the whole image.
+        verdict: sharp, soft, blurred or failed (`avatar.evaluation.sharpness`); null if nothing was
+            scored.
+        blur: Median equivalent blur, as a fraction of body height; null beyond the largest
+            measurable one.
+        overlap: Median soft IoU of rendered alpha and mask.
         lpips: Not measured.
-        background: What alpha was blended with.
-        poses: Which poses the frames were rendered in.
+        background: Color behind the alpha.
+        poses: Poses that the frames were rendered in: given, or fitted.
     """
 
     frames: tuple[int, ...]
@@ -122,7 +124,7 @@ class HeldOutStats:
 
     @classmethod
     def of(cls, scores: tuple[HeldOutScore, ...], size: tuple[int, int] | None) -> "HeldOutStats":
-        """From the scores of the single frames."""
+        """Summarize the scores of single frames."""
         return cls(
             frames=tuple(score.frame for score in scores),
             size=size,
@@ -137,32 +139,32 @@ class HeldOutStats:
 
 @dataclass(frozen=True, kw_only=True)
 class Percentiles:
-    """A spread of numbers: half of them are below p50, and 95 % below p95."""
+    """Median and 95th percentile."""
 
     p50: float
     p95: float
 
     @classmethod
     def of(cls, numbers: ReservoirSample, *, scale: float = 1.0) -> "Percentiles":
-        """Of what a reservoir has seen, times `scale`."""
+        """Return the percentiles of a reservoir sample, times `scale`."""
         p50, p95 = (scale * numbers.percentile(percent) for percent in (50.0, 95.0))
         return cls(p50=p50, p95=p95)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamStats:
-    """How the video kept pace.
+    """Timing of the frame stream.
 
     Attributes:
-        realtime: Whether frames came at times of their own: played so, or live.
+        realtime: Whether frames arrived at their own times: simulated (--realtime), or live.
         ingest_ms: From decoding to ready for training, per frame.
-        inbox_dropped: Frames of a live source that gave way, because nobody took them in time.
-        ready_after_last_frame_seconds: From the end of the video, had it been filmed from the
-            first frame on, to the finished package; null without a package.
-        latency_ms: From the moment when a frame was there (due, filmed, or decoded) until the
+        inbox_dropped: Frames of a live source that were replaced by newer ones.
+        ready_after_last_frame_seconds: From the end of the video, as if filmed from the first
+            frame on, to the package; null without a package.
+        latency_ms: From the moment a frame was available (due, filmed, or decoded) until the
             trainer had it.
-        lateness_ms: How long after that moment its preparation began.
-        inbox_depth: Frames that waited in the inbox.
+        lateness_ms: From the moment a frame was available until its preparation began.
+        inbox_depth: Frames waiting in the inbox.
     """
 
     realtime: bool
@@ -176,7 +178,7 @@ class StreamStats:
 
 @dataclass(frozen=True, kw_only=True)
 class PackageStats:
-    """The package, beside the report, and how close its player is to the volume renderer."""
+    """The package next to the report, and the PSNR of its player against the volume renderer."""
 
     path: str
     bytes: int
@@ -186,14 +188,14 @@ class PackageStats:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageStats:
-    """What of the person's skin the frames show that were trained on.
+    """Fraction of the person's skin that the training frames show.
 
     Attributes:
-        seen: Share of the skin, in [0, 1].
-        well: The same, counting only what was seen within 53° of squarely.
-        advice: What the person should do next, in a sentence.
-        parts: For each body part its share under "seen", then one for each side that it has. Left
-            and right are the person's.
+        seen: Fraction of the skin seen, in [0, 1].
+        well: Fraction seen within 53° of the surface normal.
+        advice: What to film next, in a sentence.
+        parts: Fraction seen of each body part under "seen", then of each of its sides. Left and
+            right are the person's.
     """
 
     seen: float
@@ -203,7 +205,7 @@ class CoverageStats:
 
     @classmethod
     def of(cls, coverage: Coverage) -> "CoverageStats":
-        """As things stand."""
+        """Summarize the coverage in its current state."""
         parts = {
             name: {"seen": part.seen_share, **part.sides}
             for name, part in coverage.by_part().items()
@@ -218,17 +220,18 @@ class CoverageStats:
 
 @dataclass(frozen=True, kw_only=True)
 class ForgettingStats:
-    """What became of earlier videos when this one was added.
+    """Forgetting of earlier videos caused by adding this one.
 
     Attributes:
-        videos: Names of the videos that were learnt before, in order.
-        used: How many of their frames the avatar had been trained on.
-        wall_seconds: How long it had been trained.
-        recalled: Their key frames that were learnt from again.
-        frames: Their held-out frames that were scored, by their numbers in their own video.
-        video_of_frame: Of which of `videos` each of those is, counted from 1.
-        psnr_before, psnr_after: Means over them before this video, and at the end, dB.
-        largest_drop: Of any of them, dB; 0 if none fell.
+        videos: Names of the earlier videos, in order.
+        frames_trained: Number of their frames that were trained on.
+        wall_seconds: Training time before this video.
+        replayed_key_frames: Number of their key frames that were replayed.
+        frames: Their held-out frames, by frame number in their own video.
+        video_of_frame: Position in `videos`, from 1, of the video of each of these frames.
+        psnr_before: Mean PSNR of these frames before this video, dB.
+        psnr_after: Mean PSNR of these frames at the end, dB.
+        largest_drop: Largest drop in PSNR of one of these frames, dB; 0 if none dropped.
     """
 
     videos: tuple[str, ...]
@@ -253,8 +256,8 @@ class ForgettingStats:
         wall_seconds: float,
         replayed_key_frames: int,
     ) -> "ForgettingStats":
-        """From the scores of the same frames before and after."""
-        falls = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
+        """Compare scores of the same frames before and after."""
+        drops = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
         return cls(
             videos=videos,
             frames_trained=frames_trained,
@@ -264,13 +267,13 @@ class ForgettingStats:
             video_of_frame=tuple(video_of_frame),
             psnr_before=finite_mean([score.psnr for score in before]),
             psnr_after=finite_mean([score.psnr for score in after]),
-            largest_drop=max(0.0, *falls) if falls else None,
+            largest_drop=max(0.0, *drops) if drops else None,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """All of it. `package` is None if none was written, `cameras` if none were solved."""
+    """A whole report. `package` is None if none was written, `cameras` if none were solved."""
 
     command: dict[str, Any]
     recipe: dict[str, Any]
@@ -289,13 +292,13 @@ class Report:
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
-        """What the avatar is, in a word: in fitted poses where it looks better in them."""
+        """Verdict on the avatar: the better of those in given and in fitted poses."""
         fitted = self.held_out_refined
         return better_verdict(self.held_out.verdict, None if fitted is None else fitted.verdict)
 
     def to_json(self) -> str:
-        """The text of report.json; what is not a number is null."""
-        content = _to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
+        """Return the text of report.json; NaN and infinity become null."""
+        content = to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
         order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
         order += ("held_out", "held_out_refined", "curve", "stream", "package", "coverage")
         order += ("earlier_videos", "cameras")
@@ -303,20 +306,20 @@ class Report:
 
 
 def provisional_verdict(verdict: str | None) -> str | None:
-    """The word for an avatar that is still learnt: nothing has failed then."""
-    return "no person to be seen yet" if verdict == "failed" else verdict
+    """Return the word for a verdict during training, when nothing has failed yet."""
+    return "not converged yet" if verdict == "failed" else verdict
 
 
 def format_psnr(
     psnr: float | None, verdict: str | None, *, digits: int = 2, provisional: bool = False
 ) -> str:
-    """A PSNR as people read it, with what it means: "22.78 dB (blurred)".
+    """Format a PSNR with its verdict: "22.78 dB (blurred)".
 
     Args:
-        psnr: In dB.
-        verdict: Its word.
-        digits: After the point.
-        learning: Whether the avatar is still learnt: nothing has failed then.
+        psnr: In dB; None for "n/a".
+        verdict: Shown in brackets; None for none.
+        digits: After the decimal point.
+        provisional: Whether training continues, so that "failed" does not apply yet.
     """
     if psnr is None:
         return "n/a"
@@ -325,24 +328,24 @@ def format_psnr(
 
 
 def format_percent(share: float) -> str:
-    """A share as people read it; only all of it is 100 %, and only nothing of it 0 %."""
+    """Format a fraction in percent; only 1 is "100 %", and only 0 is "0 %"."""
     if 0.0 < share < 1.0:
         return f"{min(max(round(100.0 * share), 1), 99)} %"
     return f"{100.0 * share:.0f} %"
 
 
 def finite_mean(values: list[float]) -> float | None:
-    """The mean of the finite ones; None if there are none."""
+    """Return the mean of the finite values; None if there are none."""
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
-def _to_json_value(value: Any) -> Any:
-    """Numbers of a sensible length, and null for NaN and infinity."""
+def to_json_value(value: Any) -> Any:
+    """Round floats to 6 digits and replace NaN and infinity by null."""
     if isinstance(value, dict):
-        return {str(key): _to_json_value(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_json_value(item) for item in value]
+        return [to_json_value(item) for item in value]
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
     return value

@@ -1,4 +1,4 @@
-"""Watches a stream go by: how many, how long each took, what was left out, and until when."""
+"""Timing and counts of the frame stream: read, dropped, near-duplicate, latency, lateness."""
 
 import threading
 import time
@@ -17,32 +17,34 @@ from preprocess.observe import DroppedFrame
 Item = TypeVar("Item")
 
 MAX_DROPPED_LISTED = 1000
-"""Frames that were left out and are listed; of the others only the number is kept."""
+"""Dropped frames that are listed with their reasons; the rest are only counted."""
+LATENESS_WARNING_S = 0.5
+"""Lateness of playback, 95th percentile in seconds, from which the user is warned."""
 
 
 @final
 class StreamMeter:
-    """Counts on the producer's thread, read on the consumer's.
+    """Counts frames on the producer's thread; read on the consumer's.
 
     Attributes:
-        read: Frames that came out of the source.
-        dropped: Those that were left out, the first `MAX_DROPPED_LISTED` of them.
-        dropped_count: How many were left out.
-        near_duplicates: How many are not learnt from because they look like the one before.
-        held_out: How many the trainer got that are not learnt from.
-        first_frame_at: When the first frame was there, on `time.perf_counter`'s clock.
-        last_s: The newest frame's time, counted from the first frame's.
-        size_px: Width and height that training sees.
-        preparation_s: How long frames took, from decoding to ready, without waiting for them.
-        lateness_s: How long after its moment each frame was handed over to be prepared.
-        latency_s: From the moment a frame was there until the trainer had it.
-        current_latency_s: The latest of these.
-        depth: How many frames waited in the inbox, looked at after each step.
-        inbox_dropped: How many gave way in the inbox.
+        frames_read: Frames that the source delivered.
+        dropped: The first `MAX_DROPPED_LISTED` dropped frames.
+        dropped_count: Number of dropped frames.
+        near_duplicates: Frames not trained on because they resemble the previous one.
+        held_out_count: Held-out frames that have reached the trainer.
+        first_frame_at: When the first frame was available, on `time.perf_counter`'s clock.
+        last_frame_s: Time of the newest frame since the first one, in the video.
+        size_px: Width and height of training images.
+        preparation_s: From decoding to ready for training, without waiting for the source.
+        lateness_s: From the moment a frame was due until its preparation began.
+        latency_s: From the moment a frame was available until the trainer had it.
+        current_latency_s: Latency of the newest frame.
+        inbox_depth: Frames waiting in the inbox, sampled after each step.
+        inbox_dropped: Frames that the inbox replaced by newer ones.
     """
 
     def __init__(self, stop: threading.Event, source: FrameSource) -> None:
-        """A meter whose streams end early once `stop` is set."""
+        """Measure one source; `measure_preparation` ends early once `stop` is set."""
         self._stop, self._source = stop, source
         self.frames_read = self.dropped_count = self.near_duplicates = self.held_out_count = 0
         self.dropped: list[DroppedFrameEntry] = []
@@ -57,7 +59,7 @@ class StreamMeter:
         self._available_at: deque[tuple[int, float]] = deque()
 
     def measure_arrival(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Passes frames on and notes when they were there."""
+        """Pass frames on and record when each was available."""
         for frame in frames:
             now = time.perf_counter()
             there_at = now if frame.due_s is None else frame.due_s
@@ -66,7 +68,7 @@ class StreamMeter:
                 self.first_frame_at, self._first_time_s = there_at, frame.time_s
                 self._clip_started_at = there_at
             self.last_frame_s = max(self.last_frame_s, frame.time_s - self._first_time_s)
-            if frame.due_s is not None:  # a resumed run plays from where it had come to
+            if frame.due_s is not None:  # a resumed run plays on from its last frame
                 self._clip_started_at = there_at - (frame.time_s - self._first_time_s)
             self.frames_read += 1
             self._available_at.append((frame.index, there_at))
@@ -75,7 +77,7 @@ class StreamMeter:
     def count_observations(
         self, observations: Iterable[Observation | DroppedFrame]
     ) -> Iterator[Observation | DroppedFrame]:
-        """Passes observations on and notes what they say."""
+        """Pass observations on; count dropped frames and record the image size."""
         for item in observations:
             if isinstance(item, DroppedFrame):
                 self.dropped_count += 1
@@ -86,7 +88,7 @@ class StreamMeter:
             yield item
 
     def measure_preparation(self, items: Iterator[Item]) -> Iterator[Item]:
-        """Passes items on, noting how long each took to make, until `stop` is set."""
+        """Pass items on until `stop` is set; record how long each took to prepare."""
         while not self._stop.is_set():
             started, waited = time.perf_counter(), self._source.waited_s
             try:
@@ -101,7 +103,7 @@ class StreamMeter:
             yield item
 
     def mark_arrived(self, index: int, *, held_out: bool) -> None:
-        """The trainer has a frame now; those before it that it never got are forgotten."""
+        """Record that the trainer has a frame; forget older ones that it never got."""
         self.held_out_count += held_out
         while self._available_at and self._available_at[0][0] <= index:
             number, there_at = self._available_at.popleft()
@@ -109,11 +111,27 @@ class StreamMeter:
                 self.current_latency_s = time.perf_counter() - there_at
                 self.latency_s.add(self.current_latency_s)
 
+    def lateness_warnings(self) -> Iterator[str]:
+        """Yield warnings about frames that could not be prepared as fast as they came."""
+        dropped, late = self._source.dropped + self.inbox_dropped, self.lateness_s
+        if dropped:
+            yield (
+                f"{dropped} frames were dropped because preprocessing is slower than the frame "
+                "rate. Reduce --size."
+            )
+        playback = self._source.paced and not self._source.live
+        if playback and late.percentile(95.0) > LATENESS_WARNING_S:
+            yield (
+                f"Playback lagged by up to {late.largest:.1f} s (median "
+                f"{late.percentile(50.0):.1f} s): preprocessing is slower than the frame rate. No "
+                "frame was dropped. Reduce --size, or use every other frame (--frames ::2)."
+            )
+
     def stats(self, *, ready_at: float | None) -> StreamStats:
-        """What the report says of the stream.
+        """Summarize the stream for the report.
 
         Args:
-            ready_at: When the package was there, on `time.perf_counter`'s clock.
+            ready_at: When the package was written, on `time.perf_counter`'s clock.
         """
         ready = None
         if ready_at is not None and self.first_frame_at is not None:

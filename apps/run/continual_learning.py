@@ -1,4 +1,4 @@
-"""Another video added to a finished avatar: what it knew stays, and what it loses is said."""
+"""Continual learning: add a video to a trained avatar, replay earlier ones, measure forgetting."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,32 +23,32 @@ from avatar.training.trainer import Trainer
 
 @final
 class EarlierVideos:
-    """The videos that were learnt before this one.
+    """The videos that an avatar was trained on before this one.
 
-    Their key frames stay in replay beside the new ones, and compete with them for their places; a
-    few frames that were never trained on say what was lost.
+    Their key frames stay in the replay buffer and compete with new ones for its places; their
+    held-out frames measure forgetting.
     """
 
     def __init__(self, run: RunFolder, notes: dict[str, Any]) -> None:
-        """Nothing happens yet.
+        """Load the frames of earlier videos, if there are any.
 
         Args:
-            run: Whose checkpoint folder keeps the frames.
-            notes: Kept with each checkpoint; what must be known after an interruption goes here.
+            run: Its checkpoint folder holds the frames.
+            notes: Stored with each checkpoint; updated with what an interrupted run needs.
         """
         self._run, self._notes = run, notes
-        began = "before" in notes  # else the file is of a run that was killed at its start
+        began = "before" in notes  # otherwise the file is from a run that was killed at its start
         self._kept = (
             SavedFrames.load(run.checkpoint / EARLIER_VIDEOS_FILE) if began else SavedFrames([], [])
         )
 
     @property
     def held_out(self) -> list[HeldOutFrame]:
-        """Frames of earlier videos that were never trained on."""
+        """Held-out frames of earlier videos."""
         return self._kept.held_out
 
     def start_new_video(self, trainer: Trainer, console: Console) -> None:
-        """Makes the video that was learnt last an earlier one, and scores it for the last time."""
+        """Turn the previous video into an earlier one, and score its held-out frames."""
         self._kept = SavedFrames.load(self._run.checkpoint / LAST_RUN_FILE).as_earlier_video()
         self._kept.save(self._run.checkpoint / EARLIER_VIDEOS_FILE)
         trainer.pose_corrections = {
@@ -57,8 +57,8 @@ class EarlierVideos:
         }
         if not self._kept.replay_frames:
             console.warning(
-                "The frames of the earlier video were not kept, for its run did not come to its "
-                "end: they are not learnt from again, and what they lose cannot be said."
+                "The previous video's run did not finish, so its key frames were not saved: they "
+                "cannot be replayed, and forgetting cannot be measured."
             )
         self.restore_key_frames(trainer, console)
         with console.status(f"scoring {len(self.held_out)} frames of the earlier video"):
@@ -72,7 +72,7 @@ class EarlierVideos:
         }
 
     def restore_key_frames(self, trainer: Trainer, console: Console) -> None:
-        """Puts the key frames of earlier videos back into the trainer's memory."""
+        """Put the key frames of earlier videos back into the replay buffer."""
         if not self._kept.replay_frames:
             return
         count = len(self._kept.replay_frames)
@@ -83,12 +83,12 @@ class EarlierVideos:
     def measure_forgetting(
         self, trainer: Trainer, held_out: list[HeldOutFrame], console: Console
     ) -> ForgettingStats | None:
-        """Keeps the frames for the next video; says what the earlier ones lost, if there are any.
+        """Save frames for the next video; compare scores of earlier videos, if there are any.
 
         Args:
             trainer: After its last step.
-            held: Held-out frames of the video that was learnt now.
-            console: Where it is said.
+            held_out: Held-out frames of the current video.
+            console: Shows the result.
 
         Raises:
             OSError: If the disk is full.
@@ -108,23 +108,23 @@ class EarlierVideos:
         )  # fmt: skip
         if note.psnr_after is not None:
             console.info(
-                "Frames of the earlier video: "
+                "Held-out frames of the earlier video: "
                 f"{format_psnr(note.psnr_before, overall_verdict(before))} before, "
-                f"{format_psnr(note.psnr_after, overall_verdict(after))} now; none lost more than "
-                f"{note.largest_drop:.2f} dB."
+                f"{format_psnr(note.psnr_after, overall_verdict(after))} now (largest drop "
+                f"{note.largest_drop:.2f} dB)."
             )
         return note
 
     def _previous_video_name(self) -> str:
-        """Of the video that was learnt last, as its user named it."""
+        """Return the file name of the previous video."""
         return self._notes.get("name") or Path(self._notes["video"]).name
 
     def _score_earlier_videos(self, trainer: Trainer) -> tuple[HeldOutScore, ...]:
-        """Of the held-out frames, by the numbers that they had in their own video."""
+        """Score the held-out frames; frame numbers are those of their own video."""
         scores = (score_frame(trainer.avatar, frame) for frame in self.held_out)
         return tuple(replace(each, frame=number_in_video(each.frame)) for each in scores)
 
 
 def earlier_video_names(notes: dict[str, Any]) -> tuple[str, ...]:
-    """Names of the videos that were learnt before the present one, by what a checkpoint keeps."""
+    """Return the names of the videos before the current one from a checkpoint's notes."""
     return tuple(notes.get("before", {}).get("videos", ()))

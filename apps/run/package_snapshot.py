@@ -1,4 +1,4 @@
-"""The avatar as it stands at this second, as a package that the player opens."""
+"""Write the avatar in its current state as a package for the player."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -16,17 +16,20 @@ from export.build import ExportReport, export_avatar
 from preprocess.capture_session import Capture
 from preprocess.observe import shrink_to_longer_side
 
-VALIDATION_VIEWS, QUICK_VALIDATION_VIEWS = 4, 2
+VALIDATION_VIEWS = 4
+"""Views that a package is validated with."""
+QUICK_VALIDATION_VIEWS = 2
+"""Views that a quick package is validated with."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PackageSnapshot:
-    """What became of it.
+    """Outcome of writing a package.
 
     Attributes:
-        exported: The package that was written, if one was.
-        refused: Why there is none, otherwise.
-        ready_at: When the package stood under its name, on `time.perf_counter`'s clock.
+        export_report: Describes the package; None if it was refused.
+        refusal: Why no package was written; None if one was.
+        ready_at: When the file was complete, on `time.perf_counter`'s clock.
     """
 
     export_report: ExportReport | None
@@ -44,20 +47,19 @@ def write_package_snapshot(
     fine_tune: bool = True,
     progress: Callable[[float], None] = lambda _: None,
 ) -> PackageSnapshot:
-    """Writes the package, whole or not at all; training may go on afterwards.
+    """Write the package, whole or not at all; training may continue afterwards.
 
     Args:
-        trainer: Whose avatar; not in the middle of a step.
-        path: The `.iavatar` file; what is there already is replaced only by something better
-            than nothing.
-        views: Poses and cameras to check it with (`validation_views`).
-        mark: How well held-out frames were rendered when that was last asked; goes with it.
-        hasty: Whether somebody waits for it; a finer one can replace it later (`finer`).
-        fine_tuned: Whether there are ten seconds more, for a better likeness.
-        progress: Gets the share that is done, from 0 to 1.
+        trainer: Holds the avatar; not in the middle of a step.
+        path: The `.iavatar` file; an existing one is kept if the package is refused.
+        views: Poses and cameras to validate the package with (`validation_views`).
+        curve_point: Latest scores of held-out frames, stored in the package.
+        quick: Whether to skip the finest detail because the user waits (`prefer_final`).
+        fine_tune: Whether to spend about ten seconds on fine-tuning the bricks.
+        progress: Called with the fraction done, from 0 to 1.
 
     Raises:
-        OSError: If the disk is full; what was there before stays.
+        OSError: If the disk is full; an existing package is kept.
     """
     metrics = {
         "held_out": None if curve_point is None else asdict(curve_point),
@@ -79,14 +81,14 @@ def write_package_snapshot(
 
 
 def prefer_final(quick: PackageSnapshot, final: PackageSnapshot) -> PackageSnapshot:
-    """What there is after a hasty package was replaced, if it was; it was ready with the first."""
+    """Return the package on disk after a quick one; it was ready when the quick one was."""
     if quick.export_report is None:
         return final
     return quick if final.export_report is None else replace(final, ready_at=quick.ready_at)
 
 
 def validation_views(held_out: list[HeldOutFrame], recording: Capture) -> Sequence[PosedView]:
-    """Poses and cameras to check a player with: held-out frames, else the first valid pose."""
+    """Return views to validate a package with: held-out frames, else the first valid pose."""
     seen = [frame.observation for frame in subsample_evenly(held_out, VALIDATION_VIEWS)]
     if seen:
         return [(observation.pose, observation.camera) for observation in seen]

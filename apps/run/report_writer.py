@@ -1,15 +1,10 @@
-"""Pictures inside a page: encoded as WebP, in the address itself.
-
-What a user should know of a result that is no avatar: what it is, and what to look at.
-
-What a run leaves on disk beside its package: report.json and report.html.
-"""
+"""Report of a run: report.json, report.html with its images, and the verdict on the console."""
 
 import base64
 import io
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +15,7 @@ from PIL import Image
 from apps.animation.driving_motion import demo_motion
 from apps.animation.following_camera import FollowingCamera
 from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit
 from apps.report.coverage_map import CoverageMap
 from apps.report.report_page import ComparisonPair, report_page
 from apps.report.report_schema import (
@@ -32,7 +28,6 @@ from apps.report.report_schema import (
     TrainingStats,
     format_psnr,
 )
-from apps.run.package_snapshot import PackageSnapshot
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
 from avatar.evaluation.held_out import subsample_evenly
@@ -42,7 +37,6 @@ from avatar.render import render
 from capture.atomic_files import write_text_atomically
 from capture.live.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb
-from export.build import ExportReport
 from export.player import Player
 from preprocess.capture_session import Capture
 
@@ -50,19 +44,19 @@ from preprocess.capture_session import Capture
 def to_uint8(
     picture: Float[np.ndarray, "height width channels"],
 ) -> UInt8[np.ndarray, "height width channels"]:
-    """A picture in [0, 1] as bytes."""
+    """Round an image in [0, 1] to 8 bits."""
     return (np.clip(picture, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def webp_data_uri(picture: UInt8[np.ndarray, "height width channels"]) -> str:
-    """One RGB or RGBA picture."""
+    """Encode an RGB or RGBA image as a data URI."""
     return _encode_webp([picture], frame_ms=0)
 
 
 def animated_webp_data_uri(
     pictures: Sequence[UInt8[np.ndarray, "height width channels"]], *, fps: float
 ) -> str:
-    """Pictures that follow each other again and again; transparency stays."""
+    """Encode RGB or RGBA images as a looping animation in a data URI."""
     return _encode_webp(pictures, frame_ms=max(1, round(1000.0 / fps)))
 
 
@@ -75,44 +69,41 @@ def _encode_webp(pictures: Sequence[UInt8[np.ndarray, "..."]], *, frame_ms: int)
 
 
 MIN_STEPS_TO_JUDGE = 60
-"""Below this many steps the avatar may simply not have had the time: fog clears in about 50."""
+"""Training steps below which a failed avatar is undertrained: fog clears in about 50."""
 CHECK_OPTIONS = ("poses", "person", "masks", "cameras", "body")
-"""Arguments of ia-ingest that ia-check needs to look at the same capture."""
+"""Arguments of ia-ingest that ia-check takes for the same capture."""
 
 
 def diagnose_failure(report: Report) -> str | None:
-    """Why the result is no avatar of the person, and what to do; None if it is one."""
+    """Explain a failed avatar and suggest what to do; None if it has not failed."""
     if report.verdict != "failed":
         return None
     held = report.held_out_refined or report.held_out
     what = f"The result is no usable avatar: {_describe_scores(held)}."
     if report.training.steps < MIN_STEPS_TO_JUDGE:
         return (
-            f"{what} Only {report.training.steps} steps were made: learn longer (the same command "
+            f"{what} Only {report.training.steps} steps were made: train longer (the same command "
             "with --resume and more --seconds)."
         )
     return (
-        f"{what} It has learnt something other than the person; masks that show too much, or poses "
-        "of another video, are the usual causes. Compare video and avatar in report.html"
+        f"{what} The model did not converge to the person. Usual causes: masks that include "
+        "background, or poses from another video. Compare video and avatar in report.html"
         + _check_advice(report.command)
     )
 
 
 def _describe_scores(held: HeldOutStats) -> str:
-    said = f"frames that it was not trained on are drawn at {format_psnr(held.psnr, held.verdict)}"
+    score = f"held-out PSNR is {format_psnr(held.psnr, held.verdict)}"
     if held.overlap is not None and held.overlap < MIN_OVERLAP:
         return (
-            f"{said}, and the body that is drawn agrees with the masks by only {held.overlap:.2f} "
-            f"(0 to 1; at least {MIN_OVERLAP:.1f} was expected)"
+            f"{score}, and the IoU of rendered alpha and masks is {held.overlap:.2f} (at least "
+            f"{MIN_OVERLAP:.1f} expected)"
         )
-    return (
-        f"{said}, worse than the video itself blurred by {MAX_MEASURABLE_BLUR:.0%} of the person's height, in "
-        "which no person can be made out"
-    )
+    return f"{score}, below that of the video blurred by {MAX_MEASURABLE_BLUR:.0%} of body height"
 
 
 def _check_advice(command: Mapping[str, Any]) -> str:
-    """The command that looks at poses and masks; of a live camera nothing is left to look at."""
+    """Return the ia-check command of the capture; a live camera leaves nothing to check."""
     video = str(command.get("video"))
     if camera_address(Path(video)) is not None:
         return "."
@@ -120,92 +111,95 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     for name in CHECK_OPTIONS:
         if command.get(name) not in (None, "solve"):
             words += [f"--{name}", str(command[name])]
-    return f", and let poses and masks be checked: {shlex.join(words)}"
+    return f", and check poses and masks: {shlex.join(words)}"
 
 
 MAX_PAIRS = 6
+"""Held-out frames shown beside their renderings on the page."""
 ANIMATION_PX = 320
+"""Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunInfo:
-    """What only the command knows.
-
-    Attributes:
-        command: The arguments, as given.
-        startup_seconds: From the start of the command to the first frame.
-        threads: Of torch and numba.
-    """
-
-    command: dict[str, Any]
-    startup_seconds: float
-    threads: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOutcome:
-    """What was written.
-
-    Attributes:
-        report: As in report.json.
-        refused: Why there is no package, if there is none.
-        failure: Why the result is no avatar of the person, if it is none.
-    """
-
-    report: Report
-    refusal: str | None
-    failure: str | None
+"""Images per second of the animation on the page."""
 
 
 def write_report(
     result: TrainingResult,
-    snapshot: PackageSnapshot,
-    recording: Capture,
+    capture: Capture,
     run: RunFolder,
-    info: RunInfo,
     console: Console,
-) -> RunOutcome:
-    """Writes the report, then the page; each whole or not at all.
+    *,
+    command: dict[str, Any],
+    startup_seconds: float,
+    threads: int,
+) -> Report:
+    """Write report.json, then report.html; each appears whole or not at all.
 
     Args:
-        learnt: With its scores.
-        taken: The package of the same avatar.
-        recording: What it was learnt from.
-        run: Where it goes.
-        note: What only the command knows.
-        console: Where warnings are collected and progress is shown.
+        result: Baked and scored.
+        capture: What the avatar was trained on.
+        run: Where the files go.
+        console: Holds the warnings, and shows progress.
+        command: Arguments of ia-ingest, as given.
+        startup_seconds: From the start of the command to the first frame.
+        threads: Of torch and numba.
 
     Raises:
-        OSError: If the disk is full; what was written before stays.
+        OSError: If the disk is full; what was written before is kept.
     """
-    refused, package = snapshot.refusal, None
-    if snapshot.export_report is None:
-        run.remove(run.package)  # a resumed run's older avatar would contradict
-    else:
-        for warning in snapshot.export_report.warnings:
-            console.warning(warning)
-        package = _package_stats(snapshot.export_report, run)
-    ready_at = None if snapshot.export_report is None else snapshot.ready_at
-    report = _build_report(result, recording, info, package, ready_at)
-    failure = diagnose_failure(report)
+    package = _package_stats(result, run, console)
+    report = _build_report(
+        result, capture, package,
+        command=command, startup_seconds=startup_seconds, threads=threads,
+    )  # fmt: skip
     write_text_atomically(run.report_json, report.to_json())
     with console.status("drawing the report"):
         page = report_page(
             report,
-            name=recording.paths.video.name,
-            body_map=CoverageMap(recording.shaped, result.coverage).svg(),
+            name=capture.paths.video.name,
+            body_map=CoverageMap(capture.shaped, result.coverage).svg(),
             pairs=comparison_pairs(result),
             animation=None if package is None else demo_animation(Player.load(run.package)),
-            warnings=[*console.warnings, *([] if refused is None else [refused])],
-            failure=failure,
+            warnings=[*console.warnings, *filter(None, [_refusal(result)])],
+            failure=diagnose_failure(report),
             present_files=[path.name for path in (run.cameras, run.poses) if path.exists()],
             play_command=None
             if package is None
-            else play_command(run.package, recording.paths.poses),
+            else play_command(run.package, capture.paths.poses),
         )
     write_text_atomically(run.report_html, page)
-    return RunOutcome(report=report, refusal=refused, failure=failure)
+    return report
+
+
+def print_results(
+    report: Report, result: TrainingResult, run: RunFolder, console: Console, *, interrupted: bool
+) -> int:
+    """Print scores and files; return the exit code.
+
+    Raises:
+        CommandExit: If there is no package, or its avatar has failed.
+    """
+    held_out, fitted = report.held_out, report.held_out_refined
+    score = "no frame was held out"
+    if held_out.psnr is not None:
+        score = f"held-out PSNR {format_psnr(held_out.psnr, held_out.verdict)}"
+    if fitted is not None and fitted.psnr is not None:
+        score += f", with poses fitted to those frames {format_psnr(fitted.psnr, fitted.verdict)}"
+    training = report.training
+    console.info(f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}.")
+    if report.package is not None:
+        console.print_artifact("package", run.package)
+    console.print_artifact("report", run.report_json)
+    console.print_artifact("look at it", run.report_html)
+    console.print_artifact("checkpoint", run.checkpoint)
+    unusable = _refusal(result) or diagnose_failure(report)
+    if unusable is not None:
+        raise CommandExit(unusable, INTERRUPTED if interrupted else NO_AVATAR)
+    return INTERRUPTED if interrupted else DONE
+
+
+def _refusal(result: TrainingResult) -> str | None:
+    """Return why no package was written; None if one was."""
+    return None if result.package is None else result.package.refusal
 
 
 def play_command(package: Path, poses: Path) -> str:
@@ -253,7 +247,14 @@ def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
     return replace(HeldOutStats.of(result.fitted_pose_scores, result.meter.size_px), poses="fitted")
 
 
-def _package_stats(exported: ExportReport, run: RunFolder) -> PackageStats:
+def _package_stats(result: TrainingResult, run: RunFolder, console: Console) -> PackageStats | None:
+    """Describe the package, or remove a resumed run's older one if none was written."""
+    exported = None if result.package is None else result.package.export_report
+    if exported is None:
+        run.remove(run.package)
+        return None
+    for warning in exported.warnings:
+        console.warning(warning)
     return PackageStats(
         path=run.package.name,
         bytes=exported.bytes,
@@ -264,38 +265,41 @@ def _package_stats(exported: ExportReport, run: RunFolder) -> PackageStats:
 
 def _build_report(
     result: TrainingResult,
-    recording: Capture,
-    info: RunInfo,
+    capture: Capture,
     package: PackageStats | None,
-    ready_at: float | None,
+    *,
+    command: dict[str, Any],
+    startup_seconds: float,
+    threads: int,
 ) -> Report:
-    trainer = result.trainer
-    held = HeldOutStats.of(result.scores, result.meter.size_px if result.scores else None)
+    trainer, snapshot = result.trainer, result.package
+    ready_at = None if package is None or snapshot is None else snapshot.ready_at
+    held_out = HeldOutStats.of(result.scores, result.meter.size_px if result.scores else None)
     recipe = asdict(trainer.config) | {
-        "camera": recording.cameras.source,
-        "body": recording.shaped.body.family,
-        "pose_model": recording.motion.body_model,
-        "body_fit": recording.body_fit_report(),
-        **recording.mask_report(),
+        "camera": capture.cameras.source,
+        "body": capture.shaped.body.family,
+        "pose_model": capture.motion.body_model,
+        "body_fit": capture.body_fit_report(),
+        **capture.mask_report(),
     }
     return Report(
-        command=info.command,
+        command=command,
         recipe=recipe,
         machine=MachineInfo(
             device=trainer.avatar.field.table.device.type,
             backend=trainer.backend.name,
-            threads=info.threads,
+            threads=threads,
         ),
         frames=_frame_stats(result),
-        training=_training_stats(result, info),
-        held_out=held,
+        training=_training_stats(result, startup_seconds),
+        held_out=held_out,
         held_out_refined=_fitted_pose_stats(result),
         curve=result.curve,
         stream=result.meter.stats(ready_at=ready_at),
         package=package,
         coverage=CoverageStats.of(result.coverage),
         earlier_videos=result.earlier_videos,
-        cameras=recording.camera_report,
+        cameras=capture.camera_report,
     )
 
 
@@ -314,13 +318,13 @@ def _frame_stats(result: TrainingResult) -> FrameStats:
     )
 
 
-def _training_stats(result: TrainingResult, info: RunInfo) -> TrainingStats:
+def _training_stats(result: TrainingResult, startup_seconds: float) -> TrainingStats:
     trainer = result.trainer
     return TrainingStats(
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
         cpu_contention_seconds=result.cpu_time.waited_s,
-        startup_seconds=info.startup_seconds,
+        startup_seconds=startup_seconds,
         steps=trainer.steps,
         rays=trainer.rays,
         rays_per_second=trainer.rays / max(trainer.wall_seconds, 1e-6),

@@ -1,4 +1,4 @@
-"""Where a run lies on disk, which of its files are ours, and whether there is one already."""
+"""Folder of a run: its files, which of them ia-ingest wrote, and how it is claimed."""
 
 import difflib
 import json
@@ -17,15 +17,16 @@ from capture.input_error import InputError
 from capture.output_file_list import OutputFileList
 
 STATE_FILE = "state.pt"
+"""Trainer and avatar, in checkpoint/."""
 CHECKPOINT_FILES = (STATE_FILE, "person.npz", "frames.tensors", "earlier.tensors")
-"""What ia-ingest writes into checkpoint/."""
+"""Files that ia-ingest writes into checkpoint/."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder:
     """A folder that holds one run of ia-ingest.
 
-    Other files may lie in it; those that a run would have to replace must be its own.
+    Files of the user may lie in it, but not where a run writes its own.
 
     Attributes:
         path: The folder.
@@ -35,78 +36,76 @@ class RunFolder:
 
     @property
     def package(self) -> Path:
-        """The avatar."""
+        """The package with the avatar."""
         return self.path / "avatar.iavatar"
 
     @property
     def report_json(self) -> Path:
-        """What was done and how well, as JSON."""
+        """The report for machines."""
         return self.path / "report.json"
 
     @property
     def report_html(self) -> Path:
-        """The same to look at."""
+        """The report as a page."""
         return self.path / "report.html"
 
     @property
     def checkpoint(self) -> Path:
-        """The folder from which training can go on."""
+        """The folder from which training can continue."""
         return self.path / "checkpoint"
 
     @property
     def body_file(self) -> Path:
-        """The body that the avatar has, for videos that are added later."""
+        """The body of the avatar, for videos that are added later."""
         return self.checkpoint / "person.npz"
 
     @property
     def cameras(self) -> Path:
-        """Cameras that were solved here; the folder of the same name without ending made them."""
+        """Solved cameras; the folder cameras/ holds the stages of solving."""
         return self.path / "cameras.npz"
 
     @property
     def poses(self) -> Path:
-        """The poses in the world of the solved cameras."""
+        """Poses in the world of the solved cameras."""
         return self.path / "poses.npz"
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All that a run may write, except for the stages of solved cameras."""
+        """All files that a run may write, except for the stages of camera solving."""
         top = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
 
     def has_run(self) -> bool:
-        """Whether any part of a run is there."""
+        """Whether any file of a run exists."""
         return any(path.exists() for path in self.files)
 
     def has_checkpoint(self) -> bool:
-        """Whether training can go on from here."""
+        """Whether training can continue from here."""
         return (self.checkpoint / STATE_FILE).is_file()
 
     def check_usable(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
-        """Whether the folder is a place for a run; nothing is made yet.
+        """Check that a run can be written here; nothing is created yet.
 
         Args:
-            inputs: What the run reads.
-            resume: Whether it goes on with a run that is there.
-            overwrite: Whether it replaces one.
+            inputs: Files and folders that the run reads.
+            resume: Whether to continue an existing run.
+            overwrite: Whether to replace an existing run.
 
         Raises:
-            InputError: If the path is no folder, has to do with an input, holds files that are not
-                ours where a run's would go, or cannot be written to.
+            InputError: If the path is a file, overlaps an input, holds foreign files where a run
+                writes, or cannot be written to.
         """
         if resume and overwrite:
-            raise InputError(
-                "--resume goes on with a run, --overwrite removes it: give one of them."
-            )
+            raise InputError("--resume and --overwrite are mutually exclusive.")
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
         check_disjoint_from_inputs(self.path, "--out", inputs)
-        stranger = self._foreign_file()
-        if stranger is not None:
+        foreign = self._foreign_file()
+        if foreign is not None:
             free = shlex.quote(str(unused_path(self.path)))
             raise InputError(
-                f"{stranger} is not what ia-ingest wrote there, and a run in {self.path} would "
-                f"have to replace it. Move it elsewhere, or name another folder: --out {free}"
+                f"{foreign} was not written by ia-ingest and would be overwritten. Move it, or "
+                f"choose another folder: --out {free}"
             )
         if resume and not (self.has_checkpoint() or self._was_started()):
             raise InputError(self._nothing_to_resume_message())
@@ -114,16 +113,16 @@ class RunFolder:
 
     @contextmanager
     def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
-        """Makes the folder and keeps other runs out of it; if it stays empty, it goes again.
+        """Create and lock the folder during a block; remove it afterwards if it stayed empty.
 
         Args:
-            console: Where warnings are shown.
-            resume: Whether a run goes on with what is there.
-            overwrite: Whether it replaces what is there.
+            console: Shows warnings.
+            resume: Whether to continue an existing run.
+            overwrite: Whether to replace an existing run.
 
         Raises:
-            InputError: If there is a run that would be lost.
-            Stop: If another run is writing there.
+            InputError: If a run exists and neither flag is given.
+            CommandExit: If another run is writing here.
         """
         made = [p for p in (self.path, *self.path.parents) if not p.exists()]
         self.path.mkdir(parents=True, exist_ok=True)
@@ -131,8 +130,8 @@ class RunFolder:
             with lock_folder(self.path, console):
                 if self.has_run() and not (resume or overwrite):
                     raise InputError(
-                        f"{self.path} already holds a run. Go on with it (--resume), replace it "
-                        "(--overwrite), or name another folder (--out)."
+                        f"{self.path} already holds a run. Continue it (--resume), replace it "
+                        "(--overwrite), or choose another folder (--out)."
                     )
                 try:
                     yield
@@ -140,72 +139,68 @@ class RunFolder:
                     self.remove_empty_folders()
         finally:
             for folder in made:
-                with suppress(OSError):  # it is not empty
+                with suppress(OSError):  # not empty
                     folder.rmdir()
 
     def start_run(self, *, resume: bool) -> None:
-        """Starts the lists of what is ours; unless the run is resumed, an older one is removed.
+        """Start the lists of written files; remove an older run unless it is resumed.
 
-        Call it when nothing can be wrong with the input any more.
+        Call it once the inputs have been found good.
 
         Raises:
-            InputError: If files came meanwhile that are not ours.
+            InputError: If foreign files have appeared since `check_usable`.
         """
-        older = self._unlisted_run_files()
         self.checkpoint.mkdir(parents=True, exist_ok=True)
         for folder in (self.path, self.checkpoint):
             listing = OutputFileList(folder)
             listing.create()
-            listing.add_all({path.name: path for path in older if path.parent == folder})
             listing.remove_temporaries()
         for path in () if resume else self.files:
             self.remove(path)
 
     def remove(self, path: Path) -> None:
-        """Removes one of the run's files.
+        """Remove one of the run's files.
 
         Raises:
-            InputError: If a file is there that is not ours.
+            InputError: If ia-ingest did not write the file.
         """
         if not OutputFileList(path.parent).remove(path.name):
-            raise InputError(f"{path} is not what ia-ingest wrote there; it was left alone.")
+            raise InputError(f"{path} was not written by ia-ingest; it was kept.")
 
     def describe_remaining_files(self) -> str:
-        """What is there after a run has failed half-way, and what a user can do."""
+        """Tell what an interrupted run has left, and how to continue."""
         files = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
         names = [path.name for path in files if path.exists()]
-        there = f"{self.path} holds {', '.join(names)}." if names else ""
+        held = f"{self.path} holds {', '.join(names)}." if names else ""
         if not self.has_checkpoint() and self.package.exists():
-            return f"{there} Without a checkpoint the avatar can be played, but not learnt on."
+            return f"{held} Without a checkpoint the avatar can be played but not trained further."
         if not self.has_checkpoint():
-            return there or f"Nothing was written to {self.path}."
+            return held or f"Nothing was written to {self.path}."
         return (
-            f"{there} The newest checkpoint is kept in {self.checkpoint}: run the same command "
-            "with --resume, in place of any --overwrite, to go on from it."
+            f"{held} The newest checkpoint is kept in {self.checkpoint}: to continue from it, run "
+            "the same command with --resume instead of --overwrite."
         ).lstrip()
 
     def release(self) -> None:
-        """Gives up a folder that this process has claimed, where the process ends at once."""
+        """Release a claimed folder where the process is about to exit without unwinding."""
         (self.path / LOCK).unlink(missing_ok=True)
         self.remove_empty_folders()
 
     def remove_empty_folders(self) -> None:
-        """Removes folders that nothing was written to."""
+        """Remove folders that nothing was written to."""
         for folder in (self.checkpoint, self.path):
             OutputFileList(folder).remove_if_empty()
-            with suppress(OSError):  # it is not empty, or not there
+            with suppress(OSError):  # not empty, or missing
                 folder.rmdir()
 
     def _was_started(self) -> bool:
-        """Whether a run was here that was killed, perhaps before it had written anything."""
+        """Whether a run was started here, even if it was killed before it wrote a file."""
         return OutputFileList(self.path).exists() or (self.path / LOCK).is_file()
 
     def _foreign_file(self) -> Path | None:
-        """A file that is not ours where a run's would go."""
-        older = self._unlisted_run_files()
+        """Return a foreign file where a run would write; None if there is none."""
         for path in self.files:
-            there = os.path.lexists(path)
-            if there and path not in older and not OutputFileList(path.parent).owns(path.name):
+            if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
         for folder in (self.checkpoint, self.path / "cameras"):
             if os.path.lexists(folder) and not folder.is_dir():
@@ -213,31 +208,21 @@ class RunFolder:
         lists = (OutputFileList(self.path), OutputFileList(self.checkpoint))
         return next((listing.path for listing in lists if listing.path_is_foreign()), None)
 
-    def _unlisted_run_files(self) -> list[Path]:
-        """The files of a run that was made before there were lists, known by its report."""
-        if OutputFileList(self.path).exists() or not is_run_report(self.report_json):
-            return []
-        solved = json.loads(self.report_json.read_text(encoding="utf-8")).get("cameras") or {}
-        ours = set(self.files)
-        if solved.get("verdict") != "solved":
-            ours -= {self.cameras, self.poses}
-        return [path for path in self.files if path in ours and path.is_file()]
-
     def _nothing_to_resume_message(self) -> str:
-        """That there is no run to go on with, and which one may have been meant."""
+        """Tell that there is no run to resume, and suggest the one probably meant."""
         beside = self.path.absolute().parent
         runs = [p.parent.parent.name for p in sorted(beside.glob(f"*/checkpoint/{STATE_FILE}"))]
         near = difflib.get_close_matches(self.path.absolute().name, runs, n=1, cutoff=0.5)
         meant = [shlex.quote(str(self.path.with_name(name))) for name in near]
         return (
-            f"There is no run in {self.path}, so there is nothing to --resume."
+            f"No run to --resume in {self.path}."
             + "".join(f" Did you mean --out {path}?" for path in meant)
-            + " To begin a new run, leave --resume out."
+            + " To start a new run, omit --resume."
         )
 
 
 def is_run_report(path: Path) -> bool:
-    """Whether a file is a report.json that ia-ingest wrote."""
+    """Whether a file is a report.json of ia-ingest."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""One run at a time: a lock on a run's folder, which the kernel releases however a run ends."""
+"""Lock of a run's folder, which the kernel releases however the process ends."""
 
 import errno
 import os
@@ -19,24 +19,26 @@ except ImportError:  # Windows
     fcntl = None
 
 LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
+"""Name of the locked file in a run's folder."""
 LOCK_LABEL_PATTERN = re.compile(r"instant-avatar-stream run, process (\d+), since (.+)\n?")
+"""Content of a lock file: process and time."""
 LOCKED_ERRNOS = frozenset({errno.EWOULDBLOCK, errno.EACCES})
+"""Errors of `flock` where another process holds the lock."""
 
 
 @contextmanager
 def lock_folder(folder: Path, console: Console) -> Iterator[None]:
-    """Holds a folder for this process; the file that is locked is removed at the end.
+    """Lock a folder for this process; remove the lock file at the end.
 
-    After `kill -9` the file stays, but not the lock. On file systems without locks a warning is
-    shown instead.
+    After `kill -9` the file remains, but not the lock. File systems without locks cause a warning.
 
     Args:
-        folder: Is there already.
-        console: Where warnings are shown.
+        folder: An existing folder.
+        console: Shows warnings.
 
     Raises:
-        Stop: If another process holds it.
-        InputError: If a file of somebody else has the lock's name.
+        CommandExit: If another process holds the lock.
+        InputError: If a foreign file has the lock's name.
     """
     path = folder / LOCK_FILE_NAME
     descriptor = _acquire(path, console)
@@ -49,15 +51,14 @@ def lock_folder(folder: Path, console: Console) -> Iterator[None]:
 
 
 def _acquire(path: Path, console: Console) -> int | None:
-    """The locked file; None where files cannot be locked."""
+    """Return the locked file's descriptor; None where files cannot be locked."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             label = os.read(descriptor, 1000).decode(errors="replace")
             if label and LOCK_LABEL_PATTERN.fullmatch(label) is None:
                 raise InputError(
-                    f"{path} is not a lock that ia-ingest made. Move it elsewhere, or name another "
-                    "folder (--out)."
+                    f"{path} is not a lock of ia-ingest. Move it, or choose another folder (--out)."
                 )
             if not _try_lock(descriptor, path.parent, label, console):
                 path.unlink(missing_ok=True)
@@ -65,7 +66,7 @@ def _acquire(path: Path, console: Console) -> int | None:
                 return None
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(descriptor), path.stat()):
-                    break  # else it was removed by a run that ended just now
+                    break  # else a run that just ended has removed it
         except BaseException:
             os.close(descriptor)
             raise
@@ -78,7 +79,7 @@ def _acquire(path: Path, console: Console) -> int | None:
 
 
 def _try_lock(descriptor: int, folder: Path, label: str, console: Console) -> bool:
-    """Whether the file could be locked; False where there are no locks."""
+    """Lock a file; return False where the file system has no locks."""
     try:
         if fcntl is None:
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
@@ -89,7 +90,7 @@ def _try_lock(descriptor: int, folder: Path, label: str, console: Console) -> bo
             raise CommandExit(_busy_message(folder, label), RESOURCE_UNAVAILABLE) from None
         console.warning(
             f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "
-            "ia-ingest writes into this folder meanwhile."
+            "ia-ingest writes into this folder at the same time."
         )
         return False
 
@@ -98,6 +99,6 @@ def _busy_message(folder: Path, label: str) -> str:
     found = LOCK_LABEL_PATTERN.fullmatch(label)
     who = f" (process {found[1]}, since {found[2]})" if found else ""
     return (
-        f"Another ia-ingest is writing into {folder}{who}. Wait until it has ended, or name "
-        "another folder (--out)."
+        f"Another ia-ingest is writing into {folder}{who}. Wait until it ends, or choose another "
+        "folder (--out)."
     )

@@ -1,4 +1,4 @@
-"""What training leaves in memory, for scores, report and package."""
+"""Result of training, for scores, package and report."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ from apps.report.cpu_contention import CpuTime
 from apps.report.learning_curve import CurvePoint
 from apps.report.report_schema import ForgettingStats
 from apps.report.stream_meter import StreamMeter
+from apps.run.package_snapshot import PackageSnapshot
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import HeldOutScore
@@ -14,20 +15,21 @@ from avatar.training.trainer import Trainer
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingResult:
-    """What training leaves in memory.
+    """A trained avatar and how it was trained.
 
     Attributes:
-        trainer: With the avatar as it is now.
-        held: Held-out frames that have arrived.
-        curve: Scores on the way, and at the end.
-        meter: What it saw of the stream.
-        coverage: What of the person the frames show that it was trained on.
-        added: Frames that were put into the trainer's memory in this run.
-        interrupted: Whether Ctrl-C ended it.
-        scores: Of each held-out frame, at the end, in the given poses; empty until they are made.
-        fitted: The same in poses fitted to them, if poses are refined.
-        cpu: What the machine gave, and what the run waited for.
-        extended: What an earlier video lost, if there was one.
+        trainer: Holds the avatar.
+        held_out: Held-out frames that have arrived.
+        curve: Learning curve, up to the final scores.
+        meter: Timing and counts of the frame stream.
+        coverage: Skin that the training frames show.
+        frames_added: Frames of this capture that were trained on.
+        interrupted: Whether Ctrl-C ended training.
+        cpu_time: CPU time used, and lost to other programs.
+        package: Outcome of packaging; None before `TrainingSession.bake`.
+        scores: Final scores of the held-out frames in the given poses; empty before `bake`.
+        fitted_pose_scores: Final scores in poses fitted to the frames, if poses are refined.
+        earlier_videos: Forgetting of earlier videos, if there were any.
     """
 
     trainer: Trainer
@@ -38,11 +40,12 @@ class TrainingResult:
     frames_added: int
     interrupted: bool
     cpu_time: CpuTime
+    package: PackageSnapshot | None = None
     scores: tuple[HeldOutScore, ...] = ()
     fitted_pose_scores: tuple[HeldOutScore, ...] = ()
     earlier_videos: ForgettingStats | None = None
 
     @property
     def is_trained(self) -> bool:
-        """Whether there is anything to show."""
+        """Whether any step was made on any frame."""
         return self.trainer.steps > 0 and self.frames_added > 0

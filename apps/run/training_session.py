@@ -1,7 +1,8 @@
-"""The walk from a recording to a trained avatar: feeds the trainer, listens, keeps checkpoints."""
+"""A training session: frames in, steps, checkpoints, package, scores."""
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -11,11 +12,18 @@ from typing import Any, final
 import torch
 
 from apps.cli.console import Console, ProgressBar, format_duration
+from apps.cli.exit_codes import BAD_INPUT, INTERRUPTED, CommandExit
 from apps.report.cpu_contention import CpuContentionMeter, CpuTime
 from apps.report.learning_curve import CurvePoint
 from apps.report.report_schema import finite_mean, format_percent, format_psnr
 from apps.report.stream_meter import StreamMeter
 from apps.run.continual_learning import EarlierVideos, earlier_video_names
+from apps.run.package_snapshot import (
+    PackageSnapshot,
+    prefer_final,
+    validation_views,
+    write_package_snapshot,
+)
 from apps.run.run_folder import RunFolder
 from apps.run.time_estimate import describe_position, post_training_seconds
 from apps.run.training_observer import TrainingObserver, notify_observers
@@ -36,12 +44,12 @@ from avatar.training.training_frame import TrainingFrame
 from capture.atomic_files import atomic_file
 from capture.inbox import Inbox
 from capture.live.realtime_playback import RealtimePlayback
+from export.bake.render_targets import PosedView
 from preprocess.body.body_file import write_shaped_body
 from preprocess.capture_session import Capture
 
 CHECKPOINT_INTERVAL_S = 5.0
-LATENESS_WARNING_S = 0.5
-"""A playback that lags more than this is spoken of."""
+"""Seconds of training between two checkpoints."""
 
 
 def new_trainer(
@@ -54,7 +62,7 @@ def new_trainer(
     hold_every: int = HELD_OUT_STRIDE,
     device: torch.device,
 ) -> Trainer:
-    """A trainer that has seen nothing, for this person, this waiting time and this picture size."""
+    """Build an untrained trainer for the person, the training budget and the image size."""
     config = TrainConfig.for_budget(
         seconds,
         steps=steps,
@@ -69,14 +77,14 @@ def new_trainer(
 
 @final
 class TrainingSession:
-    """One recording taught to one trainer.
+    """Training of one avatar on one capture.
 
     Attributes:
-        trainer: With the avatar as it is now.
-        held: Held-out frames that have arrived.
-        curve: Scores so far.
-        coverage: What of the person has been seen so far.
-        meter: What it saw of the stream.
+        trainer: Holds the avatar in its current state.
+        held_out: Held-out frames that have arrived.
+        curve: Learning curve up to now.
+        coverage: Skin that the training frames have shown.
+        meter: Timing and counts of the frame stream.
     """
 
     def __init__(
@@ -90,16 +98,16 @@ class TrainingSession:
         *,
         observers: Sequence[TrainingObserver] = (),
     ) -> None:
-        """Nothing happens yet.
+        """Prepare the session; `train` starts it.
 
         Args:
             trainer: New, or from a checkpoint.
-            recording: Its frames are read anew.
-            run: Where checkpoints go.
-            console: Where progress is shown.
+            recording: Capture to train on.
+            run: Folder for checkpoints and package.
+            console: Shows progress and warnings.
             stop: Ends training as soon as it is set.
-            notes: Kept with each checkpoint.
-            watchers: Who looks on.
+            notes: Stored with each checkpoint.
+            observers: Notified of frames and training events.
         """
         self.trainer, self._recording, self._run = trainer, recording, run
         self._console, self._stop, self._notes = console, stop, notes
@@ -116,20 +124,18 @@ class TrainingSession:
 
     @property
     def stop_requested(self) -> bool:
-        """Whether somebody wants it to end."""
+        """Whether the user has asked to stop."""
         return self._stop.is_set()
 
     def train(self, *, restore_count: int = 0) -> TrainingResult:
-        """Trains until the time is up or somebody stops it. Scores come later (`scored`).
-
-        What was learnt since the last checkpoint is not written yet (`saving`).
+        """Train until the budget is used or the user stops; `bake` packages and scores.
 
         Args:
-            recall: Frames that the trainer has learnt from before: they are put back into its
-                memory before the clock starts.
+            restore_count: Frames of this video that the trainer was trained on before; they are
+                read back into its replay buffer before the clock starts.
 
         Raises:
-            OSError: If a checkpoint cannot be written; the one before stays.
+            OSError: If a checkpoint cannot be written; the previous one is kept.
         """
         source = self._recording.source
         self._set_unpaced(restore_count > 0)
@@ -138,12 +144,12 @@ class TrainingSession:
             added = self._restore_frames(inbox, restore_count) - self.trainer.frames_seen
             self._set_unpaced(False)
             self._checkpointed_at, waited = time.perf_counter(), CpuContentionMeter(self.trainer)
-            with self._console.progress("learning", self.trainer.config.seconds) as bar:
+            with self._console.progress("training", self.trainer.config.seconds) as bar:
                 for event in train(self.trainer, inbox, self.held_out):
                     self._handle_event(event, bar)
-                    for watcher in self._observers:
-                        watcher.on_event(event)
-                        watcher.between_steps(self)
+                    for observer in self._observers:
+                        observer.on_event(event)
+                        observer.between_steps(self)
                     if self._stop.is_set():
                         break
         finally:
@@ -151,14 +157,14 @@ class TrainingSession:
             inbox.close()
         self.meter.inbox_dropped, cpu = inbox.dropped, waited.measure()
         interrupted = self._stop.is_set()
-        late = [*self._lateness_warnings(), *filter(None, [cpu.warning()])]
+        late = [*self.meter.lateness_warnings(), *filter(None, [cpu.warning()])]
         for warning in [*source.warnings, *late, *self._recording.final_notes()]:
             self._console.warning(warning)
         self._console.summarize_warnings()
         if len(self.trainer.replay):
             seen = format_percent(self.coverage.seen_share)
-            self._console.info(f"{seen} of the person was seen. {coverage_advice(self.coverage)}")
-            self._console.info(f"The package and the scores take {self._remaining_text(cpu)} more.")
+            self._console.info(f"Body coverage: {seen}. {coverage_advice(self.coverage)}")
+            self._console.info(f"Packaging and evaluation take {self._remaining_text(cpu)}.")
         return TrainingResult(
             trainer=self.trainer,
             held_out=self.held_out,
@@ -170,23 +176,65 @@ class TrainingSession:
             cpu_time=cpu,
         )
 
-    @contextmanager
-    def checkpointing(self) -> Iterator[None]:
-        """Writes a checkpoint beside what happens in this block, which changes nothing learnt.
+    def bake(self, result: TrainingResult) -> TrainingResult:
+        """Write the package, then score every held-out frame.
+
+        A paced source has a user waiting at its end, so a quick package comes first and a final
+        one with finer detail replaces it after scoring.
 
         Raises:
-            OSError: If it cannot be written; the one before stays.
+            CommandExit: If the avatar was not trained.
+            OSError: If the disk is full; what was written before is kept.
         """
+        self._check_trained(result)
+        views, quick = (
+            validation_views(self.held_out, self._recording),
+            self._recording.source.paced,
+        )
+        with self._checkpointing():
+            package = self._write_package("writing the package", views, quick=quick)
+        result = self._with_scores(result)
+        if quick:
+            final = self._write_package("writing the final package, with finer detail", views)
+            package = prefer_final(package, final)
+        return replace(result, package=package)
+
+    def _check_trained(self, result: TrainingResult) -> None:
+        if result.is_trained:
+            return
+        if result.interrupted:
+            raise CommandExit("stopped before the first step; no avatar was written.", INTERRUPTED)
+        reasons = Counter(drop.reason for drop in self.meter.dropped)
+        why = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))
+        raise CommandExit(
+            f"no frame of {self._recording.source.path} could be used ({why or 'it has none'}); at "
+            "least two usable frames are needed. No avatar was written.",
+            BAD_INPUT,
+        )
+
+    def _write_package(
+        self, label: str, views: Sequence[PosedView], *, quick: bool = False
+    ) -> PackageSnapshot:
+        with self._console.progress(label, 1.0) as bar:
+            return write_package_snapshot(
+                self.trainer,
+                self._run.package,
+                views,
+                curve_point=self.curve[-1] if self.curve else None,
+                quick=quick,
+                progress=bar.set_share,
+            )
+
+    @contextmanager
+    def _checkpointing(self) -> Iterator[None]:
+        """Write a checkpoint on another thread during this block, which must not train."""
         with ThreadPoolExecutor(1) as beside:
             saved = beside.submit(self._save_checkpoint)
             yield
         saved.result()
 
-    def with_scores(self, result: TrainingResult) -> TrainingResult:
-        """The same with every held-out frame scored, in given poses and in fitted ones.
-
-        It takes a while, and the package need not wait for it.
-        """
+    def _with_scores(self, result: TrainingResult) -> TrainingResult:
+        """Score every held-out frame, in the given poses and in poses fitted to it."""
         scores = self._score_held_out()
         self._save_checkpoint()
         extended = EarlierVideos(self._run, self._notes).measure_forgetting(
@@ -201,12 +249,12 @@ class TrainingSession:
         )
 
     def _set_unpaced(self, unpaced: bool) -> None:
-        """What a run has seen before is not played again at its own speed."""
+        """Deliver frames without delay while a resumed run reads back what it has seen."""
         if isinstance(self._recording.source, RealtimePlayback):
             self._recording.source.catch_up = unpaced
 
     def _frame_stream(self) -> Iterator[StreamItem]:
-        """Frames as they become ready; runs on the inbox's thread."""
+        """Prepare frames; runs on the inbox's thread."""
         frames = self.meter.measure_arrival(self._recording.source.frames())
         found = self.meter.count_observations(map(self._recording.observation_builder(), frames))
         rig, every = self.trainer.avatar.rig, self.trainer.config.held_out_stride
@@ -216,7 +264,7 @@ class TrainingSession:
         return self.meter.measure_preparation(prepare_items(items, rig))
 
     def _restore_frames(self, inbox: Inbox[StreamItem], count: int) -> int:
-        """Puts frames back into the memory of a trainer that has learnt from them before."""
+        """Read frames back into the replay buffer; return how many."""
         seen = 0
         if not count:
             return seen
@@ -244,13 +292,13 @@ class TrainingSession:
             case Evaluated():
                 point = self._add_curve_point(event.scores, event.wall_seconds, event.cpu_seconds)
                 if point.psnr is not None:
-                    so_far = format_psnr(point.psnr, point.verdict, provisional=True)
-                    self._console.info(f"{event.wall_seconds:6.1f} s   {so_far}")
+                    score = format_psnr(point.psnr, point.verdict, provisional=True)
+                    self._console.info(f"{event.wall_seconds:6.1f} s   {score}")
             case Warned(message=message):
                 self._console.warning(message)
 
     def _remaining_text(self, cpu: CpuTime) -> str:
-        """How long the run takes from now on, about."""
+        """Estimate the time from the last step to the report."""
         config, size = self.trainer.config, self.meter.size_px or (0, 0)
         rest = post_training_seconds(
             len(self.held_out),
@@ -273,11 +321,10 @@ class TrainingSession:
     def _progress_text(self) -> str:
         trainer, last = self.trainer, self.curve[-1] if self.curve else None
         rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
-        parts = [self._position_text()]  # what matters most comes first: terminals cut the rest off
+        parts = [self._position_text()]  # terminals cut off the end of a long line
         if last is not None and last.psnr is not None:
-            parts.append(
-                f"held out {format_psnr(last.psnr, last.verdict, digits=1, provisional=True)}"
-            )
+            score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)
+            parts.append(f"held-out PSNR {score}")
         parts += [
             f"{format_percent(self.coverage.seen_share)} seen",
             f"{trainer.frames_seen} frames",
@@ -288,22 +335,6 @@ class TrainingSession:
         if self._recording.source.paced:
             parts.append(f"{1000.0 * self.meter.current_latency_s:.0f} ms behind")
         return " · ".join(parts)
-
-    def _lateness_warnings(self) -> Iterator[str]:
-        """What a user should know about a stream that could not be kept up with."""
-        source, late = self._recording.source, self.meter.lateness_s
-        if source.dropped + self._inbox.dropped:
-            yield (
-                f"{source.dropped + self._inbox.dropped} frames gave way to later ones, because "
-                "preparing a frame takes longer than filming it. A smaller --size is faster."
-            )
-        if source.paced and not source.live and late.percentile(95.0) > LATENESS_WARNING_S:
-            yield (
-                f"The playback fell behind by up to {late.largest:.1f} s (half of the frames by "
-                f"{late.percentile(50.0):.1f} s or more): frames are not prepared as fast as they "
-                "come. No frame was lost. A smaller --size, or every other frame (--frames ::2), "
-                "is faster."
-            )
 
     def _add_curve_point(
         self, scores: tuple[HeldOutScore, ...], wall_s: float, cpu_s: float

@@ -23,10 +23,10 @@ from export.player import Player
 
 KEYS = {
     "": "format verdict command recipe machine frames training held_out held_out_refined curve "
-    "stream package coverage extended cameras",
+    "stream package coverage earlier_videos cameras",
     "machine": "device backend threads",
-    "frames": "read used held_out dropped alike not_replayed",
-    "training": "wall_seconds cpu_seconds cpu_waited_seconds startup_seconds steps rays "
+    "frames": "read used held_out dropped near_duplicates not_replayed",
+    "training": "wall_seconds cpu_seconds cpu_contention_seconds startup_seconds steps rays "
     "rays_per_second samples_per_ray peak_memory_mb",
     "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses",
     "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
@@ -71,7 +71,8 @@ def test_the_report_has_the_keys_that_were_agreed(report):
 def test_every_frame_is_accounted_for(report):
     frames = report["frames"]
     assert frames == {
-        "read": 24, "used": 22, "held_out": 2, "dropped": [], "alike": 0, "not_replayed": 0
+        "read": 24, "used": 22, "held_out": 2, "dropped": [], "near_duplicates": 0,
+        "not_replayed": 0,
     }  # fmt: skip
     assert report["held_out"]["frames"] == [9, 19]
     assert report["held_out"]["size"] == [64, 64]
@@ -96,13 +97,13 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
     def as_of_a_room(avatar, held):
         return replace(score(avatar, held), psnr=6.88, blur=math.inf, overlap=0.2)
 
-    monkeypatch.setattr(training_session, "score", as_of_a_room)
+    monkeypatch.setattr(training_session, "score_frame", as_of_a_room)
     out = tmp_path / "run"
     outcome = call_ingest(capture, *FEW, "--out", out, "--no-refine-poses")
     assert outcome.code == 1
     assert "no usable avatar" in outcome.complaint()
     assert "6.88 dB (failed)" in outcome.complaint()
-    assert "held out 6.88 dB (failed)" in outcome.err
+    assert "held-out PSNR 6.88 dB (failed)" in outcome.err
     report = json.loads((out / "report.json").read_text())
     assert report["verdict"] == "failed"
     assert report["held_out"]["blur"] is None  # beyond the widest
@@ -198,7 +199,7 @@ def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path)
 def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
     out = tmp_path / "run"
     RunFolder(path=out).start_run(resume=False)  # as of a run that was killed at its start
-    assert "no checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
+    assert "No checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
     first = json.loads((out / "report.json").read_text())
     outcome = call_ingest(capture, *FEW, "--out", out, "--resume", steps=15)
     second = json.loads((out / "report.json").read_text())

@@ -61,7 +61,7 @@ def test_masks_cannot_be_dark_and_bright(program, capsys):
     module, function = COMMANDS[program].split(":")
     words = ["capture", "--mask-invert", "--no-mask-invert"]
     assert getattr(importlib.import_module(module), function)(words) == 2
-    assert "contradict" in capsys.readouterr().err
+    assert "mutually exclusive" in capsys.readouterr().err
 
 
 def test_auto_trains_on_the_cpu_even_if_torch_sees_a_gpu(monkeypatch):

@@ -47,15 +47,15 @@ def test_a_quota_that_holds_the_process_back_counts(trainer, tmp_path, monkeypat
 def test_where_threads_say_nothing_steps_do(trainer, tmp_path):
     """A step that takes a second of wall time and a third of CPU time has waited."""
     meter = CpuContentionMeter(trainer, tmp_path / "none")
-    trainer.stepping_wall, trainer.stepping_cpu = 65.0, 24.0
+    trainer.step_wall_seconds, trainer.step_cpu_seconds = 65.0, 24.0
     trainer.cpu_seconds, trainer.steps = 26.0, 300
     assert meter.measure() == CpuTime(used_s=22.0, waited_s=40.0, steps=200)
 
 
 def test_a_starved_run_is_told_what_it_missed():
     said = CpuTime(used_s=17.0, waited_s=103.0, steps=134).warning()
-    assert "17 of the 120 core-seconds" in said
-    assert "134 steps instead of about 946" in said
+    assert "17 of 120 core-seconds" in said
+    assert "134 instead of about 946 steps" in said
     assert "--resume" in said
 
 

@@ -357,7 +357,7 @@ def test_cameras_that_are_refused_cost_nobody_the_avatar(
     outcome = call_ingest(walkaround, "--cameras", "solve", "--out", tmp_path / "run")
     assert outcome.code == 2
     assert "a reason" in outcome.complaint()
-    assert "avatar was learnt" in outcome.complaint()
+    assert "avatar was trained" in outcome.complaint()
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["cameras"]["verdict"] == "refused"
     assert (tmp_path / "run" / "avatar.iavatar").exists()

@@ -38,15 +38,15 @@ def test_another_video_is_added_and_what_the_first_lost_is_said(
     assert extended["largest_drop"] >= 0.0
     assert extended["videos"] == ["capture"]
     assert extended["video_of_frame"] == [1, 1, 1]
-    assert extended["used"] == before["frames"]["used"]
+    assert extended["frames_trained"] == before["frames"]["used"]
     assert extended["wall_seconds"] == pytest.approx(before["training"]["wall_seconds"])
     held = {1: before["held_out"]["frames"], 2: after["held_out"]["frames"]}
     assert {point["video"] for point in after["curve"]} == {1, 2}
     for point in after["curve"]:  # numbers in the video, whichever it was
         assert {number for number, _ in point["frames"]} <= set(held[point["video"]])
     page = (out / "report.html").read_text()
-    assert "of capture before, learnt in" in page
-    assert "The video before" in page
+    assert "of capture, trained for" in page
+    assert "Earlier videos" in page
     assert "earlier video" in outcome.err
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
     assert after["training"]["steps"] == 2 * before["training"]["steps"]

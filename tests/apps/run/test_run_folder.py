@@ -166,7 +166,7 @@ def test_a_run_folder_begins_empty_unless_it_is_resumed(tmp_path):
     assert listed(run.checkpoint) == ["other.pt"]
 
 
-def test_a_run_folder_that_stayed_empty_goes(tmp_path):
+def test_an_empty_run_folder_is_removed(tmp_path):
     run, console = RunFolder(path=tmp_path / "runs" / "run"), Console()
     with run.claim(console, resume=False, overwrite=False):
         run.start_run(resume=False)
@@ -178,7 +178,7 @@ def test_a_run_folder_that_stayed_empty_goes(tmp_path):
 
 
 def test_resuming_and_overwriting_contradict(tmp_path):
-    with pytest.raises(InputError, match="one of them"):
+    with pytest.raises(InputError, match="mutually exclusive"):
         RunFolder(path=tmp_path).check_usable([], resume=True, overwrite=True)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"):
@@ -193,7 +193,7 @@ def test_resuming_and_overwriting_contradict(tmp_path):
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("given", ["", "resume", "overwrite"])
-def test_one_strange_file_of_our_names_is_refused_by_name(tmp_path, name, given):
+def test_a_foreign_file_with_a_runs_name_is_refused(tmp_path, name, given):
     path = tmp_path / "run" / name
     path.parent.mkdir(parents=True)
     path.write_bytes(b"mine")
@@ -203,39 +203,21 @@ def test_one_strange_file_of_our_names_is_refused_by_name(tmp_path, name, given)
     assert path.read_bytes() == b"mine"
 
 
-def test_a_file_of_ours_that_was_changed_is_somebody_elses(tmp_path):
+def test_a_file_that_was_changed_counts_as_foreign(tmp_path):
     run = begun(tmp_path)
     run.check_usable([], resume=True, overwrite=False)
     run.report_json.write_text("notes of mine")
     for resume in (True, False):
-        with pytest.raises(InputError, match=r"report\.json is not what ia-ingest wrote there"):
+        with pytest.raises(InputError, match=r"report\.json was not written by ia-ingest"):
             run.check_usable([], resume=resume, overwrite=not resume)
-    with pytest.raises(InputError, match="left alone"):
+    with pytest.raises(InputError, match="was kept"):
         run.remove(run.report_json)
     assert run.report_json.read_text() == "notes of mine"
 
 
-@pytest.mark.parametrize("solved", [False, True])
-def test_a_run_from_before_there_were_lists_is_known_by_its_report(tmp_path, solved):
-    report = dict.fromkeys(("format", "command", "recipe", "machine", "training", "held_out"))
-    run = begun(tmp_path, **report, cameras={"verdict": "solved"} if solved else None)
-    for folder in (run.path, run.checkpoint):
-        OutputFileList(folder).path.unlink()
-    run.check_usable([], resume=True, overwrite=False)
-    run.cameras.write_bytes(b"cameras")
-    if not solved:  # then they are the user's
-        with pytest.raises(InputError, match=r"cameras\.npz"):
-            run.check_usable([], resume=False, overwrite=True)
-        run.cameras.unlink()
-    run.check_usable([], resume=False, overwrite=True)
-    run.start_run(resume=False)
-    assert listed(run.path) == ["checkpoint"]
-    assert listed(run.checkpoint) == []
-
-
-def test_there_must_be_a_run_to_go_on_with(tmp_path):
+def test_resuming_needs_a_run(tmp_path):
     begun(tmp_path / "walk")
-    with pytest.raises(InputError, match=r"nothing to --resume.*mean --out \S*walk\?"):
+    with pytest.raises(InputError, match=r"No run to --resume.*mean --out \S*walk\?"):
         RunFolder(path=tmp_path / "wakl").check_usable([], resume=True, overwrite=False)
     run = RunFolder(path=tmp_path / "killed")
     run.start_run(resume=False)  # and killed before its first checkpoint
@@ -247,7 +229,7 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path):
 
 def test_resuming_a_name_that_was_mistyped_is_an_error(film, tmp_path, capsys):
     assert ingest.main([str(film), "--out", str(tmp_path / "typo"), "--resume"]) == 2
-    assert "There is no run in" in capsys.readouterr().err
+    assert "No run to --resume in" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -268,9 +250,9 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp
 def test_a_killed_run_holds_its_folder_no_longer(tmp_path):
     code = (
         "import os, pathlib, sys\n"
-        "from apps.run.run_lock import locked\n"
+        "from apps.run.run_lock import lock_folder\n"
         "from apps.cli.console import Console\n"
-        "with locked(pathlib.Path(sys.argv[1]), Console()): print('held', flush=True); input()"
+        "with lock_folder(pathlib.Path(sys.argv[1]), Console()): print('held', flush=True); input()"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
     with subprocess.Popen(

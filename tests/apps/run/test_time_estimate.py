@@ -27,20 +27,20 @@ def test_how_many_frames_will_be_held_out(frames, every, held):
 
 
 @pytest.mark.parametrize(
-    ("wall_s", "reading", "said"),
+    ("elapsed_s", "frames_read", "expected"),
     [
         (12.2, (5, 24), "12 of 40 s, step 9"),
-        (54.0, (12, 24), "54 s, more than the 40 s that were given, because every frame is trained "
-         "on at least once: 12 of 24 frames read, then it ends"),
-        (54.0, (12, None), "12 frames read, then it ends"),
-        (54.0, None, "54 s, more than the 40 s that were given: the last steps"),
+        (54.0, (12, 24), "54 s (limit 40 s): finishing the first pass over the video, 12 of 24 "
+         "frames read"),
+        (54.0, (12, None), "12 frames read"),
+        (54.0, None, "54 s (limit 40 s): last steps"),
     ],
 )  # fmt: skip
-def test_time_that_is_up_is_explained(wall_s, reading, said):
+def test_time_beyond_the_limit_is_explained(elapsed_s, frames_read, expected):
     found = describe_position(
-        elapsed_s=wall_s, budget_s=40.0, step=9, steps=None, frames_read=reading
+        elapsed_s=elapsed_s, budget_s=40.0, step=9, steps=None, frames_read=frames_read
     )
-    assert found.endswith(said)
+    assert found.endswith(expected)
 
 
 def test_steps_that_were_asked_for_are_counted():

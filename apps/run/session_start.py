@@ -1,0 +1,210 @@
+"""Start of a training session: kernels, a new, resumed or extended trainer, the viewer."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from apps.cli.console import Console, format_duration
+from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
+from apps.run.continual_learning import EarlierVideos
+from apps.run.ingest_arguments import IngestArguments
+from apps.run.run_folder import RunFolder
+from apps.run.time_estimate import expected_held_out, post_training_seconds
+from apps.run.training_session import new_trainer
+from avatar.backends import backend_for
+from avatar.evaluation.held_out import MAX_HELD_OUT
+from avatar.training import checkpoint, warmup
+from avatar.training.trainer import Trainer
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from export.bake import bake_kernels
+from preprocess.capture_session import Capture
+
+if TYPE_CHECKING:  # viser is an optional extra
+    from apps.view.live_viewer import LiveViewer
+
+JOINT_TOLERANCE_M = 1e-3
+"""Largest difference of rest joints within one body, metres; more is another body."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreparedTrainer:
+    """A trainer that is ready for the frames of a capture.
+
+    Attributes:
+        trainer: New, or from the run's checkpoint.
+        restore_count: Frames of this video that the trainer was trained on before.
+        notes: Stored with each checkpoint.
+    """
+
+    trainer: Trainer
+    restore_count: int
+    notes: dict[str, Any]
+
+
+def load_kernels(arguments: IngestArguments, console: Console) -> int:
+    """Compile or load the kernels of the device; return the number of threads."""
+    threads = set_threads(arguments.threads)
+    with console.status("compiling kernels (slow on the first run only)"):
+        device = resolve_device(arguments.device)
+        backend_for(device)
+    if device.type == "cuda":
+        console.warning(CUDA_SLOW_WARNING)
+    return threads
+
+
+def prepare_trainer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> PreparedTrainer:
+    """Build a new trainer, or load the run's checkpoint to resume it or to add a video.
+
+    Raises:
+        InputError: If the checkpoint cannot be read, or belongs to another body.
+    """
+    if arguments.resume and run.has_checkpoint():
+        prepared = _load_trainer(arguments, capture, run, console)
+    else:
+        if arguments.resume:
+            console.info(f"No checkpoint in {run.path}; starting a new run.")
+        prepared = _new_run(arguments, capture)
+    with console.status("warming up"):
+        warmup.warm_up(prepared.trainer)
+        bake_kernels.warm_up()
+    _announce_duration(arguments, capture, prepared.trainer, console)
+    return prepared
+
+
+def open_viewer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> "LiveViewer | None":
+    """Open the live viewer if --view asks for it."""
+    if arguments.view is None:
+        return None
+    from apps.view.live_viewer import LiveViewer
+
+    return LiveViewer(capture, run, console, arguments.view)
+
+
+def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
+    trainer = new_trainer(
+        capture,
+        seconds=arguments.training_seconds(capture),
+        steps=arguments.steps,
+        seed=arguments.seed,
+        refine_poses=arguments.refine_poses,
+        hold_every=arguments.hold_out,
+        device=resolve_device(arguments.device),
+    )
+    notes = {"video": _video_identity(capture), "name": capture.paths.video.name}
+    return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
+
+
+def _load_trainer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> PreparedTrainer:
+    """Load the checkpoint: the same video continues, another one is added."""
+    trainer, notes = checkpoint.load(run.checkpoint, resolve_device(arguments.device))
+    _check_same_body(trainer, capture, run)
+    earlier = EarlierVideos(run, notes)
+    if notes.get("video") == _video_identity(capture):
+        return _resume_video(arguments, capture, trainer, earlier, notes, console)
+    return _add_video(arguments, capture, trainer, earlier, notes, console)
+
+
+def _resume_video(
+    arguments: IngestArguments,
+    capture: Capture,
+    trainer: Trainer,
+    earlier: EarlierVideos,
+    notes: dict[str, Any],
+    console: Console,
+) -> PreparedTrainer:
+    before = notes.get("before", {"frames": 0, "seconds": 0.0, "steps": 0})
+    unit, budget, spent = _budget(arguments, capture, trainer)
+    restore_count = trainer.frames_seen - before["frames"]
+    spent -= before[unit]
+    console.info(f"Resuming after {spent:.0f} {unit} of training.")
+    if spent >= budget:
+        console.warning(
+            f"This run has used {spent:.0f} of {budget:.0f} {unit}; only package and report will "
+            f"be rewritten. Increase --{unit} to continue training."
+        )
+    earlier.restore_key_frames(trainer, console)
+    _extend_budget(trainer, arguments, capture, float(before[unit]))
+    return PreparedTrainer(trainer=trainer, restore_count=restore_count, notes=notes)
+
+
+def _add_video(
+    arguments: IngestArguments,
+    capture: Capture,
+    trainer: Trainer,
+    earlier: EarlierVideos,
+    notes: dict[str, Any],
+    console: Console,
+) -> PreparedTrainer:
+    unit, _, spent = _budget(arguments, capture, trainer)
+    console.info(f"Adding another video to an avatar with {spent:.0f} {unit} of training.")
+    earlier.start_new_video(trainer, console)
+    notes["name"], notes["video"] = capture.paths.video.name, _video_identity(capture)
+    _extend_budget(trainer, arguments, capture, spent)
+    return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
+
+
+def _budget(
+    arguments: IngestArguments, capture: Capture, trainer: Trainer
+) -> tuple[str, float, float]:
+    """Return the unit of the training budget, the budget, and what the trainer has used of it."""
+    if arguments.steps is None:
+        return "seconds", arguments.training_seconds(capture), trainer.wall_seconds
+    return "steps", float(arguments.steps), float(trainer.steps)
+
+
+def _extend_budget(
+    trainer: Trainer, arguments: IngestArguments, capture: Capture, earlier: float
+) -> None:
+    """Add the budget of this command to what earlier videos have used."""
+    trainer.config = replace(
+        trainer.config,
+        seconds=arguments.training_seconds(capture) + earlier,
+        steps=None if arguments.steps is None else arguments.steps + int(earlier),
+        refine_poses=arguments.refine_poses,
+    )
+
+
+def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None:
+    """Refuse poses of another body than the checkpoint's."""
+    difference_m = abs(trainer.avatar.rig.rest_joints - capture.shaped.joints).max()
+    if difference_m > JOINT_TOLERANCE_M:
+        raise InputError(
+            f"The poses use a different body than the avatar in {run.path} (rest joints differ by "
+            f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
+            "with --overwrite."
+        )
+
+
+def _video_identity(capture: Capture) -> str:
+    """Return what identifies a video in a checkpoint; each recording of a camera is a new one."""
+    source = capture.source
+    if camera_address(source.path) is not None:
+        return f"{source.path} {source.started_at:.3f}"
+    return str(source.path.resolve())
+
+
+def _announce_duration(
+    arguments: IngestArguments, capture: Capture, trainer: Trainer, console: Console
+) -> None:
+    """Print the expected duration of training, and of packaging and evaluation."""
+    source, config = capture.source, trainer.config
+    longer_side_px = max(source.size_px)
+    rest = post_training_seconds(
+        expected_held_out(source.frame_count, arguments.hold_out, MAX_HELD_OUT),
+        min(longer_side_px, capture.size_px or longer_side_px),
+        fit_poses=config.refine_poses,
+    )
+    seconds = max(0.0, config.seconds - trainer.wall_seconds)
+    duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
+    if config.steps:
+        duration = f"{config.steps - trainer.steps} steps"
+    console.info(
+        f"Training for {duration}, then about {format_duration(rest)} for packaging and evaluation "
+        "on an otherwise idle machine."
+    )
