@@ -122,6 +122,7 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     started = time.perf_counter()
     player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     load_ms = 1000.0 * (time.perf_counter() - started)
+    _print_package_warnings(player, console)
     shots = list(plan_render(arguments, player, console))
     result = benchmark_player(
         player,
@@ -192,6 +193,8 @@ def _run_verification(arguments: PlayArguments, console: Console) -> int:
     verdict = verify_package(arguments.avatar, provider=arguments.provider)
     if arguments.json is not None:
         write_text_atomically(arguments.json, verdict.to_json(), replace=arguments.overwrite)
+    for note in verdict.warnings:
+        console.warning(note)
     for line in verdict.to_lines():
         console.info(line)
     return DONE if verdict.matches else BAD_INPUT

@@ -120,7 +120,7 @@ def all_marks(
 def train_or_load(
     capture: Path, run: Path, *, frames: int | None = None, size: int | None = None
 ) -> Trainer:
-    """The trainer that ia-ingest left in a folder, which it is asked to fill if there is none."""
+    """Load the trainer that ia-ingest left in a folder; train it first if there is none."""
     if not (run / "checkpoint").exists():
         command = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
         command += ["--seconds", str(SECONDS), "--overwrite"]

@@ -56,7 +56,7 @@ def views_of_sample(
         capture: A filmed sample.
         avatar: Learnt from it.
         frames: How many frames were learnt from or held out.
-        every: Every so manyth picture is looked at.
+        stride: Use every n-th picture.
     """
     recording = open_sample(capture, frames=slice(0, frames))
     found = {

@@ -2,6 +2,6 @@
 
 import os
 
-# Newer wheels of onnxruntime number the machine and keep a record for Microsoft of what runs on it,
-# in the home folder, unless this is said before they are imported. An avatar is a difference.
+# Newer wheels of onnxruntime number the machine and record in the home folder what runs on it, for
+# Microsoft, unless this is set before they are imported. An avatar is a likeness of a person.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

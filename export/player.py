@@ -1,4 +1,8 @@
-"""The player: poses and cameras in, pictures out, with numpy and onnxruntime alone."""
+"""The player: poses and cameras in, pictures out, with numpy and onnxruntime alone.
+
+player = Player.load("avatar.iavatar")
+rgba = player.render(pose, camera)          # uint8, straight alpha
+"""
 
 from collections import deque
 from collections.abc import Generator, Iterable
@@ -27,8 +31,9 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, world_from_body
 
 MIN_ORT_VERSION = "1.24"
+"""Oldest release of onnxruntime that the player runs on."""
 IN_MEMORY_TABLES = "add_external_initializers_from_files_in_memory"
-"""What older releases cannot do from Python."""
+"""Method of `SessionOptions` that older releases lack."""
 
 
 @final
@@ -38,8 +43,8 @@ class Player:
     One player may be used by several threads at once.
 
     Attributes:
-        manifest: What the package says about itself: joints, tiers, golden frames, licence.
-        provider: onnxruntime's execution provider that really draws.
+        manifest: The package's joints, tiers, golden frames and licence.
+        provider: onnxruntime's execution provider that draws.
     """
 
     def __init__(
@@ -50,14 +55,24 @@ class Player:
         threads: int = 1,
         provider: str = "cpu",
     ) -> None:
-        """A player of a package that has been read (or is about to be written)."""
+        """Prepare the graph of a package that was read or is about to be written.
+
+        Args:
+            package: Tables and graphs.
+            tier: Quality tier.
+            threads: Threads for one picture.
+            provider: onnxruntime's execution provider, "cpu", "cuda", …
+
+        Raises:
+            InputError: If the provider is unknown or the graph does not run.
+        """
         self.manifest: Manifest = package.manifest
-        self._rules = package.manifest.tiers[tier].settings
-        self._close_ups = ResolutionLimit(package.tables[tier], self._rules)
+        self._settings = package.manifest.tiers[tier].settings
+        self._close_ups = ResolutionLimit(package.tables[tier], self._settings)
         # onnxruntime only borrows the tables: they must live as long as the session
         self._tables = {
             name: array.tobytes()
-            for name, array in graph_initializers(package.tables[tier], self._rules).items()
+            for name, array in graph_initializers(package.tables[tier], self._settings).items()
         }
         self.provider = find_provider(provider)
         self._session = create_session(package.graphs[tier], self._tables, threads, self.provider)
@@ -73,17 +88,17 @@ class Player:
         threads: int = 1,
         provider: str = "cpu",
     ) -> "Player":
-        """Reads a package.
+        """Read a package and prepare its player.
 
         Args:
             path: The `.iavatar` file.
-            tier: Which quality: "hq", or "lite" where the package has it.
-            threads: Of one picture; more than one seldom pays: see `render_all`.
+            tier: Quality tier: "hq", or "lite" where the package has it.
+            threads: Threads for one picture; more than one rarely pays (see `render_all`).
             provider: onnxruntime's execution provider, "cpu", "cuda", …
 
         Raises:
-            InputError: If the file is no sound package, or has no such tier, or there is no such
-                provider here.
+            InputError: If the file is not a sound package, or lacks the tier, or the provider is
+                unknown.
         """
         try:
             package = read_package(Path(path), tier=tier)
@@ -98,34 +113,36 @@ class Player:
         size: int | np.integer | tuple[int, int] | None = None,
         samples: int | None = None,
     ) -> UInt8[np.ndarray, "height width 4"]:
-        """The avatar's picture with straight alpha.
+        """Draw the avatar with straight alpha.
 
         Args:
             pose: In the camera's world.
             camera: Without lens distortion.
-            size: Longer side, or width and height, of the picture in pixels: the camera's own field
-                of view, scaled; the camera's own size if None.
-            samples: Along 5 cm of a ray; the tier's own choice if None.
+            size: Longer side, or width and height, of the picture in pixels, with the camera's
+                field of view; the camera's own size if None.
+            samples: Density samples along 5 cm of a ray; the tier's own number if None.
 
         Raises:
-            InputError: If the camera's lens bends, there are no samples or no pixels, or pose or
-                camera are of another shape or not finite.
+            InputError: If the camera has lens distortion, there are no samples or no pixels, or
+                pose or camera have another shape or are not finite.
         """
-        samples = self._rules.samples if samples is None else samples
+        samples = self._settings.samples if samples is None else samples
         camera = resize_camera(camera, size)
         check_render_inputs(pose, camera, samples)
         bones = self.bones(pose, camera)
-        times = self._close_ups.downscale_factor(bones, camera)
-        if times == 1.0:
+        factor = self._close_ups.downscale_factor(bones, camera)
+        if factor == 1.0:
             return self._run_graph(bones, camera, samples)
         return upscale_picture(
-            self._run_graph(bones, downscale_camera(camera, times), samples), camera.size_px, times
+            self._run_graph(bones, downscale_camera(camera, factor), samples),
+            camera.size_px,
+            factor,
         )
 
     def _run_graph(
         self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
     ) -> UInt8[np.ndarray, "height width 4"]:
-        """What the graph draws."""
+        """Run the graph once."""
         width, height = camera.size_px
         lens = [*camera.focal_px, *camera.center_px]
         inputs = {
@@ -144,7 +161,8 @@ class Player:
         if packed.size != height * width or packed.dtype != np.int32:
             raise InputError(
                 f"The package's graph draws {packed.dtype} {packed.shape} instead of one 32-bit "
-                f"number for each of {width}x{height} px. It is damaged, or none of ours."
+                f"number for each of {width}x{height} px. It is damaged, or another program "
+                "wrote it."
             )
         return packed.astype("<i4", copy=False).view(np.uint8).reshape(height, width, 4)
 
@@ -155,18 +173,17 @@ class Player:
         workers: int = 1,
         samples: int | None = None,
     ) -> Generator[UInt8[np.ndarray, "_ _ 4"], None, None]:
-        """Pictures of many shots, in their order, several at the same time.
+        """Yield the pictures of many poses and cameras in order, drawing several at a time.
 
-        The pictures do not depend on how many workers draw them. No more than a few are held back
-        until they are taken.
+        The pictures do not depend on the number of workers; at most two a worker are held back.
 
         Args:
-            shots: Poses and cameras, as `render` takes them.
-            workers: Threads; onnxruntime leaves Python free while it draws.
-            samples: As in `render`.
+            shots: Poses and cameras, as of `render`.
+            workers: Threads; onnxruntime releases Python's lock while it draws.
+            samples: As of `render`.
 
         Raises:
-            InputError: As `render` does.
+            InputError: As of `render`.
         """
         if workers == 1:
             for pose, camera in shots:
@@ -186,7 +203,7 @@ class Player:
                     picture.cancel()
 
     def bones(self, pose: BodyPose, camera: Camera) -> Float32[np.ndarray, "24 3 4"]:
-        """Camera-from-canonical matrices of the joints."""
+        """Return camera-from-canonical matrices of the joints."""
         root = world_from_body(
             self.manifest.rest_joints[0], pose.root_rotation, pose.root_translation
         )
@@ -198,20 +215,18 @@ class Player:
         return body_from_rest(self.manifest.rest_joints, self.manifest.parents, rotations)
 
 
-def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDifference]:
-    """Draws a package's golden frames again, on this machine.
+def compare_golden_frames(
+    package: AvatarPackage, *, provider: str = "cpu"
+) -> list[PictureDifference]:
+    """Draw a package's golden frames again and compare them with the stored ones.
 
     Args:
-        path: The `.iavatar` file.
+        package: A package that was read.
         provider: onnxruntime's execution provider.
 
-    Returns:
-        For each golden frame, how far the new picture is from the stored one.
-
     Raises:
-        InputError: If the file is no sound package, or there is no such provider.
+        InputError: If the provider is unknown, or the graph does not run.
     """
-    package = read_package(Path(path), tier=None)  # every entry is looked at
     player = Player(package, provider=provider)
     return [
         PictureDifference.of(
@@ -222,10 +237,10 @@ def verify_package(path: Path | str, *, provider: str = "cpu") -> list[PictureDi
 
 
 def find_provider(name: str) -> str:
-    """onnxruntime's own name of a provider: "cpu" is "CPUExecutionProvider".
+    """Return onnxruntime's full name of a provider: "cpu" is "CPUExecutionProvider".
 
     Raises:
-        InputError: If this onnxruntime has none of that name.
+        InputError: If this build of onnxruntime lacks it.
     """
     known = onnxruntime.get_available_providers()
     for provider in known:
@@ -239,44 +254,41 @@ def find_provider(name: str) -> str:
 
 
 def shorten_error(error: Exception, max_length: int = 400) -> str:
-    """What onnxruntime says, without the pages that some providers add."""
-    said = " ".join(str(error).split())
-    return (
-        said
-        if len(said) <= max_length
-        else f"{said[: max_length // 2]} … {said[-max_length // 2 :]}"
-    )
+    """Return onnxruntime's message on one line, its middle cut out beyond `max_length`."""
+    message = " ".join(str(error).split())
+    half = max_length // 2
+    return message if len(message) <= max_length else f"{message[:half]} … {message[-half:]}"
 
 
 def create_session(
     graph: bytes, tables: dict[str, bytes], threads: int, provider: str
 ) -> onnxruntime.InferenceSession:
-    """A graph that is ready to run, with threads that do not spin.
+    """Create a session for a graph, with threads that do not spin.
 
     Args:
         graph: The ONNX model.
-        tables: Its external tables by name; they must live as long as the session.
-        threads: Of one run.
-        provider: As `find_provider` gives it.
+        tables: Its external tables by name; they must outlive the session.
+        threads: Threads for one run.
+        provider: A name from `find_provider`.
 
     Raises:
-        InputError: If it does not run here.
+        InputError: If the graph does not run with this onnxruntime and provider.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what fails is said below
-    options.enable_mem_reuse = False  # planning it takes longer than anything else at load
+    options.log_severity_level = 4  # failures are reported below
+    options.enable_mem_reuse = False  # its planning dominates loading time
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names, buffers = list(tables), list(tables.values())
     if not hasattr(options, IN_MEMORY_TABLES):
         raise InputError(
-            f"onnxruntime {onnxruntime.__version__} is too old for the player; {MIN_ORT_VERSION} or newer "
-            "is needed: pip install --upgrade onnxruntime (or the build of it that you use)."
+            f"onnxruntime {onnxruntime.__version__} is too old for the player; {MIN_ORT_VERSION} "
+            "or newer is needed: pip install --upgrade onnxruntime (or the build that you use)."
         )
     getattr(options, IN_MEMORY_TABLES)(names, buffers, [len(buffer) for buffer in buffers])
-    wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # what it lacks, the CPU does
+    wanted = list(dict.fromkeys([provider, "CPUExecutionProvider"]))  # the CPU runs what it lacks
     try:
         session = onnxruntime.InferenceSession(graph, options, providers=wanted)
     except Exception as error:

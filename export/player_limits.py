@@ -1,7 +1,4 @@
-"""What the player can draw, checked before it is asked of the graph.
-
-Close-ups that surfels cannot cover: drawn as coarsely as they can, and enlarged.
-"""
+"""Limits of what the player can draw: valid inputs, and resolution in close-ups."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -19,28 +16,34 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.poses.plausibility import MAX_JOINT_ANGLE_RAD, exceeds_joint_limits
 
 MAX_SAMPLES = 256
+"""Largest number of density samples along 5 cm of a ray."""
 MAX_PICTURE_PX = 8192
+"""Longest side of a picture, pixels."""
 MAX_MAGNITUDE = 1e8
-"""Pixels, metres, radians: whatever is larger, or NaN, is a mistake."""
+"""Largest magnitude of an input in pixels, metres or radians."""
+NODE_RADIUS_M = 0.05
+"""Largest distance of a surfel from the nearest skinning node, metres."""
+BAND_ROWS = 64
+"""Rows that are enlarged at a time."""
 
 
 def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | None) -> Camera:
-    """The same camera for a picture of another size.
+    """Return the camera for a picture of another size.
 
     Args:
-        camera: With a size of its own.
-        size: Longer side, or width and height, pixels; None for the camera's own.
+        camera: Its field of view is kept.
+        size: Longer side, or width and height, pixels; None for the camera's own size.
 
     Raises:
-        InputError: If there would be no pixels.
+        InputError: If `size` is neither, or not positive.
     """
     if size is None:
         return camera
     sides: Any = np.asarray(size)
     if sides.shape not in ((), (2,)) or sides.dtype.kind not in "iu" or sides.min() < 1:
         raise InputError(
-            f"A picture of size {size} was asked for; expected the longer side, or width and "
-            "height, in whole pixels from 1 on."
+            f"The picture's size is {size}; expected the longer side, or width and height, in "
+            "whole pixels from 1 on."
         )
     return (
         camera.resize_longer_side(int(sides))
@@ -50,20 +53,20 @@ def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | Non
 
 
 def check_render_inputs(pose: BodyPose, camera: Camera, samples: int) -> None:
-    """Whether all of it can be drawn.
+    """Check pose, camera and number of samples.
 
     Raises:
-        InputError: If it cannot.
+        InputError: If the player cannot draw them.
     """
     if not 1 <= samples <= MAX_SAMPLES:
-        raise InputError(f"{samples} samples were asked for; 1 to {MAX_SAMPLES} can be drawn.")
+        raise InputError(f"{samples} samples are not possible; expected 1 to {MAX_SAMPLES}.")
     _check_array("root_rotation", pose.root_rotation, (3,))
     _check_array("root_translation", pose.root_translation, (3,))
     _check_array("joint_rotations", pose.joint_rotations, (23, 3))
     if exceeds_joint_limits(pose.joint_rotations):
         raise InputError(
             f"joint_rotations turn a joint by more than {np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°; "
-            "axis-angles in radians were expected. Of degrees give numpy.deg2rad(degrees)."
+            "expected axis-angles in radians. Convert degrees by numpy.deg2rad(degrees)."
         )
     _check_array("camera_from_world", camera.camera_from_world, (4, 4))
     if camera.distortion:
@@ -74,45 +77,40 @@ def check_render_inputs(pose: BodyPose, camera: Camera, samples: int) -> None:
     width, height = camera.size_px
     if not (0 < width <= MAX_PICTURE_PX and 0 < height <= MAX_PICTURE_PX):
         raise InputError(
-            f"Pictures of {width}x{height} px cannot be drawn; 1 to {MAX_PICTURE_PX} a side can."
+            f"A picture of {width}x{height} px is not possible; expected 1 to {MAX_PICTURE_PX} px "
+            "a side."
         )
     lens = np.array([*camera.focal_px, *camera.center_px])
     if not (np.abs(lens) < MAX_MAGNITUDE).all() or min(camera.focal_px) <= 0.0:
         raise InputError(
-            f"The camera's focal lengths are {camera.focal_px} and its centre {camera.center_px}; "
-            "finite numbers of pixels were expected, focal lengths above 0."
+            f"The camera's focal lengths are {camera.focal_px} and its center {camera.center_px}; "
+            "expected finite numbers of pixels, focal lengths above 0."
         )
 
 
 def _check_array(name: str, array: Any, shape: tuple[int, ...]) -> None:
     if np.shape(array) != shape:
-        raise InputError(f"{name} has the shape {np.shape(array)}; {shape} was expected.")
+        raise InputError(f"{name} has the shape {np.shape(array)}; expected {shape}.")
     if not (np.abs(array) < MAX_MAGNITUDE).all():
-        raise InputError(f"{name} holds NaN, infinity or a number out of all bounds.")
-
-
-NODE_RADIUS_M = 0.05
-"""A surfel has a node of the skin no farther away."""
-BAND_ROWS = 64
-"""Rows that are enlarged at a time."""
+        raise InputError(f"{name} holds NaN, infinity or a number above {MAX_MAGNITUDE:g}.")
 
 
 @final
 class ResolutionLimit:
-    """How much of a picture's fineness an avatar's surfels can cover.
+    """The picture resolution up to which an avatar's surfels leave no gaps.
 
-    A surfel covers at most `RenderSettings.largest_footprint_px`; nearer by, one would look between
-    them. There a voxel is dozens of pixels wide: a coarser picture, enlarged, shows as much.
+    A surfel covers at most `RenderSettings.max_footprint_px`; closer up, gaps would open between
+    them. A voxel is dozens of pixels wide there: a coarser picture, enlarged, shows as much.
     """
 
     def __init__(self, tables: PlayerTables, settings: RenderSettings) -> None:
-        """Of what is drawn, and how; nothing is computed before it is needed."""
+        """Store sizes; posed nodes are computed when they are needed."""
         self._skin, self._pelvis, self._reach_m = tables.skinning, tables.pelvis, tables.reach_m
         self._nearest_m, self._largest_px = settings.near_plane_m, settings.max_footprint_px
         self._footprint_m = tables.surfels.spacing_m * settings.footprint_spacings
 
     def downscale_factor(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
-        """How many times coarser a picture has to be drawn; 1 if surfels cover it as it is.
+        """Return the factor by which a picture has to be coarser; 1 if surfels leave no gaps.
 
         Args:
             bones: Camera-from-canonical matrices.
@@ -126,7 +124,7 @@ class ResolutionLimit:
         return max(1.0, footprint / most / self._nearest_depth_m(bones, camera))
 
     def _nearest_depth_m(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
-        """Least depth of what may be seen, metres; the nodes of the skin stand for it."""
+        """Return the least depth of skinning nodes that may be in the picture, metres."""
         matrices = (self._node_weights.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
         there = (
             np.einsum("nij,nj->ni", matrices[:, :, :3], self._node_positions) + matrices[:, :, 3]
@@ -149,7 +147,7 @@ class ResolutionLimit:
 
 
 def downscale_camera(camera: Camera, factor: float) -> Camera:
-    """The camera of a picture whose pixels are so many times as wide, with the same corner."""
+    """Return the camera of a picture with pixels wider by a factor, and the same corner."""
     (fx, fy), (x, y), (width, height) = camera.focal_px, camera.center_px, camera.size_px
     return replace(
         camera,
@@ -162,7 +160,13 @@ def downscale_camera(camera: Camera, factor: float) -> Camera:
 def upscale_picture(
     picture: UInt8[np.ndarray, "rows columns 4"], size_px: tuple[int, int], factor: float
 ) -> UInt8[np.ndarray, "height width 4"]:
-    """The inverse of `coarse` for a picture with straight alpha: bilinear, premultiplied."""
+    """Enlarge a picture with straight alpha to the camera's size, bilinearly.
+
+    Args:
+        picture: Drawn by `downscale_camera(camera, factor)`.
+        size_px: Width and height of the camera.
+        factor: Its factor.
+    """
     width, height = size_px
     source = picture.astype(np.float32)
     source[..., :3] *= source[..., 3:] / np.float32(255.0)
@@ -181,10 +185,10 @@ def upscale_picture(
 
 
 def _bilinear_taps(
-    length: int, coarse_length: int, times: float
+    length: int, coarse_length: int, factor: float
 ) -> tuple[np.ndarray, np.ndarray, Float32[np.ndarray, "length"]]:
-    """For each pixel along a side the two coarse ones that it lies between, and how far."""
-    place = np.clip((np.arange(length) + 0.5) / times - 0.5, 0.0, coarse_length - 1.0)
+    """Return for each pixel along a side the two coarse ones beside it, and its fraction."""
+    place = np.clip((np.arange(length) + 0.5) / factor - 0.5, 0.0, coarse_length - 1.0)
     before = np.floor(place).astype(np.intp)
     after = np.minimum(before + 1, coarse_length - 1)
     return before, after, (place - before).astype(np.float32)

@@ -1,1 +1,1 @@
-"""Baking: the field sampled into tables, and fine-tuned."""
+"""Baking: a trained field sampled into tables and fine-tuned."""

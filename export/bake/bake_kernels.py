@@ -1,9 +1,10 @@
-"""The loops of baking, compiled: walks along normals, and neighbours' colors."""
+"""Compiled loops of baking: walks along normals, and colors of neighbors."""
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from avatar.numba_kernels.kernel_compiler import compile_kernel
+from export.bake.grid_filters import dilate
 
 F32, I32 = np.float32, np.int32
 
@@ -12,21 +13,22 @@ F32, I32 = np.float32, np.int32
 def visible_depth_steps(
     density, low, voxel_m, positions, normals, step, max_steps, opaque, fraction
 ):
-    """Number of steps along each inward normal until all that can be seen has been seen.
+    """Count the steps along each inward normal until everything visible has been passed.
 
     Args:
         density: On nodes, 1/m.
-        low, voxel_m: Their place and distance, metres.
-        positions, normals: Where to start, and which way is out.
+        low, voxel_m: Position of the first node and distance between nodes, metres.
+        positions, normals: Where to start, and the outward direction.
         step: Distance between steps, metres.
-        deepest: Steps that are made.
-        opaque: Optical depth behind which nothing is seen.
-        share: So much of all there is along the normal is enough, too.
+        max_steps: Steps to take.
+        opaque: Optical depth behind which nothing is visible.
+        fraction: Fraction of the optical depth of all steps that is enough, too.
     """
     ends = np.empty(len(positions), dtype=np.int32)
     along = np.empty(max_steps, dtype=np.float32)
     last_i, last_j, last_k = density.shape[0] - 1, density.shape[1] - 1, density.shape[2] - 1
     for p in range(len(positions)):
+        # the whole walk comes first: thin parts are enough at a fraction of their own total
         total = F32(0)
         for n in range(max_steps):
             depth = (F32(n) + F32(0.5)) * step
@@ -46,7 +48,7 @@ def visible_depth_steps(
 
 @compile_kernel(nogil=True, error_model="numpy")
 def mark_visible_nodes(visible, low, voxel_m, positions, normals, thickness, margin_m):
-    """Marks the nodes from a margin outside of each position as deep as its thickness."""
+    """Mark the nodes along each normal, from a margin outside to the thickness inside."""
     last_i, last_j, last_k = visible.shape[0] - 1, visible.shape[1] - 1, visible.shape[2] - 1
     for p in range(len(positions)):
         depth = -margin_m
@@ -61,6 +63,7 @@ def mark_visible_nodes(visible, low, voxel_m, positions, normals, thickness, mar
 
 @compile_kernel(nogil=True, error_model="numpy")
 def _mean_colors(visible, rgb, nodes):
+    """Write the mean color of the visible ones among 26 neighbors to some nodes."""
     _, ny, nz = visible.shape
     for node in nodes:
         i, j, k = node // (ny * nz), node // nz % ny, node % nz
@@ -79,10 +82,10 @@ def _mean_colors(visible, rgb, nodes):
 
 
 def dilate_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
-    """Gives each empty node beside visible ones their mean color, in place.
+    """Give each empty node next to visible ones their mean color, in place.
 
-    Between a visible and an empty node color is interpolated too: black would darken the rim.
-    The border is left alone, and counts as empty.
+    Color is interpolated between a visible and an empty node as well: black would darken the rim.
+    The grid's border is left unchanged and counts as empty.
     """
     inner = np.zeros_like(visible)
     inner[1:-1, 1:-1, 1:-1] = visible[1:-1, 1:-1, 1:-1]
@@ -91,20 +94,8 @@ def dilate_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x 
     _mean_colors(inner, rgb, np.flatnonzero(beside))
 
 
-def dilate(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """The nodes and all 26 neighbours of each."""
-    for axis in range(3):
-        out = solid.copy()
-        here, beyond = [slice(None)] * 3, [slice(None)] * 3
-        here[axis], beyond[axis] = slice(None, -1), slice(1, None)
-        out[tuple(here)] |= solid[tuple(beyond)]
-        out[tuple(beyond)] |= solid[tuple(here)]
-        solid = out
-    return solid
-
-
 def warm_up() -> None:
-    """Compiles these loops, or loads them from disk, before anybody waits for a package."""
+    """Compile these loops, or load them from disk, before a package is waited for."""
     nodes, point = np.zeros((3, 3, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
     low, size = point[0], np.float32(1.0)
     visible_depth_steps(nodes, low, size, point, point, size, 1, 7.0, 0.999)

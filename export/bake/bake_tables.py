@@ -1,9 +1,4 @@
-"""Why an avatar is not written.
-
-The part of a rig's skinning volume that a package needs: cells in which rays are followed.
-
-Bakes a trained field into the tables that the player draws.
-"""
+"""Baking: a trained field and its rig as the tables that the player draws."""
 
 from dataclasses import dataclass, replace
 
@@ -11,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8, UInt16
 
 from avatar.deformation.rig import Rig
-from export.bake.bake_kernels import dilate, mark_visible_nodes
+from export.bake.bake_kernels import mark_visible_nodes
 from export.bake.field_grid import MIN_DENSITY, FieldFunction, FieldGrid, sample_field_grid
+from export.bake.grid_filters import dilate
 from export.bake.proxy_surface import ProxySurface, extract_proxy_surface
 from export.package.player_tables import (
     BRICK_NODES,
@@ -34,21 +30,21 @@ from preprocess.body.kinematics import body_from_rest
 
 
 class ExportRefused(RuntimeError):  # noqa: N818 - names what happened
-    """Nothing to draw, or a graph that does not compute what it should; nothing is written."""
+    """The avatar is empty, or its graph does not match the reference; no package is written."""
 
 
 OUTER_MARGIN_M = 0.012
-"""Rays begin at most about so far outside of the surface."""
+"""Largest distance outside the surface at which rays begin, about, metres."""
 PROBE_SPACING_M = 0.012
-"""Distance between the points along a normal that are looked at: much less than a cell."""
+"""Distance between probes along a normal, metres: much less than a cell of the rig's grid."""
 
 
 def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
-    """The skin under a surface, as deep as one sees.
+    """Keep the cells of the rig's skinning grid in which rays may be marched.
 
     Args:
-        rig: Whose.
-        surface: The surface.
+        rig: Its weights are kept.
+        surface: Where rays enter, and how deep they see.
     """
     shape = np.array(rig.weights.shape[:3])
     step_m = (rig.box_high - rig.box_low) / (shape - 1)
@@ -82,7 +78,7 @@ def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
 
 
 def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarray, "nodes 24"]:
-    """Weights × `WEIGHT_SCALE`, rounded so that each row sums to it (the largest makes up)."""
+    """Quantize weights to rows that sum to `WEIGHT_SCALE`; the largest weight takes the rest."""
     codes: Int64[np.ndarray, "nodes 24"] = np.round(weights * WEIGHT_SCALE).astype(np.int64)
     rows = np.arange(len(codes))
     codes[rows, codes.argmax(axis=1)] += WEIGHT_SCALE - codes.sum(axis=1)
@@ -90,38 +86,45 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
 
 
 FAINT_DENSITY_FRACTION = 0.1
-"""The surface's level is at most this share of what the densest percent of a field reaches."""
+"""Upper bound of the surface's level as a fraction of the 99th percentile of visible density."""
 BRICK_MARGIN_M = 0.012
-"""Bricks reach this far outside of the surface."""
+"""Distance outside the surface that bricks cover, metres."""
 VOXEL_TO_CELL_RATIO = 0.53
-"""Brick voxels as a share of the field's finest cells: finer ones cost bytes and show nothing."""
-MIN_VOXEL_M, MAX_VOXEL_M = 0.0038, 0.006
+"""Voxel size in units of the field's finest cells: finer voxels cost bytes and show nothing."""
+MIN_VOXEL_M = 0.0038
+"""Smallest voxel that follows from a field's cells, metres."""
+MAX_VOXEL_M = 0.006
+"""Largest voxel, metres."""
 FINER_VOXEL_FACTOR = 0.62
-"""So much finer are voxels where the player is too far from the renderer: 1 to 1.5 dB, and twice
-the bytes. An avatar learnt from few photographs weighs less than others."""
+"""Factor on the voxel size where the player is too far from the renderer: gains 1 to 1.5 dB for
+twice the bytes. An avatar trained on few photographs weighs less than others."""
 QUICK_VOXEL_FACTOR = 1.5
-"""How much coarser a package is that cannot wait."""
-POSITION_CODE_STEP, NORMAL_CODE_STEP = 32, 7
-"""Codes are rounded to multiples of these, a millimetre and three degrees, so that they deflate
-well."""
+"""Factor on voxel size and surfel spacing of a quick package."""
+POSITION_CODE_STEP = 32
+"""Multiple to which position codes are rounded, about a millimetre, so that they deflate well."""
+NORMAL_CODE_STEP = 7
+"""Multiple to which normal codes are rounded, about three degrees, so that they deflate well."""
 FINE_TUNING_PICTURES = 16
-"""Pictures that bricks are fine-tuned on, half a second each."""
+"""Pictures on which bricks are fine-tuned, half a second each."""
 EMPTY_AVATAR_MESSAGE = (
     f"The avatar is empty: its density is nowhere above {MIN_DENSITY:g} per metre. "
     "No package was written. Train it longer (--resume), or check the masks."
 )
+"""Message of `ExportRefused` for an empty field."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
-    """How finely an avatar is baked.
+    """Resolution and content of a package.
 
     Attributes:
-        voxel_m: Distance between brick voxels.
-        surfel_spacing_m: Cell on which the surface is taken; made coarser if there are too many.
-        surface_density: Density of the surface's level set, 1/m; less where the whole field is faint.
-        tiers: Which qualities the package has; "hq" is always among them.
-        tuned: On how many pictures bricks are fine-tuned; 0 for none.
+        voxel_m: Distance between brick voxels, metres.
+        surfel_spacing_m: Cell on which the surface is extracted, metres; enlarged until surfels can
+            be numbered.
+        surface_density: Density of the surface's level set, 1/m; less where the whole field is
+            faint.
+        tiers: Quality tiers of the package; "hq" is always among them.
+        fine_tuning_pictures: Pictures on which bricks are fine-tuned; 0 for no fine-tuning.
     """
 
     voxel_m: float = 0.004
@@ -132,16 +135,16 @@ class BakeConfig:
 
     @classmethod
     def for_cell_size(cls, finest_cell_m: float) -> "BakeConfig":
-        """For a field whose finest cells are that long: about two voxels each; fine-tuned."""
+        """Choose voxels of about half the field's finest cells, within bounds, and fine-tuning."""
         voxel_m = float(np.clip(VOXEL_TO_CELL_RATIO * finest_cell_m, MIN_VOXEL_M, MAX_VOXEL_M))
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
     def with_finer_voxels(self) -> "BakeConfig":
-        """For an avatar that these voxels do not show well enough."""
+        """Return the configuration with voxels smaller by `FINER_VOXEL_FACTOR`."""
         return replace(self, voxel_m=FINER_VOXEL_FACTOR * self.voxel_m)
 
     def quick(self) -> "BakeConfig":
-        """For a package that is wanted at once, and that a finer one will follow."""
+        """Return the configuration of a coarser package of one tier, without fine-tuning."""
         return replace(
             self,
             voxel_m=min(QUICK_VOXEL_FACTOR * self.voxel_m, MAX_VOXEL_M),
@@ -158,16 +161,16 @@ def bake_field(
     occupied: UInt8[np.ndarray, "cx cy cz"],
     config: BakeConfig | None = None,
 ) -> PlayerTables:
-    """The tables of a trained field.
+    """Bake the tables of a trained field: `sample_field`, then `bake_tables`.
 
     Args:
-        field_at: The field; asked only inside `occupied`.
+        field_at: The field; evaluated only inside `occupied`.
         rig: What moves it.
-        occupied: Cells of the rig's box that are not empty, as in `rig.distance`.
-        config: How finely.
+        occupied: Cells of the rig's box that are not empty, as in `rig.skin_distance`.
+        config: Resolution.
 
     Raises:
-        ExportRefused: If there is nothing to be seen in the field.
+        ExportRefused: If the field is empty.
     """
     config = config or BakeConfig()
     return bake_tables(sample_field(field_at, rig, occupied=occupied, config=config), rig, config)
@@ -180,22 +183,22 @@ def sample_field(
     occupied: UInt8[np.ndarray, "cx cy cz"],
     config: BakeConfig,
 ) -> FieldGrid:
-    """The first half of baking: all that the field is asked for. Arguments as of `bake`."""
+    """Evaluate the field, the first half of baking; arguments and errors as of `bake_field`."""
     if not occupied.any():
         raise ExportRefused(EMPTY_AVATAR_MESSAGE)
     return sample_field_grid(field_at, rig, occupied, config.voxel_m)
 
 
 def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
-    """The second half: numpy and serial kernels only, on whatever thread.
+    """Bake sampled density and color, the second half; numpy and serial kernels, on any thread.
 
     Args:
-        grid: What the field said.
+        grid: The sampled field.
         rig: What moves it.
-        config: How finely.
+        config: Resolution.
 
     Raises:
-        ExportRefused: If there is nothing to be seen in the field.
+        ExportRefused: If the field is empty.
     """
     surface = _surface_within_surfel_limit(grid, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
@@ -211,7 +214,7 @@ def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
 
 
 def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySurface:
-    """The surface, on a grid so coarse that surfel numbers fit into the z-buffer's keys."""
+    """Extract the surface on the finest grid whose surfel numbers fit into z-buffer keys."""
     visible = grid.density[grid.density > MIN_DENSITY]
     if visible.size == 0:
         raise ExportRefused(EMPTY_AVATAR_MESSAGE)
@@ -225,7 +228,10 @@ def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySu
 
 
 def _max_reach_m(rig: Rig) -> float:
-    """No visible point gets farther from the pelvis in any pose, metres: bones and clothes."""
+    """Bound the distance of any visible point from the pelvis in any pose, metres.
+
+    The longest chain of bones, and 0.35 m for hands, head and clothes.
+    """
     along = np.zeros(len(rig.parents))
     for joint, parent in enumerate(rig.parents):
         if parent >= 0:
@@ -235,6 +241,7 @@ def _max_reach_m(rig: Rig) -> float:
 
 
 def _encode_surfels(surface: ProxySurface) -> SurfelTable:
+    """Quantize the surface's points in Morton order."""
     low = surface.positions.min(axis=0)
     extent_m = float((surface.positions.max(axis=0) - low).max())
     codes = np.round((surface.positions - low) / extent_m * 65535.0).astype(np.uint16)
@@ -252,7 +259,7 @@ def _encode_surfels(surface: ProxySurface) -> SurfelTable:
 
 
 def _morton_order(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "points"]:
-    """Place along a Z-order curve (10 bits an axis): neighbours in space lie close in memory."""
+    """Return positions on a Z-order curve, 10 bits an axis: neighbors lie close in memory."""
     order = np.zeros(len(codes), dtype=np.int32)
     for bit in range(10):
         for axis in range(3):
@@ -262,7 +269,7 @@ def _morton_order(codes: UInt16[np.ndarray, "points 3"]) -> Int32[np.ndarray, "p
 
 
 def _encode_bricks(grid: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> BrickTable:
-    """The visible part of the grid near the surface, cut into bricks."""
+    """Cut the visible nodes of the grid into bricks."""
     counts = np.array(grid.density.shape) // BRICK_SIZE
     places = np.flatnonzero(reached)
     seen = encode_density(grid.density.ravel()[places])
@@ -288,19 +295,19 @@ def _encode_bricks(grid: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> Brick
 def _overlapping_blocks(
     nodes: Shaped[np.ndarray, "x y z"],
 ) -> Shaped[np.ndarray, "blocks_x blocks_y blocks_z 9 9 9"]:
-    """A grid's blocks of 8 cells along each side; neighbours share a layer of nodes."""
+    """View a grid as blocks of 8 cells along each side; neighbors share a layer of nodes."""
     blocks = np.lib.stride_tricks.sliding_window_view(nodes, (BRICK_NODES,) * 3)
     return blocks[::BRICK_SIZE, ::BRICK_SIZE, ::BRICK_SIZE]
 
 
 def _visible_nodes(grid: FieldGrid, surface: ProxySurface) -> Bool[np.ndarray, "x y z"]:
-    """Nodes that rays see: from a little outside of the surface as deep as its thickness."""
+    """Mark the nodes that rays see: from `BRICK_MARGIN_M` outside the surface to its thickness."""
     reached = np.zeros(grid.density.shape, dtype=bool)
     mark_visible_nodes(
         reached, grid.low, np.float32(grid.voxel_m), surface.positions, surface.normals,
         surface.thickness, np.float32(BRICK_MARGIN_M),
     )  # fmt: skip
-    gap = 1 + 2 * int(np.ceil(surface.spacing_m / grid.voxel_m))  # between neighbouring surfels
+    gap = 1 + 2 * int(np.ceil(surface.spacing_m / grid.voxel_m))  # between neighboring surfels
     for _ in range(gap // 2):
         reached = dilate(reached)
     return reached

@@ -1,4 +1,4 @@
-"""The trained field read once on a voxel grid: everything else of a bake looks at this."""
+"""The trained field sampled once on a voxel grid, from which everything else is baked."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,10 +15,11 @@ FieldFunction = Callable[
     [Float32[torch.Tensor, "points 3"]],
     tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
 ]
-"""Canonical points to color in [0, 1] and density in 1/m."""
+"""Evaluates color in [0, 1] and density in 1/m at canonical points."""
 CHUNK_POINTS = 1 << 18
-"""Points that the field is asked for at a time."""
+"""Points per evaluation of the field."""
 MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
+"""Density below which a node is empty, 1/m."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,7 +30,7 @@ class FieldGrid:
         low: Corner, canonical metres.
         voxel_m: Distance between nodes.
         density: 1/m.
-        rgb: 8 bits; nodes that are empty but touch a visible one hold their neighbours' mean.
+        rgb: 8 bits; empty nodes next to visible ones hold the mean of these.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -41,13 +42,13 @@ class FieldGrid:
 def sample_field_grid(
     field_at: FieldFunction, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
 ) -> FieldGrid:
-    """Asks the field at every node inside an occupied cell; the others are empty.
+    """Sample the field at every node inside an occupied cell; the others are empty.
 
     Args:
         field_at: The field.
-        rig: Whose box the cells divide.
-        occupied: Cells of the box that are not empty, as in `rig.distance`.
-        voxel_m: Distance between nodes.
+        rig: Its box is what the cells divide.
+        occupied: Cells of the box that are not empty, as in `rig.skin_distance`.
+        voxel_m: Distance between nodes, metres.
     """
     first, last = _occupied_bounds(occupied)
     cell = (rig.box_high - rig.box_low) / occupied.shape
@@ -71,6 +72,7 @@ def sample_field_grid(
 def _occupied_bounds(
     occupied: UInt8[np.ndarray, "cx cy cz"],
 ) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+    """Return the first and the last occupied cell along each axis."""
     axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
     return np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
 
@@ -81,7 +83,7 @@ def _occupied_nodes(
     step: Float[np.ndarray, "3"],
     counts: Int[np.ndarray, "3"],
 ) -> Iterator[Int[np.ndarray, "nodes 3"]]:
-    """Grid nodes inside occupied cells, some 10⁵ at a time."""
+    """Yield the nodes inside occupied cells, some 10⁵ at a time."""
     padded = np.pad(occupied, 1)
     cells = [
         np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)

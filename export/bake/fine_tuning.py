@@ -1,7 +1,7 @@
 """Fine-tuning of bricks until the player's pixels show what the volume renderer shows.
 
-A voxel that holds the field's value at its node is not the voxel with which a few samples, linear
-between voxels and quantized, look most like the field. Rays of the player are compared with the
+Sampled a few times, interpolated and quantized, voxels that hold the field's values at their nodes
+are not the ones that look most like the field. Rays of the player are compared with the
 same rays of the renderer, and each shares its error among the voxels that it has read (SIRT).
 """
 

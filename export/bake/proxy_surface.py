@@ -1,39 +1,39 @@
-"""The surface: points on a level set just outside of what can be seen, with normals and depth."""
+"""The proxy surface: a level set just outside the visible density, with normals and thickness."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32
+from jaxtyping import Float32, Int
 from scipy import ndimage
 
 from export.bake.bake_kernels import visible_depth_steps
 from export.bake.field_grid import FieldGrid
-from export.mesh.isosurface import resample_grid
+from export.bake.grid_filters import remove_floaters_and_cavities, resample_grid
 
 DENSITY_CONTRAST = 16.0
-"""Densities beyond this factor from the level count as the factor: emptiness has no log."""
+"""Factor about the level to which densities are clipped, as emptiness has no logarithm."""
 SMOOTHING_M = 0.004
-"""Deviation of the blur before the level is taken: a trained field is never quite smooth."""
+"""Standard deviation of the blur before the level set is extracted, metres."""
 MIN_PART_FRACTION = 0.0002
-"""Parts of less volume than this share of the largest are floaters. At ten times as much a foot
-that a few photographs left in pieces was gone."""
+"""Least volume of a part as a fraction of the largest one's; smaller ones are floaters. At ten
+times this, a foot that few photographs had left in fragments was lost."""
 OPAQUE_OPTICAL_DEPTH = 7.0
-"""Optical depth behind which nothing is seen (0.1 %)."""
+"""Optical depth behind which nothing is visible (0.1 %)."""
 THICKNESS_MARGIN_M = 0.004
-"""Added to the thickness, for what lies deeper beside the normal than along it."""
+"""Added to the thickness, metres, for what lies deeper beside the normal than along it."""
 MAX_THICKNESS_M = 0.1
-"""Nothing is looked for deeper than this under the surface."""
+"""Depth under the surface beyond which density is ignored, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProxySurface:
-    """A person's surface in canonical space.
+    """Points, normals and visible depth of a person's surface in canonical space.
 
     Attributes:
-        spacing_m: Cell of the grid that the level set was taken on.
+        spacing_m: Cell of the grid on which the level set was extracted, metres.
         positions: Metres.
         normals: Outward, of length 1.
-        thickness: How deep one sees into it along the normal, metres.
+        thickness: Depth along the inward normal to which the field is visible, metres.
     """
 
     spacing_m: float
@@ -43,17 +43,17 @@ class ProxySurface:
 
 
 def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) -> ProxySurface:
-    """The outer level set of the blurred log-density, without floaters and hollows.
+    """Extract the outer level set of the blurred log-density, without floaters and cavities.
 
     Args:
         grid: The field.
-        level: Density in 1/m. Lower, and haze that nobody sees shapes the surface; higher, and it
-            cuts into what is seen.
-        spacing_m: Cell of the grid that the set is taken on; surfels sit on its edges.
+        level: Density in 1/m. A lower one lets invisible haze shape the surface; a higher one cuts
+            into the visible field.
+        spacing_m: Cell of the grid on which it is extracted, metres; surfels lie on cell edges.
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
-    inside = _remove_floaters_and_cavities(logs > 0.0)
+    inside = remove_floaters_and_cavities(logs > 0.0, MIN_PART_FRACTION)
     nothing = np.float32(1e-3)
     logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
     slope = ndimage.gaussian_filter(logs, 1.0, truncate=3.0)
@@ -68,7 +68,8 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
 
 
 def _log_density(grid: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
-    """Logarithm of the density over the level, within `CONTRAST`; most nodes are empty."""
+    """Return the logarithm of density over level, clipped to `DENSITY_CONTRAST`."""
+    # most nodes are empty: take logarithms of the others alone
     logs = np.full(grid.density.shape, -np.log(DENSITY_CONTRAST), dtype=np.float32)
     places = np.flatnonzero(grid.density > np.float32(level / DENSITY_CONTRAST))
     dense = grid.density.ravel()[places] / np.float32(level)
@@ -76,29 +77,14 @@ def _log_density(grid: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
     return logs
 
 
-def _remove_floaters_and_cavities(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """Solid without floaters, and with what it encloses."""
-    parts = _label_components(solid)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
-    kept = sizes >= MIN_PART_FRACTION * sizes.max()
-    outside = _label_components(~kept[parts])
-    return outside != outside[0, 0, 0]
-
-
-def _label_components(mask: Bool[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
-    """The number of each connected part; 0 outside of the mask."""
-    parts = np.zeros(mask.shape, dtype=np.int32)
-    ndimage.label(mask, output=parts)
-    return parts
-
-
 def _zero_crossings(
     logs: Float32[np.ndarray, "x y z"], smoothed: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
-    """Where grid edges cross zero (marching cubes' vertices), in nodes, and the unit normals.
+    """Return the zero crossings of grid edges, in nodes, and unit normals.
 
-    `slope` is a smoother version of `logs`, for the normals.
+    Args:
+        logs: Positive inside.
+        smoothed: A smoother version, from which normals are taken.
     """
     nodes, normals = [], []
     for axis in range(3):
@@ -120,7 +106,7 @@ def _zero_crossings(
 def _central_differences(
     values: Float32[np.ndarray, "x y z"], nodes: Int[np.ndarray, "nodes 3"]
 ) -> Float32[np.ndarray, "nodes 3"]:
-    """Central differences at nodes that are not on the border, per two nodes."""
+    """Return central differences at some nodes, per two nodes."""
     parts = []
     last = np.array(values.shape) - 1
     for along in np.eye(3, dtype=int):
@@ -134,10 +120,10 @@ def _visible_thickness(
     positions: Float32[np.ndarray, "surfels 3"],
     normals: Float32[np.ndarray, "surfels 3"],
 ) -> Float32[np.ndarray, "surfels"]:
-    """Depth along the normal at which all that can be seen has been seen.
+    """Return the visible depth under each point, metres, plus `THICKNESS_MARGIN_M`.
 
-    That is where the optical depth reaches `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of all there is within
-    `DEEPEST_M`; and `MARGIN_M`.
+    That is where the optical depth along the inward normal reaches `OPAQUE_OPTICAL_DEPTH` or 99.9 %
+    of its value at `MAX_THICKNESS_M`.
     """
     step = np.float32(0.5 * grid.voxel_m)
     ends = visible_depth_steps(

@@ -1,6 +1,6 @@
-"""What every part of the player's graph looks at: inputs, tables and settings.
+"""What all parts of the player's graph share: inputs, tables and vectors of values.
 
-Vectors and matrices whose components are tensors of their own (no batched small products).
+Components of vectors and matrices are tensors of their own: batched small products are slow.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from export.package.render_settings import RenderSettings
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraValues:
-    """Where a picture is taken from: values of the graph.
+    """Inputs for a picture's pose and camera: values of the graph.
 
     Attributes:
         bones: Camera-from-canonical 3×4 matrices, one row of 12 a joint.
@@ -29,21 +29,21 @@ class CameraValues:
 
     @property
     def num_pixels(self) -> GraphValue:
-        """How many there are, int64 scalar."""
+        """Number of pixels, int64 scalar."""
         return self.height * self.width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GraphContext:
-    """A graph being written, and what it draws.
+    """A graph being built, its tables and its inputs.
 
     Attributes:
         graph: The graph.
-        tables: What is drawn, for the sizes and scales that become constants.
-        columns: The tables' contents as values of the graph (`export.package.player_tables.initialisers`).
-        settings: How it is drawn.
-        view: From where.
-        samples: Along each ray and layer, int64 scalar.
+        tables: Their sizes and scales become constants.
+        table_values: Values of `export.package.graph_tables.graph_initializers`, by name.
+        settings: How the tables are drawn.
+        camera: Pose and camera.
+        samples: Density samples along `RenderSettings.sample_span_m`, int64 scalar.
     """
 
     graph: GraphBuilder
@@ -61,17 +61,17 @@ MatrixValue = list[list[GraphValue]]
 
 
 def dot(a: Sequence[GraphValue], b: Sequence[GraphValue]) -> GraphValue:
-    """Dot product."""
+    """Return dot products."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: VectorValue, b: VectorValue) -> VectorValue:
-    """Cross product."""
+    """Return cross products."""
     return [a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3] for k in range(3)]
 
 
 def adjugate(matrix: MatrixValue) -> MatrixValue:
-    """The inverse of 3×3 matrices times their determinant."""
+    """Return the inverses of 3×3 matrices times their determinants."""
     rows: MatrixValue = []
     for i in range(3):
         row = []
@@ -83,5 +83,5 @@ def adjugate(matrix: MatrixValue) -> MatrixValue:
 
 
 def gather_vector(vector: Sequence[GraphValue], places: GraphValue) -> VectorValue:
-    """`[component[places] for component in vector]`."""
+    """Return `[component[places] for component in vector]`."""
     return [component.gather(places) for component in vector]

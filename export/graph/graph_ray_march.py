@@ -1,7 +1,4 @@
-"""Nodes that read color and density out of the bricks.
-
-Nodes that follow rays through canonical space, and gather color on the way.
-"""
+"""Nodes that march rays through canonical space and composite the bricks along them."""
 
 from dataclasses import dataclass
 
@@ -18,23 +15,25 @@ from export.graph.onnx_builder import GraphBuilder, GraphValue
 from export.package.player_tables import BRICK_NODES, BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
 
 VOXEL_STRIDES = (BRICK_NODES * BRICK_NODES, BRICK_NODES, 1)
-"""Steps along x, y and z inside a brick."""
+"""Steps along x, y and z between addresses inside a brick."""
 COLOR_WEIGHT_SCALE = 256
-"""Weights of colors are integers that sum to this: two channels share a multiplication."""
+"""Sum of the integer weights of colors, so that two channels share a multiplication."""
 VOXEL_OFFSET_BITS = 10
-"""A voxel's place inside its brick takes so many bits, the brick's block the others."""
+"""Low bits of a packed address, for the voxel in its brick; the others number the block."""
+MIN_REMAINING_M = 1e-5
+"""Length below which the rest of a ray is dropped, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BrickTetrahedra:
-    """Tetrahedra that hold some points: values of the graph, one entry a point.
+    """Tetrahedra that contain some points: values of the graph, one entry a point.
 
     A cell is cut into six tetrahedra along its diagonal. The one that holds a point is walked
     from the cell's lower to its upper corner along the axes in the order of their fractions.
 
     Attributes:
-        corners: Addresses of the four voxels on that way.
-        fractions: How far the point is along each of the three edges, the largest first.
+        corners: Addresses of the four voxels on that walk.
+        fractions: Fraction of the point along each of the three edges, the largest first.
     """
 
     corners: list[GraphValue]
@@ -42,7 +41,7 @@ class BrickTetrahedra:
 
 
 def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetrahedra:
-    """The tetrahedra about lattice coordinates, (point - low) / voxel_m."""
+    """Find the tetrahedra about lattice coordinates, (point - low) / voxel_m."""
     graph, bricks = context.graph, context.tables.bricks
     packed, fraction = None, []
     for axis, coordinate in enumerate(lattice):
@@ -52,7 +51,7 @@ def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetra
         part = graph.constant(_packed_addresses(bricks, axis)).gather(voxel)
         packed = part if packed is None else packed + part
     assert packed is not None
-    # as floats: two bits of the place may be lost, but it never reaches the next block
+    # divide as floats: rounding loses two bits of the voxel, but never reaches the next block
     block = (packed.cast(np.float32) * (1.0 / (1 << VOXEL_OFFSET_BITS))).cast(np.int32)
     base = packed + _brick_offsets(context).gather(block)
     x, y, z = fraction
@@ -63,7 +62,7 @@ def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetra
 
 
 def _packed_addresses(bricks: BrickTable, axis: int) -> np.ndarray:
-    """For each voxel along an axis its part of the block's number and of the place inside."""
+    """Return each voxel's part of the block's number and of the address inside, along an axis."""
     voxel = np.arange(bricks.index.shape[axis] * BRICK_SIZE, dtype=np.int32)
     blocks = int(np.prod(bricks.index.shape[axis + 1 :]))
     packed = (
@@ -73,7 +72,7 @@ def _packed_addresses(bricks: BrickTable, axis: int) -> np.ndarray:
 
 
 def _brick_offsets(context: GraphContext) -> GraphValue:
-    """What added to a packed place gives the voxel's address, for each block."""
+    """Return what turns a packed address into a voxel's address when added, for each block."""
     offset = context.table_values["brick_offset"]
     blocks = context.graph.range(context.graph.constant(np.int32(context.tables.bricks.index.size)))
     return offset - blocks * (1 << VOXEL_OFFSET_BITS)
@@ -86,9 +85,9 @@ def _tetrahedron_corners(
     largest: GraphValue,
     smallest: GraphValue,
 ) -> list[GraphValue]:
-    """The corners of the tetrahedron: the axis of the largest fraction is taken first.
+    """Return the corners of each tetrahedron, stepping along the largest fraction's axis first.
 
-    Where two fractions are the same, the corner between them has no share.
+    Where two fractions are equal, the corner between them has weight 0.
     """
     x, y, _ = fraction
     sx, sy, sz = VOXEL_STRIDES
@@ -103,7 +102,7 @@ def _tetrahedron_corners(
 
 
 def interpolate_density(context: GraphContext, cell: BrickTetrahedra) -> GraphValue:
-    """Density in 1/m: its logarithm is linear in a tetrahedron; below half a code is nothing."""
+    """Return density in 1/m, log-linear in each tetrahedron; below half a code it is 0."""
     table = context.table_values["voxel_density"]
     codes = [table.gather(corner).cast(np.float32) for corner in cell.corners]
     code = codes[0]
@@ -115,7 +114,7 @@ def interpolate_density(context: GraphContext, cell: BrickTetrahedra) -> GraphVa
 
 
 def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> VectorValue:
-    """Red, green and blue in [0, 1]."""
+    """Return red, green and blue in [0, 1], linear in each tetrahedron."""
     parts = [(part * float(COLOR_WEIGHT_SCALE) + 0.5).cast(np.int32) for part in cell.fractions]
     a, b, c = parts
     red_blue = green = None
@@ -136,18 +135,15 @@ def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> VectorVal
     ]
 
 
-MIN_REMAINING_M = 1e-5
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentValues:
-    """Pieces of rays: values of the graph, one entry a ray.
+    """Segments of rays: values of the graph, one entry a ray.
 
     Attributes:
-        ray: Directions in the camera's frame, of length 1.
-        begin, end: Along the ray, metres.
-        canonical: Where the beginning lies in canonical space.
-        direction: Canonical metres a metre of the ray, at the beginning.
+        direction_camera: Unit directions in the camera's frame.
+        begin, end: Distances from the camera's center, metres.
+        start_canonical: Canonical positions at `begin`.
+        direction_canonical: Canonical metres per metre along the ray, at `begin`.
     """
 
     direction_camera: VectorValue
@@ -159,13 +155,13 @@ class SegmentValues:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlockValues:
-    """What a block of samples leaves behind: values of the graph, one entry a ray.
+    """Result of a block of samples: values of the graph, one entry a ray.
 
     Attributes:
-        place: Where it ends along the ray, metres.
-        canonical: The same in canonical space.
-        light: What is let through.
-        color: What it adds, premultiplied.
+        end: End of the block along the ray, metres.
+        end_canonical: Canonical position there.
+        transmittance: Transmittance of the ray after the block.
+        color: Premultiplied color that the block adds.
     """
 
     end: GraphValue
@@ -177,26 +173,24 @@ class BlockValues:
 def march_segments(
     context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> tuple[VectorValue, GraphValue]:
-    """Front-to-back compositing, a block of samples at a time.
+    """Composite rays front to back, a block of samples at a time.
 
-    After each block the rays that have ended are put aside, and the others are led back to where
-    the skin says that they are: a step of Newton's method, which also turns them. The last block
-    takes all that is left of a ray.
+    After each block, rays that have ended are dropped; a Newton step moves the others back onto
+    their camera rays and updates their directions. The last block takes the rest of a ray.
 
     Args:
-        context: What is drawn.
-        posed: The skin's nodes in the camera's frame.
+        context: Tables, settings and inputs.
+        posed: Skinning nodes in the camera's frame.
         segment: The rays.
 
     Returns:
-        Premultiplied color, and the light that is left, in [0, 1].
+        Premultiplied color, and the transmittance, in [0, 1].
     """
     graph, settings = context.graph, context.settings
     usual = settings.sample_span_m / context.samples.cast(np.float32)
     shortened = compression_scale(context, segment.direction_canonical)
-    scale = (
-        context.samples + (settings.samples - 1)
-    ) // settings.samples  # more samples, more blocks
+    # more samples than usual make more blocks, not longer ones
+    scale = (context.samples + (settings.samples - 1)) // settings.samples
     blocks, steady = (scale * count for count in (settings.max_blocks, settings.uniform_blocks))
     block = composite_samples(
         context, segment, segment.begin * 0.0 + 1.0, settings.block_samples, usual * shortened
@@ -225,14 +219,14 @@ def march_segments(
 
 
 def compression_scale(context: GraphContext, direction: VectorValue) -> GraphValue:
-    """Factor by which lengths along rays shrink where the pose compresses canonical space."""
+    """Return the factor, at most 1, by which lengths shrink where the pose compresses space."""
     return (context.settings.max_compression / dot(direction, direction).sqrt()).minimum(1.0)
 
 
 def _unfinished_rays(
     context: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
 ) -> list[GraphValue]:
-    """Which rays go on: their numbers, the light that is left, and `_pack_segment` of their rest."""
+    """Return numbers, transmittances and packed remainders (`_pack_segment`) of unfinished rays."""
     graph = context.graph
     on = (block.transmittance > context.settings.min_transmittance) & (
         block.end < segment.end - MIN_REMAINING_M
@@ -259,8 +253,9 @@ def _unpack_segment(values: list[GraphValue]) -> SegmentValues:
 
 
 def _pack_segment(segment: SegmentValues) -> list[GraphValue]:
+    directions = segment.direction_camera, segment.direction_canonical
     return [
-        *segment.direction_camera, segment.begin, segment.end, *segment.start_canonical, *segment.direction_canonical
+        *directions[0], segment.begin, segment.end, *segment.start_canonical, *directions[1]
     ]  # fmt: skip
 
 
@@ -271,7 +266,7 @@ def composite_samples(
     num_samples: int,
     max_spacing: GraphValue | float,
 ) -> BlockValues:
-    """A block of so many samples: density at each, color once, at their mean."""
+    """Sample density `num_samples` times and color once, at the mean of what is seen."""
     graph, bricks = context.graph, context.tables.bricks
     step = ((segment.end - segment.begin) * (1.0 / num_samples)).minimum(max_spacing)
     scale = 1.0 / bricks.voxel_m
@@ -321,7 +316,7 @@ def composite_samples(
 def _newton_step(
     context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> SegmentValues:
-    """Corrects canonical points and directions where the derivative can be inverted."""
+    """Move canonical positions onto their camera rays where the Jacobian can be inverted."""
     graph, settings = context.graph, context.settings
     camera, derivative = skin_points(
         context, posed, locate_skinning_cell(context, segment.start_canonical)

@@ -1,4 +1,4 @@
-"""Nodes that say where each pixel's ray enters the surface, and what it sees from there on."""
+"""Nodes that set up each pixel's ray at the proxy surface and trace one depth layer."""
 
 from dataclasses import dataclass
 
@@ -35,12 +35,13 @@ class DepthLayer:
     """One depth layer: values of the graph, one entry a ray.
 
     Attributes:
-        ray: Directions in the camera's frame, of length 1.
-        surfel: What each ray sees, and
-        canonical, camera: where that is.
+        ray: Unit directions in the camera's frame.
+        surfel: Surfel that each ray sees.
+        canonical_position, camera_position: Its position in both frames, metres.
         color: Premultiplied.
-        light: What is let through, in [0, 1].
-        enter, end: Where the ray enters the surface and where it ends, metres along it.
+        transmittance: In [0, 1].
+        enter: Distance at which the ray enters the surface, metres.
+        end: Distance at which it ends, metres.
     """
 
     ray: VectorValue
@@ -55,14 +56,14 @@ class DepthLayer:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedProxySurface:
-    """What rays meet: the surfels, and the skin's nodes in the camera's frame."""
+    """Surfels and skinning nodes in the camera's frame."""
 
     surfels: PosedSurfels
     posed: PosedNodeValues
 
 
 def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> VectorValue:
-    """Unit directions in the camera's frame through the centres of the window's pixels (int32)."""
+    """Return unit directions through the centers of some of the window's pixels (int32)."""
     width = window.width.cast(np.int32)
     row = pixel // width
     column = pixel - row * width
@@ -80,17 +81,17 @@ def trace_depth_layer(
     ray: VectorValue,
     front_layer: DepthLayer | None,
 ) -> DepthLayer:
-    """Color and light behind of rays.
+    """Trace rays through one depth layer.
 
-    The map from canonical space to the camera's is taken as linear about the surfel that a ray
-    sees: its inverse carries the ray to where it enters the surface.
+    Skinning is linearized about the surfel that a ray sees: the inverse Jacobian carries the ray to
+    where it enters the surface.
 
     Args:
-        context: What is drawn.
+        context: Tables, settings and inputs.
         surface: In its pose.
-        keys: What each ray sees.
-        ray: Directions.
-        before: What the same rays saw in the first layer, if this is the second.
+        keys: Z-buffer key of each ray.
+        ray: Unit directions in the camera's frame.
+        front_layer: The layer in front of the same rays; None for the first.
     """
     graph, surfel = context.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
     place = surface.surfels.cell
@@ -100,7 +101,7 @@ def trace_depth_layer(
     camera, derivative = skin_points(context, surface.posed, place)
     inverse = invert_jacobian(context, derivative, adjugate(derivative))
     normal = gather_vector([context.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
-    # where the skin is folded, the surface is looked at from straight above
+    # where the skin is folded, look at the surface along its normal
     above = [-n for n in normal]
     seen_along = zip(inverse.apply(ray), above, strict=True)
     direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
@@ -154,10 +155,15 @@ def _segment_bounds(
     beside: VectorValue,
     along: GraphValue,
 ) -> tuple[GraphValue, GraphValue, GraphValue]:
-    """Where rays enter the surface's tangent plane, and from where to where they are followed.
+    """Return the distances at which rays enter the tangent plane, begin and end.
 
-    `beside` is where each ray comes closest to its surfel, seen from that in canonical space,
-    `along` how far that is along the ray.
+    Args:
+        context: Settings.
+        normal: Canonical normals of the surfels.
+        thickness: Their visible depths, metres.
+        direction: Canonical metres per metre along each ray.
+        beside: Canonical offset from each surfel to the closest point of its ray.
+        along: Distance of that point along the ray, metres.
     """
     graph, settings = context.graph, context.settings
     falling = dot(normal, direction)
@@ -187,7 +193,7 @@ def _begin_behind_front_layer(
     begin: GraphValue,
     end: GraphValue,
 ) -> GraphValue:
-    """Where rays begin that must not see a second time what they have passed already."""
+    """Begin rays at the end of the front layer where both layers see one sheet."""
     settings = context.settings
 
     def apart(here: VectorValue, first: VectorValue) -> GraphValue:

@@ -1,7 +1,4 @@
-"""Nodes that carry canonical points to the camera's frame, with the derivative.
-
-Nodes that carry the surface's surfels into the camera's frame, cheaply: most are never seen.
-"""
+"""Nodes for linear blend skinning of grid nodes, points and surfels into the camera's frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,19 +19,19 @@ from export.graph.onnx_builder import GraphValue
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedNodeValues:
-    """The skin's nodes in the camera's frame: values of the graph, one entry a node."""
+    """Skinning nodes in the camera's frame: values of the graph, one entry a node."""
 
     camera_positions: VectorValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinningCell:
-    """Where points lie among the skin's nodes: values of the graph, one entry a point.
+    """Cells of the skinning grid about points: values of the graph, one entry a point.
 
     Attributes:
         rows: Rows of the four lower nodes along z of the cell about the point, in C order; the
             upper ones follow them.
-        fraction: How far the point is between the nodes along x, y, z.
+        fraction: Position of the point in its cell along x, y, z, from 0 to 1.
     """
 
     rows: list[GraphValue]
@@ -42,7 +39,7 @@ class SkinningCell:
 
 
 def pose_nodes(context: GraphContext) -> PosedNodeValues:
-    """Linear blend skinning of every node, straight into the camera's frame."""
+    """Skin every node into the camera's frame."""
     graph, columns = context.graph, context.table_values
     blended = context.camera.bones.transpose(1, 0).matmul(columns["node_weights"])
     positions = [columns[f"node_{letter}"] for letter in "xyz"]
@@ -53,7 +50,7 @@ def pose_nodes(context: GraphContext) -> PosedNodeValues:
 
 
 def skinning_nodes_per_m(context: GraphContext) -> list[float]:
-    """Along x, y, z."""
+    """Return the number of nodes per metre along x, y, z."""
     return [
         context.settings.skinning_subdivision / float(step)
         for step in context.tables.skinning.step_m
@@ -61,7 +58,7 @@ def skinning_nodes_per_m(context: GraphContext) -> list[float]:
 
 
 def locate_skinning_cell(context: GraphContext, canonical: VectorValue) -> SkinningCell:
-    """Where canonical points lie among the nodes."""
+    """Find the cells about canonical points."""
     skin = context.tables.skinning
     counts = [context.settings.skinning_subdivision * (count - 1) + 1 for count in skin.index.shape]
     number, fraction = None, []
@@ -82,12 +79,10 @@ def locate_skinning_cell(context: GraphContext, canonical: VectorValue) -> Skinn
 def skin_points(
     context: GraphContext, posed: PosedNodeValues, place: SkinningCell
 ) -> tuple[VectorValue, MatrixValue]:
-    """Where points are in the camera's frame, and how that changes with them.
-
-    Trilinear between the eight nodes about each.
+    """Skin points, trilinear between the eight nodes about each.
 
     Returns:
-        The points, and the derivative's rows, metres a step between nodes.
+        Positions in the camera's frame, and the Jacobian's rows in metres per step between nodes.
     """
     rows = [row for lower in place.rows for row in (lower, lower + 1)]
     point, derivative = [], []
@@ -99,7 +94,7 @@ def skin_points(
 
 
 def _trilinear(corners: list[GraphValue], fraction: VectorValue) -> tuple[GraphValue, VectorValue]:
-    """The value between eight corners, and its slopes along x, y, z, per cell."""
+    """Interpolate between eight corners; return the value and its slopes along x, y, z per cell."""
     x, y, z = fraction
     along_z = [corners[i + 1] - corners[i] for i in range(0, 8, 2)]
     on_z = [corners[2 * i] + z * slope for i, slope in enumerate(along_z)]
@@ -121,13 +116,13 @@ def _lerp(low: GraphValue, high: GraphValue, share: GraphValue) -> GraphValue:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InverseJacobian:
-    """The inverse of derivatives: values of the graph, one entry a point.
+    """Inverse Jacobians of skinning: values of the graph, one entry a point.
 
     Attributes:
-        cofactors: Of the derivative per step between nodes.
-        scale: For each row of the cofactors, what makes it the inverse's, per metre; 0 where the
-            derivative cannot be inverted.
-        trusted: Where it can: the skin is neither folded over nor torn apart.
+        cofactors: Adjugate of the Jacobian per step between nodes.
+        scale: Factor from each row of the adjugate to the inverse's, per metre; almost 0 where the
+            Jacobian is not inverted.
+        trusted: Whether it is inverted: the skin is neither folded nor torn apart.
     """
 
     cofactors: MatrixValue
@@ -135,7 +130,7 @@ class InverseJacobian:
     trusted: GraphValue
 
     def apply(self, vector: VectorValue) -> VectorValue:
-        """The inverse times a vector."""
+        """Multiply vectors by the inverse."""
         return [
             dot(row, vector) * scale for row, scale in zip(self.cofactors, self.scale, strict=True)
         ]
@@ -144,7 +139,7 @@ class InverseJacobian:
 def invert_jacobian(
     context: GraphContext, jacobian: MatrixValue, cofactors: MatrixValue
 ) -> InverseJacobian:
-    """Inverts derivatives (metres a step between nodes), given their adjugates."""
+    """Invert Jacobians (metres per step between nodes), given their adjugates."""
     per_m = skinning_nodes_per_m(context)
     volume = dot(jacobian[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
     stretch = context.settings.max_volume_ratio
@@ -156,15 +151,15 @@ def invert_jacobian(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedSurfels:
-    """The surface: values of the graph, one entry a surfel.
+    """Surfels of the proxy surface: values of the graph, one entry a surfel.
 
     Attributes:
-        place: Where they lie among the skin's nodes, the same in all poses.
-        rows: Of the four nodes about each, and
-        normal: its normal per step along the edges between these, also the same in all poses.
-        camera: Positions in the camera's frame, linear in tetrahedra.
-        folded: Whether the posed tetrahedron has less than `fold_volume_ratio` of its canonical volume;
-            inside out counts as negative.
+        cell: Cells of the skinning grid, the same in all poses.
+        rows: Rows of the four nodes of each surfel's tetrahedron, the same in all poses.
+        normal: Normals per step along the edges of these, the same in all poses.
+        camera_positions: Positions in the camera's frame, linear in tetrahedra.
+        folded: Whether the posed tetrahedron has less than `fold_volume_ratio` of its canonical
+            volume, which is negative inside out.
     """
 
     cell: SkinningCell
@@ -175,9 +170,9 @@ class PosedSurfels:
 
 
 def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
-    """Positions as sums over four nodes each.
+    """Pose surfels as weighted sums of four nodes each, as most of them are never seen.
 
-    All but the nodes' posed places is the same in every pose: onnxruntime computes it once.
+    All but the nodes' posed positions is constant: onnxruntime computes it once.
     """
     columns = context.table_values
     place = locate_skinning_cell(context, [columns[f"position_{letter}"] for letter in "xyz"])
@@ -196,16 +191,16 @@ def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
 
 
 def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
-    """The three edges from each corner to the next."""
+    """Return the three edges from each corner to the next."""
     return [[b - a for a, b in zip(*pair, strict=True)] for pair in pairwise(corners)]
 
 
 def faces_camera(
     context: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue
 ) -> GraphValue:
-    """Which of some surfels face the camera: n · J⁻¹ c, J the derivative in the tetrahedron.
+    """Tell which surfels face the camera: n · J⁻¹ c < 0, J the Jacobian in the tetrahedron.
 
-    J's columns are the edges between the four nodes, so J⁻¹ is made of their cross products.
+    J's columns are the edges between the four nodes, so J⁻¹ consists of their cross products.
     """
     settings, rows = context.settings, gather_vector(surfels.rows, number)
     edges = _tetrahedron_edges([gather_vector(posed.camera_positions, row) for row in rows])
@@ -213,19 +208,18 @@ def faces_camera(
     volume = dot(edges[0], across[0])
     camera = gather_vector(surfels.camera_positions, number)
     facing = dot(gather_vector(surfels.normal, number), [dot(vector, camera) for vector in across])
-    # the way along the edges turns left or right, so the volume may have either sign
+    # the edges may be left- or right-handed, so the volume may have either sign
     return facing * volume < camera[2] * volume * volume * -settings.min_facing_cosine
 
 
 def _surfel_tetrahedra(
     context: GraphContext, place: SkinningCell
 ) -> tuple[list[GraphValue], list[GraphValue], VectorValue, GraphValue]:
-    """Rows of four nodes, their shares in a surfel's position, and its normal along their edges.
+    """Find the tetrahedra about surfels, walked as in `BrickTetrahedra`.
 
-    The last value is 1 where these edges are right-handed in canonical space, and -1 elsewhere.
-
-    The way from the lower to the upper corner of a cell takes the axis of the largest fraction
-    first (as `lookup.Cell`).
+    Returns:
+        Rows of the four nodes, their weights in a surfel's position, its normal along their edges,
+        and 1 where these edges are right-handed in canonical space, -1 elsewhere.
     """
     graph, (x, y, z) = context.graph, place.fraction
     low, along_y, along_x, along_both = place.rows

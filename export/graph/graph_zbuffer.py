@@ -1,4 +1,4 @@
-"""Nodes that find out which surfel each pixel sees: a z-buffer of the part that the surface covers."""
+"""Nodes that splat surfels into z-buffers of the window that the surface covers."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from export.package.player_tables import DEPTH_CODES, SURFEL_BITS
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
 INFINITE_DEPTH_M = 1e6
-"""Metres: deeper than anything."""
+"""Depth beyond all surfels, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SplatWindow:
-    """The part of the picture that the surface may cover, and a buffer with a border around it.
+    """The part of the picture that the surface may cover, with a buffer and its border.
 
     Attributes:
-        left, top: Where it begins, pixels, int64.
+        left, top: First pixel, int64.
         width, height: At least 1, int64.
-        border: Pixels around it in the buffer, so that footprints never leave it, int64.
+        border: Pixels around it in the buffer, so that footprints stay inside, int64.
         stride: Pixels in a row of the buffer, int64.
-        cells: Pixels in the buffer, int64; there is one more for what is not drawn.
+        cells: Pixels in the buffer, int64; one more takes what is not drawn.
     """
 
     left: GraphValue
@@ -41,10 +41,10 @@ class SurfelSplats:
     """Surfels on their way into a z-buffer: values of the graph, one entry a surfel.
 
     Attributes:
-        window: Where it is.
-        side: Pixels along the edge of every surfel's footprint, int64 scalar.
-        cell: Upper left pixel of its footprint in the buffer; `SplatWindow.cells` for none.
-        key: Depth code and surfel number, to be minimised.
+        window: Window of the buffer.
+        footprint_px: Edge of every surfel's footprint, pixels, int64 scalar.
+        cell: Upper left cell of the footprint in the buffer; `SplatWindow.cells` for none.
+        key: Depth code and surfel number; the least one wins.
         depth: Metres along z.
     """
 
@@ -56,7 +56,7 @@ class SurfelSplats:
 
 
 def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplats:
-    """Culls and projects the surfels."""
+    """Cull and project the surfels."""
     graph, view, settings = context.graph, context.camera, context.settings
     x, y, depth = surfels.camera_positions
     inverse = depth.maximum(settings.near_plane_m).reciprocal()
@@ -90,7 +90,7 @@ def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplat
 
 
 def _window(context: GraphContext, u: GraphValue, v: GraphValue, side: GraphValue) -> SplatWindow:
-    """About all points, whether they are seen or not."""
+    """Bound all projected points, seen or not, within the picture."""
     border, reach = side * 2 + 2, side.cast(np.float32) * 0.5
 
     def extent(places: GraphValue, size: GraphValue) -> tuple[GraphValue, GraphValue]:
@@ -126,7 +126,7 @@ def _depth_code(context: GraphContext, depth: GraphValue) -> GraphValue:
 
 
 def _offset_folded(context: GraphContext, code: GraphValue, surfels: PosedSurfels) -> GraphValue:
-    """Depth codes, with folded surfels moved behind their neighbours."""
+    """Move the depth codes of folded surfels behind those of their neighbors."""
     settings = context.settings
     if settings.fold_depth_offset_m == 0.0:
         return code
@@ -136,10 +136,9 @@ def _offset_folded(context: GraphContext, code: GraphValue, surfels: PosedSurfel
 
 
 def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
-    """Pixels along the edge of every surfel's footprint, an int64 scalar of at least 2.
+    """Return the edge of every footprint, pixels, an int64 scalar of at least 2.
 
-    It follows the spacing of the surfels where they are nearest to the camera, so that one does
-    not see through the surface in a close-up.
+    It follows the spacing of the surfels nearest to the camera, so that close-ups have no gaps.
     """
     settings, focal = context.settings, context.camera.focal
     spacing_px = focal[0].maximum(focal[1]) * context.tables.surfels.spacing_m / nearest
@@ -148,15 +147,15 @@ def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
 
 
 def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
-    """The least key of each of the window's pixels, row after row.
+    """Return the least key of each of the window's pixels, row after row.
 
-    Where the skin is stretched surfels lie farther apart than a footprint is wide: what two of them
-    on opposite sides, a footprint away, overtop by far is a hole, and filled.
+    Where the skin is stretched, surfels lie farther apart than a footprint is wide: a pixel that
+    two opposite ones, a footprint away, overtop by far is a hole, and filled.
     """
     window = splats.window
     buffer = _scatter_keys(context, window, splats.cell, splats.key)
     buffer = _min_over_footprint(context, buffer.slice_axes([0], [window.cells]), splats)
-    # footprints lie to the lower right of their cells, so what is spread begins so much later
+    # footprints lie to the lower right of their cells, so pixels begin a footprint earlier
     begin = (window.stride + 1) * (1 - splats.footprint_px + window.border)
 
     def shifted(by: GraphValue | int) -> GraphValue:
@@ -166,10 +165,10 @@ def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
     row = splats.footprint_px * window.stride
     across = shifted(-splats.footprint_px).maximum(shifted(splats.footprint_px))
     along = shifted(-row).maximum(shifted(row))
-    neighbours = across.minimum(along)
+    neighbors = across.minimum(along)
     steps = int(context.settings.hole_depth_m / (2.0 * context.tables.reach_m) * DEPTH_CODES)
-    hole = (keys - (steps << SURFEL_BITS)) > neighbours
-    keys = context.graph.where(hole, neighbours, keys)
+    hole = (keys - (steps << SURFEL_BITS)) > neighbors
+    keys = context.graph.where(hole, neighbors, keys)
     rows = keys.reshape(-1, window.stride)
     return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1)
 
@@ -184,7 +183,7 @@ def _scatter_keys(
 def _min_over_footprint(
     context: GraphContext, buffer: GraphValue, splats: SurfelSplats
 ) -> GraphValue:
-    """The least of a footprint's cells right and below of each; the last ones are left out."""
+    """Return the least of the footprint right of and below each cell; drop the last cells."""
     stride = splats.window.stride
     last = np.iinfo(np.int64).max
 
@@ -198,13 +197,13 @@ def _min_over_footprint(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HiddenSplats:
-    """Surfels that may lie behind something, on their way into further z-buffers.
+    """Surfels that may lie behind the first layer, on their way into further z-buffers.
 
     One entry for each pixel of a footprint: values of the graph.
 
     Attributes:
-        window: Where the buffers are.
-        cell: Pixel of the buffer.
+        window: Window of the buffers.
+        cell: Cell of the buffer.
         key: As in `SurfelSplats`.
         depth: Metres along z.
     """
@@ -218,7 +217,7 @@ class HiddenSplats:
 def depth_limits(
     context: GraphContext, window: SplatWindow, cell: GraphValue, depth: GraphValue
 ) -> GraphValue:
-    """A buffer of depths, metres along z: those given, and nowhere else anything is deeper."""
+    """Return a buffer of depths, metres along z; `INFINITE_DEPTH_M` in cells that have none."""
     empty = context.graph.full(context.graph.shape(window.cells + 1), np.float32(INFINITE_DEPTH_M))
     return empty.scatter(cell, depth)
 
@@ -230,14 +229,14 @@ def hidden_splats(
     splats: SurfelSplats,
     limits: GraphValue,
 ) -> HiddenSplats:
-    """Surfels that are deeper than a limit somewhere on their footprint, and face the camera.
+    """Select surfels that face the camera and are deeper than a limit on their footprint.
 
     Args:
-        context: What is drawn.
-        posed: The skin's nodes in the camera's frame.
-        surfels: All of them.
-        splats: The same, projected.
-        limits: The first ones (`depth_limits`); later ones only grow deeper.
+        context: Tables, settings and inputs.
+        posed: Skinning nodes in the camera's frame.
+        surfels: All surfels.
+        splats: All surfels, projected.
+        limits: Limits of the second layer (`depth_limits`); those of later layers are deeper.
     """
     graph, window, side = context.graph, splats.window, splats.footprint_px
     lowest = _min_over_footprint(context, limits, splats) - sheet_slack_m(context)
@@ -260,7 +259,7 @@ def hidden_splats(
 
 
 def sheet_slack_m(context: GraphContext) -> float:
-    """By how much other sheets' surfels may fall short of a limit, metres; 0 if by nothing."""
+    """Return how much nearer than a limit surfels of other sheets may be, metres, at least 0."""
     return max(context.settings.layer_gap_m - context.settings.other_sheet_gap_m, 0.0)
 
 
@@ -272,15 +271,15 @@ def keys_behind_limits(
     cell: GraphValue,
     front_surfel: GraphValue,
 ) -> GraphValue:
-    """The least key of what lies deeper than the limits, for some cells of the buffer.
+    """Return the least key deeper than the limits, for some cells of the buffer.
 
     Args:
-        context: What is drawn.
-        surfels: The surface.
-        hidden: What comes into question.
-        limits: As `depth_limits` makes them.
+        context: Tables, settings and inputs.
+        surfels: All surfels.
+        hidden: Candidates, from `hidden_splats`.
+        limits: From `depth_limits`.
         cell: Cells of the buffer.
-        before: The surfel that was seen in each of them.
+        front_surfel: Surfel of the layer in front, for each of them.
     """
     graph, window = context.graph, hidden.window
     limit = limits.gather(hidden.cell)
@@ -303,7 +302,7 @@ def keys_behind_limits(
 def _same_sheet(
     context: GraphContext, surfels: PosedSurfels, one: GraphValue, other: GraphValue
 ) -> GraphValue:
-    """Whether pairs of surfels are no farther apart in canonical space than as they are posed."""
+    """Tell which pairs of surfels are about as close in canonical space as they are posed."""
     settings = context.settings
 
     def apart(columns: VectorValue) -> GraphValue:

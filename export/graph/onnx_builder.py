@@ -9,7 +9,9 @@ from jaxtyping import Shaped
 from onnx import TensorProto, helper, numpy_helper
 
 ONNX_OPSET = 18
+"""Operator set, which onnxruntime 1.24 and onnxruntime-web run."""
 ONNX_IR_VERSION = 9
+"""Version of the file format of that operator set."""
 ONNX_TYPES = {
     np.dtype(np.float32): TensorProto.FLOAT,
     np.dtype(np.int32): TensorProto.INT32,
@@ -19,7 +21,7 @@ ONNX_TYPES = {
     np.dtype(np.int8): TensorProto.INT8,
     np.dtype(np.bool_): TensorProto.BOOL,
 }
-"""ONNX's name of each element type that a graph here may hold."""
+"""ONNX's name of each element type."""
 
 
 @final
@@ -27,11 +29,11 @@ class GraphValue:
     """A tensor of the graph: known by its name and element type, computed when the graph runs.
 
     Arithmetic between values, or between a value and a number, adds a node. A plain number takes
-    the element type of the value beside it.
+    the element type of the value it is combined with.
     """
 
     def __init__(self, graph: "GraphBuilder", name: str, dtype: np.dtype) -> None:
-        """Called by `GraphBuilder`; a value always belongs to one graph."""
+        """Wrap an output of a graph; called by `GraphBuilder`."""
         self.graph, self.name, self.dtype = graph, name, np.dtype(dtype)
 
     def _with(self, kind: str, *others: "Operand", dtype: Any = None) -> "GraphValue":
@@ -102,7 +104,7 @@ class GraphValue:
         return self.graph.node("BitShift", unsigned, by, direction="RIGHT")
 
     def cast(self, dtype: Any) -> "GraphValue":
-        """The same numbers in another element type (floats are cut towards zero)."""
+        """Cast to another element type; floats are truncated."""
         return self.graph.node("Cast", self, dtype=dtype, to=ONNX_TYPES[np.dtype(dtype)])
 
     def floor(self) -> "GraphValue":
@@ -205,7 +207,7 @@ class GraphBuilder:
         """An empty graph."""
         self._nodes: list[onnx.NodeProto] = []
         self._constants: dict[tuple[str, tuple[int, ...], bytes], GraphValue] = {}
-        self._initialisers: list[onnx.TensorProto] = []
+        self._initializers: list[onnx.TensorProto] = []
         self._inputs: list[onnx.ValueInfoProto] = []
         self._outputs: list[onnx.ValueInfoProto] = []
         self._count = 0
@@ -223,21 +225,21 @@ class GraphBuilder:
         self._outputs.append(helper.make_tensor_value_info(name, kind, list(shape)))
 
     def table(self, name: str, array: Shaped[np.ndarray, "..."]) -> GraphValue:
-        """A named initialiser kept outside of the model, as a "file" of its own name."""
+        """Add a named external initializer, a "file" of its own name."""
         tensor = TensorProto(name=name, data_type=ONNX_TYPES[array.dtype], dims=array.shape)
         tensor.data_location = TensorProto.EXTERNAL
         for key, value in (("location", name), ("offset", 0), ("length", array.nbytes)):
             tensor.external_data.add(key=key, value=str(value))
-        self._initialisers.append(tensor)
+        self._initializers.append(tensor)
         return GraphValue(self, name, array.dtype)
 
     def constant(self, array: Any) -> GraphValue:
-        """A small initialiser inside of the graph; equal ones are stored once."""
+        """Add a small initializer inside the graph; store equal ones once."""
         array = np.asarray(array)
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             name = f"constant_{len(self._constants)}"
-            self._initialisers.append(numpy_helper.from_array(array, name))
+            self._initializers.append(numpy_helper.from_array(array, name))
             self._constants[key] = GraphValue(self, name, array.dtype)
         return self._constants[key]
 
@@ -310,14 +312,14 @@ class GraphBuilder:
         states: Sequence[GraphValue],
         body: Callable[[GraphValue, list[GraphValue]], tuple[GraphValue | None, list[GraphValue]]],
     ) -> list[GraphValue]:
-        """`for i in range(most): go, states = body(i, states)` until it is told not to go on.
+        """`for i in range(max_turns): go, states = body(i, states)` while `go` holds.
 
         The states' lengths may change from turn to turn.
         """
         return self._loop(max_turns, states, body)
 
     def split(self, value: GraphValue, parts: int, axis: int = 0) -> list[GraphValue]:
-        """Equal pieces along an axis, which is as long as there are pieces and goes away."""
+        """Split along an axis of length `parts`, which goes away."""
         self._count += 1
         names = [f"split_{self._count}_{i}" for i in range(parts)]
         self._nodes.append(
@@ -353,10 +355,10 @@ class GraphBuilder:
         return outputs
 
     def model(self) -> onnx.ModelProto:
-        """The graph as a model; its tables are handed to the runtime beside it."""
+        """Return the model; its tables are passed to the runtime separately."""
         return helper.make_model(
             helper.make_graph(
-                self._nodes, "avatar", self._inputs, self._outputs, self._initialisers
+                self._nodes, "avatar", self._inputs, self._outputs, self._initializers
             ),
             opset_imports=[helper.make_opsetid("", ONNX_OPSET)],
             ir_version=ONNX_IR_VERSION,
@@ -372,4 +374,4 @@ def _vector_info(value: GraphValue) -> onnx.ValueInfoProto:
 
 
 Operand = GraphValue | float | int | np.generic | np.ndarray
-"""What may stand beside a value: another one, or a number."""
+"""What a value may be combined with: another one, or a number."""

@@ -1,4 +1,4 @@
-"""The player's graph: bones and camera in, a picture with alpha out. The only door out of numpy."""
+"""The player's ONNX graph: bones and camera in, a picture with alpha out."""
 
 from dataclasses import replace
 
@@ -30,12 +30,12 @@ from export.package.render_settings import RenderSettings
 
 
 def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
-    """The graph that draws `tables`.
+    """Build the graph that draws `tables`.
 
     Inputs: `bones` (24, 12), camera-from-canonical 3×4 matrices in metres; `camera` (4), focal
-    lengths and centre in pixels; `height`, `width`, `samples`, int64 scalars. Output: `rgba`
+    lengths and center in pixels; `height`, `width`, `samples`, int64 scalars. Output: `rgba`
     (height × width), int32: red, green, blue and straight alpha, one byte each, red the lowest.
-    Its tables stay outside (`initialisers`).
+    Its tables are external, named as in `graph_initializers`.
     """
     graph = GraphBuilder()
     context = GraphContext(
@@ -54,6 +54,7 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
 
 
 def _draw_picture(context: GraphContext) -> GraphValue:
+    """Splat, trace all layers, pack."""
     graph = context.graph
     posed = pose_nodes(context)
     surface = PosedProxySurface(surfels=pose_surfels(context, posed), posed=posed)
@@ -89,7 +90,7 @@ def _add_further_layers(
     pixel: GraphValue,
     first: DepthLayer,
 ) -> list[GraphValue]:
-    """Color and light after all layers, one entry a ray of the first."""
+    """Return color and transmittance after all layers, one entry a ray of the first."""
     graph, window, hidden = context.graph, splats.window, None
     color, light, before = first.color, first.transmittance, first
     number = graph.range(graph.size(pixel).cast(np.int32))
@@ -127,7 +128,7 @@ def _add_further_layers(
 
 
 def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
-    """Cells of the buffer in which pixels of the window lie."""
+    """Return the buffer's cells of pixels of the window."""
     width, stride = window.width.cast(np.int32), window.stride.cast(np.int32)
     row = pixel // width
     border = window.border.cast(np.int32)
@@ -137,7 +138,7 @@ def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
 def _pack_rgba(
     context: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]
 ) -> GraphValue:
-    """The whole picture, eight bits a channel, straight alpha: color is divided by alpha."""
+    """Pack the whole picture into one int32 a pixel, straight alpha: divide color by alpha."""
     graph, view = context.graph, context.camera
     *color, light = channels
     alpha = 1.0 - light
@@ -147,7 +148,7 @@ def _pack_rgba(
         for value in [*(channel * inverse for channel in color), alpha * 255.0]
     ]
     red, green, blue, alpha = bytes_
-    alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte holds the sign
+    alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte has the sign bit
     packed = red + green * (1 << 8) + blue * (1 << 16) + alpha * (1 << 24)
     width = window.width.cast(np.int32)
     row = pixel // width

@@ -1,1 +1,1 @@
-"""Meshes: isosurface, skin and glTF."""
+"""Meshes for other programs: isosurface, skinning weights and glTF."""

@@ -15,19 +15,25 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest
 
 COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
-"""glTF's numbers of the element types."""
+"""glTF's codes of the element types."""
 ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+"""glTF's names of the shapes of elements."""
+ARRAY_BUFFER = 34962
+"""glTF's code of a buffer of vertices."""
+ELEMENT_ARRAY_BUFFER = 34963
+"""glTF's code of a buffer of indices."""
+FIRST_JOINT = 2
+"""Node of the first joint; 0 is the mesh and 1 the floor."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkeletonAnimation:
-    """A motion as the skeleton's nodes take it.
+    """Translations and rotations of the skeleton's nodes over time.
 
     Attributes:
-        times_s: Rising from 0.
-        translations: Of the pelvis, metres.
-        rotations: Of every joint, as quaternions x, y, z, w whose signs do not jump.
+        times_s: Seconds, ascending from 0.
+        translations: Positions of the pelvis, metres.
+        rotations: Quaternions x, y, z, w of every joint, whose signs do not jump.
     """
 
     times_s: Float32[np.ndarray, "poses"]
@@ -38,14 +44,14 @@ class SkeletonAnimation:
     def of(
         cls, motion: Motion, rows: tuple[int, ...], fps: float, pelvis: Float[np.ndarray, "3"]
     ) -> "SkeletonAnimation":
-        """The valid poses of a motion, turned and shifted so that the first one stands in place.
+        """Convert poses of a motion, rotated and translated so that the first one is upright.
 
-        glTF's axes are the body's own (y up, the front towards z); a tracker's world may lie
-        anyhow, so the first pose's root gives up, forward and the origin.
+        glTF's axes are the body's own (y up, the front towards z); a tracker's world may have any
+        orientation, so the first pose's root defines up, forward and the origin.
 
         Args:
             motion: In the tracker's world.
-            rows: Which of its poses.
+            rows: Poses to convert.
             fps: Poses a second.
             pelvis: Rest pelvis, metres.
         """
@@ -67,7 +73,7 @@ class SkeletonAnimation:
 def _continuous_quaternions(
     quaternions: Float[np.ndarray, "24 poses 4"],
 ) -> Float[np.ndarray, "24 poses 4"]:
-    """q and -q are the same rotation; the nearer one to its predecessor is taken."""
+    """Choose between q and -q, the same rotation, the one nearer to its predecessor."""
     steps = np.sum(quaternions[:, 1:] * quaternions[:, :-1], axis=-1)
     signs = np.cumprod(np.where(steps < 0.0, -1.0, 1.0), axis=1)
     return np.concatenate([quaternions[:, :1], quaternions[:, 1:] * signs[..., None]], axis=1)
@@ -76,17 +82,16 @@ def _continuous_quaternions(
 def encode_glb(
     mesh: SkinnedMesh, manifest: Manifest, animation: SkeletonAnimation, *, name: str
 ) -> bytes:
-    """The file's bytes.
+    """Encode a skinned mesh, its skeleton and a motion as a .glb file.
 
-    Colors hold the light of the recording, so the material asks for no light of its own
-    (KHR_materials_unlit); importers that do not know that see a matt one. The canonical pose is
-    the bind pose, and the skeleton rests in it.
+    Colors include the recording's light, so the material is unlit (KHR_materials_unlit), and matt
+    for importers without that extension. The canonical pose is the bind pose and the rest pose.
 
     Args:
         mesh: In the canonical pose.
-        manifest: Its skeleton.
-        animation: What it does.
-        name: Of the avatar.
+        manifest: The skeleton.
+        animation: The motion.
+        name: Name of the avatar.
     """
     draft = _GltfBuffer()
     skin, nodes = _skeleton(draft, mesh, manifest)
@@ -115,14 +120,10 @@ def encode_glb(
     return _pack_glb(content, bytes(draft.binary))
 
 
-FIRST_JOINT = 2
-"""Nodes: 0 is the mesh, then what stands on the floor, then the joints."""
-
-
 def _skeleton(
     draft: "_GltfBuffer", mesh: SkinnedMesh, manifest: Manifest
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The skin, and the nodes of the joints below one that puts the feet on the floor."""
+    """Return the skin, and the joints' nodes below one that puts the feet on the floor."""
     rest, parents = manifest.rest_joints, manifest.parents
     canonical = body_from_rest(rest, parents, manifest.canonical_rotations)
     canonical_from_joint = canonical.copy()
@@ -167,7 +168,7 @@ def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
 
 
 def _srgb_to_linear(colors: Shaped[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
-    """sRGB to linear light, which glTF's vertex colors are, and opaque; 16 bits keep the darks."""
+    """Convert sRGB to linear light with alpha, as glTF wants it; 16 bits keep the darks."""
     srgb = colors.astype(np.float64) / 255.0
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     opaque = np.concatenate([light, np.ones((len(light), 1))], axis=1)
@@ -193,7 +194,7 @@ def _animation(draft: "_GltfBuffer", animation: SkeletonAnimation) -> dict[str, 
 
 @final
 class _GltfBuffer:
-    """The binary part while it grows, and what describes it."""
+    """The binary part of a file being built, and its description."""
 
     def __init__(self) -> None:
         self.binary = bytearray()
@@ -208,7 +209,7 @@ class _GltfBuffer:
         normalized: bool = False,
         bounds: bool = False,
     ) -> int:
-        """Adds an array of scalars, vectors or matrices; returns its accessor's number."""
+        """Add an array of scalars, vectors or matrices; return its accessor's number."""
         content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content)}
         self._views.append(view if target is None else {**view, "target": target})
@@ -229,7 +230,7 @@ class _GltfBuffer:
         return len(self._accessors) - 1
 
     def describe(self) -> dict[str, Any]:
-        """What the JSON part says about the binary one."""
+        """Describe the binary part for the JSON part."""
         return {
             "buffers": [{"byteLength": len(self.binary)}],
             "bufferViews": self._views,
@@ -238,7 +239,7 @@ class _GltfBuffer:
 
 
 def _pack_glb(content: dict[str, Any], binary: bytes) -> bytes:
-    """glTF's container: a header and two chunks, each padded to four bytes."""
+    """Pack glTF's container: a header and two chunks, each padded to four bytes."""
     text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text

@@ -1,20 +1,22 @@
-"""The zero set of a grid of numbers as a mesh: one vertex a cell (naive surface nets)."""
+"""Isosurface extraction by naive surface nets: one vertex for each crossed cell."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
 CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+"""Corners of a cell, relative to its lowest one."""
 AXES = np.eye(3, dtype=np.int64)
+"""Steps along x, y and z."""
 
 
 def extract_isosurface(
     values: Float32[np.ndarray, "x y z"],
 ) -> tuple[Float32[np.ndarray, "vertices 3"], Int32[np.ndarray, "faces 3"]]:
-    """Vertices in nodes of the grid, and triangles that face from positive to negative.
+    """Return vertices in nodes of the grid, and triangles that face from positive to negative.
 
-    Every cell that the zero set crosses has one vertex, the mean of where it crosses the cell's
-    edges; every grid edge that it crosses has a quad between its four cells (Gibson 1998,
-    "Constrained elastic surface nets", without the relaxation). Closed if the border is negative.
+    Every cell that the zero set crosses has one vertex, the mean of its crossings of the cell's
+    edges; every crossed grid edge has a quad between its four cells (Gibson 1998, "Constrained
+    elastic surface nets", without the relaxation). The surface is closed if the border is negative.
 
     Args:
         values: Positive inside.
@@ -28,23 +30,8 @@ def extract_isosurface(
     return vertices, _triangles(vertices, np.concatenate(quads))
 
 
-def resample_grid(
-    values: Float32[np.ndarray, "x y z"], step: float
-) -> Float32[np.ndarray, "x2 y2 z2"]:
-    """Linear interpolation at every `step`-th node along each axis; each has two nodes or more."""
-    for axis in range(3):
-        places = np.arange(0.0, values.shape[axis] - 1, step)
-        below = np.minimum(places.astype(int), values.shape[axis] - 2)  # a last place by rounding
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        part = (places - below).astype(np.float32).reshape(shape)
-        lower = np.take(values, below, axis=axis)
-        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
-    return values
-
-
 def _crossed_cells(inside: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "cells 3"]:
-    """Lowest corners of the cells whose corners do not agree."""
+    """Return the lowest corners of cells with corners on both sides."""
     x, y, z = (size - 1 for size in inside.shape)
     count = np.zeros((x, y, z), dtype=np.uint8)
     for i, j, k in CORNERS:
@@ -57,6 +44,7 @@ def _mean_crossings(
     inside: Bool[np.ndarray, "x y z"],
     cells: Int64[np.ndarray, "cells 3"],
 ) -> Float32[np.ndarray, "cells 3"]:
+    """Return the mean of each cell's edge crossings."""
     total = np.zeros((len(cells), 3), dtype=np.float64)
     count = np.zeros(len(cells), dtype=np.int64)
     for axis in range(3):
@@ -73,7 +61,7 @@ def _mean_crossings(
 def _quads(
     inside: Bool[np.ndarray, "x y z"], number: Int32[np.ndarray, "cx cy cz"], axis: int
 ) -> Int32[np.ndarray, "quads 4"]:
-    """The four cells round every crossed edge along an axis, anticlockwise seen from outside."""
+    """Return the four cells about every crossed edge, counter-clockwise from outside."""
     here = [slice(1, -1)] * 3
     there = list(here)
     here[axis], there[axis] = slice(0, -1), slice(1, None)
@@ -89,7 +77,7 @@ def _quads(
 def _triangles(
     vertices: Float32[np.ndarray, "vertices 3"], quads: Int32[np.ndarray, "quads 4"]
 ) -> Int32[np.ndarray, "faces 3"]:
-    """Each quad along its shorter diagonal."""
+    """Split each quad along its shorter diagonal."""
     a, b, c, d = (vertices[corner] for corner in quads.T)
     shorter = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
     along = np.where(shorter[:, None], quads, np.roll(quads, -1, axis=1))

@@ -1,4 +1,4 @@
-"""A package's avatar as a mesh that other programs move: vertices, colors, skinning weights."""
+"""A package's avatar as a mesh for other programs: vertices, colors, skinning weights."""
 
 from dataclasses import dataclass
 
@@ -8,32 +8,40 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 
-from export.mesh.isosurface import extract_isosurface, resample_grid
+from export.bake.grid_filters import remove_floaters_and_cavities, resample_grid
+from export.mesh.isosurface import extract_isosurface
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable, PlayerTables
 
 VERTEX_SPACING_M = 0.005
-"""Edge of the cells that the surface is taken on; each crossed cell becomes a vertex."""
-SURFACE_DENSITY, HAZE_DENSITY = 50.0, 15.0
-"""Density of the surface, and of the faint cover that must close what no camera saw, 1/m."""
+"""Edge of the cells in which the surface is extracted, metres; a crossed cell gives one vertex."""
+SURFACE_DENSITY = 50.0
+"""Density of the surface, 1/m."""
+HAZE_DENSITY = 15.0
+"""Density of the faint cover that closes regions which no camera saw, 1/m."""
 BORDER_VOXELS = 4
-"""Empty voxels all round, so that closing and blurring do not meet the end."""
-CLOSING_VOXELS, SOLID_DEPTH_VOXELS = 2, 3
-"""Voxels: holes of twice the first are closed in that cover, and what is deeper under it than the
-second is solid, whatever the bricks say: they hold only what can be seen."""
-BLUR_VOXELS, CODE_CONTRAST = 0.75, 40.0
-"""Deviation of the blur in voxels, and the codes above and below the level that count."""
+"""Empty voxels around the bricks, so that closing and blurring stay clear of the border."""
+CLOSING_VOXELS = 2
+"""Iterations of closing: holes of twice as many voxels in the cover are closed."""
+SOLID_DEPTH_VOXELS = 3
+"""Depth under the cover from which everything is solid, voxels: bricks hold only visible ones."""
+BLUR_VOXELS = 0.75
+"""Standard deviation of the blur before the level set is extracted, voxels."""
+CODE_CONTRAST = 40.0
+"""Density codes above and below the level to which densities are clipped."""
 MIN_VOLUME_FRACTION = 0.002
-"""Parts of less volume than this share of the largest are floaters."""
+"""Least volume of a part as a fraction of the largest one's; smaller ones are floaters."""
 NORMAL_SMOOTHINGS = 6
-"""How often normals are averaged over neighbours: a trained field is never quite smooth."""
-COLOR_STEP_M, COLOR_DEPTH_M = 0.002, 0.03
-"""A vertex has the color of a ray that enters there: its steps, and how deep it goes."""
+"""Averagings of normals over adjacent vertices, as a trained field is not quite smooth."""
+COLOR_STEP_M = 0.002
+"""Step of the rays that give vertices their colors, metres."""
+COLOR_DEPTH_M = 0.03
+"""Depth under the surface at which these rays end, metres."""
 COLOR_LEAD_M = 0.004
-"""How far outside of the surface that ray begins."""
+"""Distance outside the surface at which these rays begin, metres."""
 MIN_COLOR_ALPHA = 0.2
-"""Alpha below which a vertex has no color of its own but its neighbour's."""
+"""Alpha below which a vertex takes the color of the nearest other one."""
 JOINTS_PER_VERTEX = 4
-"""Joints that move a vertex: what importers can be relied on to read."""
+"""Joints that move a vertex: all importers read this many."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,9 +52,9 @@ class SkinnedMesh:
         positions: Canonical metres.
         normals: Outward, of length 1.
         colors: sRGB.
-        faces: Anticlockwise seen from outside.
-        joints: Which joints move each vertex; those without weight are 0.
-        weights: How much, × 255; each row sums to 255.
+        faces: Counter-clockwise seen from outside.
+        joints: Joints that move each vertex; 0 where the weight is 0.
+        weights: Skinning weights × 255; each row sums to 255.
     """
 
     positions: Float32[np.ndarray, "vertices 3"]
@@ -58,11 +66,11 @@ class SkinnedMesh:
 
 
 def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -> SkinnedMesh:
-    """The surface of a bake.
+    """Extract the surface of baked bricks.
 
     Args:
-        tables: The bake.
-        spacing_m: About how far vertices lie apart.
+        tables: The bricks, and the weights that move them.
+        spacing_m: Distance between vertices, about, metres.
     """
     codes, low = _dense_grid(tables.bricks)
     voxel_m = tables.bricks.voxel_m
@@ -83,10 +91,11 @@ def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -
 
 
 def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, "x y z"]:
-    """Positive inside: log-density above the level, smoothed, without floaters and hollows."""
+    """Return a function that is positive inside: log-density over the level, without floaters."""
     level = _density_code(SURFACE_DENSITY)
-    solid = _remove_floaters(
-        (density > level) | _solid_interior(density > _density_code(HAZE_DENSITY))
+    solid = remove_floaters_and_cavities(
+        (density > level) | _solid_interior(density > _density_code(HAZE_DENSITY)),
+        MIN_VOLUME_FRACTION,
     )
     height = density.astype(np.float32) - level
     height = np.where(solid, np.maximum(height, 1.0), np.minimum(height, -1.0))
@@ -96,13 +105,13 @@ def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, 
 
 
 def _density_code(density: float) -> np.float32:
-    """The 8-bit code of a density, not rounded."""
+    """Return the code of a density in 1/m, not rounded."""
     begin, end = LOG_DENSITY_RANGE
     return np.float32((np.log(density) - begin) / (end - begin) * 255.0)
 
 
 def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """What lies well below a cover with holes."""
+    """Mark what lies well below a cover with holes."""
     closed = ndimage.binary_closing(cover, iterations=CLOSING_VOXELS)
     filled = ndimage.binary_fill_holes(closed)
     return np.asarray(ndimage.binary_erosion(filled, iterations=SOLID_DEPTH_VOXELS))
@@ -111,9 +120,10 @@ def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z
 def skinning_weights(
     tables: PlayerTables, points: Float32[np.ndarray, "points 3"]
 ) -> Float32[np.ndarray, "points 24"]:
-    """Weights of the joints at points near the surface; rows sum to 1.
+    """Return joints' weights at points near the surface; rows sum to 1.
 
-    Trilinear between the skin's nodes; where none is stored about a point, the nearest one's.
+    Trilinear between nodes of the skinning grid; the nearest node's where none about a point is
+    stored.
     """
     skin = tables.skinning
     place = np.clip((points - skin.low) / skin.step_m, 0.0, np.array(skin.index.shape) - 1.001)
@@ -134,7 +144,7 @@ def skinning_weights(
 def _dense_grid(
     bricks: BrickTable,
 ) -> tuple[UInt8[np.ndarray, "x y z 4"], Float32[np.ndarray, "3"]]:
-    """The grid round all bricks, with an empty border, and where its first node lies."""
+    """Return all bricks in one grid with an empty border, and the position of its first node."""
     blocks = np.argwhere(bricks.index > 0)
     first, last = blocks.min(axis=0), blocks.max(axis=0)
     counts = (last - first + 1) * BRICK_SIZE
@@ -146,20 +156,10 @@ def _dense_grid(
     return codes, low.astype(np.float32)
 
 
-def _remove_floaters(dense: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """Without floaters, and with what it encloses: bricks hold only what can be seen."""
-    parts = np.zeros(dense.shape, dtype=np.int32)
-    ndimage.label(dense, output=parts)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
-    kept = sizes >= MIN_VOLUME_FRACTION * sizes.max()
-    return np.asarray(ndimage.binary_fill_holes(kept[parts]))
-
-
 def _smooth_normals(
     positions: Float32[np.ndarray, "vertices 3"], faces: Int32[np.ndarray, "faces 3"]
 ) -> Float32[np.ndarray, "vertices 3"]:
-    """Means of the faces' normals by their areas, evened out over neighbours."""
+    """Average the faces' normals by area, then smooth them over adjacent vertices."""
     count = len(positions)
     a, b, c = (positions[corner] for corner in faces.T)
     areas = np.cross(b - a, c - a)
@@ -167,16 +167,16 @@ def _smooth_normals(
         (np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))),
         shape=(count, len(faces)),
     ).tocsr()
-    neighbours = touches @ touches.T
+    adjacent = touches @ touches.T
     normals = _normalize(touches @ areas)
     for _ in range(NORMAL_SMOOTHINGS):
-        normals = _normalize(neighbours @ normals)
+        normals = _normalize(adjacent @ normals)
     return normals.astype(np.float32)
 
 
 def _normalize(vectors: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    upward = np.array([0.0, 1.0, 0.0])  # where they cancel out
+    upward = np.array([0.0, 1.0, 0.0])  # where a vertex's faces cancel out
     return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), upward)
 
 
@@ -186,7 +186,7 @@ def _vertex_colors(
     normals: Float32[np.ndarray, "vertices 3"],
     voxel_m: float,
 ) -> UInt8[np.ndarray, "vertices 3"]:
-    """What a ray along the normal sees from outside."""
+    """Composite the color of each vertex along its inward normal, from outside."""
     begin, end = LOG_DENSITY_RANGE
     total = np.zeros((len(nodes), 3), dtype=np.float32)
     passed = np.ones(len(nodes), dtype=np.float32)
@@ -213,7 +213,7 @@ def _vertex_colors(
 def _strongest_joints(
     weights: Float32[np.ndarray, "vertices 24"],
 ) -> tuple[UInt8[np.ndarray, "vertices 4"], UInt8[np.ndarray, "vertices 4"]]:
-    """The strongest joints of each vertex, and their weights in whole 255ths."""
+    """Return the strongest joints of each vertex and their weights as integers that sum to 255."""
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :JOINTS_PER_VERTEX]
     strongest = np.take_along_axis(weights, joints, axis=1).astype(np.float64)
     scaled = strongest / strongest.sum(axis=1, keepdims=True) * 255.0

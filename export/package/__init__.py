@@ -1,1 +1,1 @@
-"""The package: tables, manifest and file."""
+"""The package: tables, settings, manifest and file."""

@@ -1,7 +1,4 @@
-"""The skin's nodes, at its own step or half of it: posed positions are linear between them.
-
-The tables as the graph reads them: one-dimensional columns.
-"""
+"""The stored tables expanded for drawing: skinning nodes, and initializers of the graph."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,27 +11,25 @@ from export.package.player_tables import BRICK_NODES, PlayerTables, SkinningGrid
 from export.package.render_settings import RenderSettings
 
 UNSTORED_M = 1e6
-"""Canonical coordinates of nodes that are not stored, metres. They make the derivative so
-large that it is never inverted: beyond the stored skin a ray keeps its direction."""
+"""Canonical coordinates of nodes that are not stored, metres. They make the Jacobian so large that
+it is never inverted: outside the stored cells a ray keeps its direction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinningNodes:
-    """Nodes of a grid whose cells are as long as the skin's, or half as long.
+    """Nodes of the skinning grid at its own step, or at half of it.
 
-    Linear blend skinning, Σ w_j(x) B_j x, carries each node to its posed place. Trilinear between
-    eight of these, at half the skin's step, it is at most some tenths of a millimetre from what the
-    skin itself says.
+    Linear blend skinning, Σ w_j(x) B_j x, poses each node; positions in between are interpolated.
+    At half the grid's step that is within some tenths of a millimetre of skinning itself.
 
     Attributes:
         low: Corner of the grid, canonical metres.
-        step_m: Distance between nodes along x, y, z.
-        index: Which row belongs to each node, 0 where it or the next one along z is not stored.
-            Rows are numbered in C order: the row of the next node along z is the next one. There is
-            one row more than nodes, so that there always is a next one.
-        positions: Canonical metres; those of the first and the last row, which are no nodes, are
-            `UNSTORED_M`.
-        weights: Of the joints.
+        step_m: Distance between nodes along x, y, z, metres.
+        index: Row of each node, 0 where it or the next node along z is not stored. Rows are
+            numbered in C order, so that the next row is the next node along z; one more row than
+            there are nodes follows the last.
+        positions: Canonical metres; `UNSTORED_M` in the first and the last row, which are no nodes.
+        weights: Joints' weights, one column a row of `positions`.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -45,22 +40,26 @@ class SkinningNodes:
 
 
 def skinning_nodes(skin: SkinningGrid, subdivision: int) -> SkinningNodes:
-    """The skin's nodes, its steps cut into so many parts.
+    """Return the nodes of a skinning grid.
+
+    Args:
+        skin: The stored grid.
+        subdivision: Parts into which each step is cut, 1 or 2.
 
     Raises:
-        InputError: If that is neither 1 nor 2.
+        InputError: If it is neither.
     """
     if subdivision not in (1, 2):
         raise InputError(
-            f"The package cuts the skin's steps into {subdivision} parts; 1 or 2 can be. "
-            "The file is damaged or none of ours."
+            f"The package cuts steps of its skinning grid into {subdivision} parts; expected 1 or "
+            "2. The file is damaged, or another program wrote it."
         )
     return subdivided_skinning_nodes(skin) if subdivision == 2 else stored_skinning_nodes(skin)
 
 
 @lru_cache(maxsize=1)
 def stored_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
-    """Every node that is stored."""
+    """Return every stored node."""
     place = np.argwhere(skin.index > 0)
     weights = np.zeros((24, len(place) + 2), dtype=np.float32)
     weights[:, :-1] = skin.weights.T
@@ -76,7 +75,7 @@ def stored_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
 
 @lru_cache(maxsize=1)
 def subdivided_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
-    """Every node of the halved grid that a cell with eight stored corners holds."""
+    """Return every node at half the step in cells whose eight corners are stored."""
     inside = _nodes_of_complete_cells(skin.index > 0)
     place = np.argwhere(inside)
     index = np.zeros(inside.shape, dtype=np.int32)
@@ -85,7 +84,7 @@ def subdivided_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
     codes = np.ascontiguousarray(skin.weight_codes.T)
     weights = np.zeros((24, len(place) + 2), dtype=np.float32)
     weights[0, [0, -1]] = 1.0
-    for parity in np.ndindex(2, 2, 2):  # a node between others has the mean of its neighbours
+    for parity in np.ndindex(2, 2, 2):  # a node between others takes their mean
         chosen = np.flatnonzero((odd == parity).all(axis=1))
         corners = [c for c in np.ndindex(2, 2, 2) if all(np.less_equal(c, parity))]
         total = np.zeros((len(chosen), 24), dtype=np.uint32)
@@ -104,7 +103,7 @@ def subdivided_skinning_nodes(skin: SkinningGrid) -> SkinningNodes:
 
 
 def _rows_with_next_in_z(index: Int32[np.ndarray, "x y z"]) -> Int32[np.ndarray, "x y z"]:
-    """The rows of those nodes alone whose next one along z is there."""
+    """Set the rows of nodes to 0 whose next node along z is not stored."""
     kept = np.zeros_like(index)
     kept[..., :-1] = np.where(index[..., 1:] > 0, index[..., :-1], 0)
     return kept
@@ -115,13 +114,13 @@ def _padded_positions(
     low: Float32[np.ndarray, "3"],
     step_m: Float32[np.ndarray, "3"],
 ) -> Float32[np.ndarray, "rows 3"]:
-    """Positions of nodes, and of a row before and behind them that are nowhere."""
+    """Return positions of nodes, with a row of `UNSTORED_M` before and after them."""
     positions = (place * step_m + low).astype(np.float32)
     return np.pad(positions, [(1, 1), (0, 0)], constant_values=UNSTORED_M)
 
 
 def _nodes_of_complete_cells(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "fx fy fz"]:
-    """Nodes of the halved grid that belong to a cell whose corners are all stored."""
+    """Mark the nodes at half the step in cells whose corners are all stored."""
     nx, ny, nz = stored.shape
     whole = np.ones((nx - 1, ny - 1, nz - 1), dtype=bool)
     for i, j, k in np.ndindex(2, 2, 2):
@@ -135,7 +134,7 @@ def _nodes_of_complete_cells(stored: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarr
 def graph_initializers(
     tables: PlayerTables, settings: RenderSettings
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Every table of the graph that draws by these settings, by its name."""
+    """Return the tables of a graph with these settings by name, one-dimensional where possible."""
     surfels, bricks = tables.surfels, tables.bricks
     nodes = skinning_nodes(tables.skinning, settings.skinning_subdivision)
     voxels = bricks.voxels.reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""The page at the front of a package: what it is, in which units, and how to check it."""
+"""manifest.json: what a package holds, in which units, and how to check it."""
 
 import json
 from dataclasses import asdict, dataclass, fields
@@ -15,37 +15,41 @@ from export.package.table_codec import TableLayout
 from preprocess.body.body_pose import BodyPose
 
 FORMAT_VERSION = 4
+"""Version of the package format; readers refuse all others."""
 MAX_GOLDEN_PX = 128
-"""Golden frames are no longer than this along either side."""
+"""Longest side of a golden frame, pixels."""
 JOINT_NAMES = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee"),
     *("spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot"),
     *("neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
     *("left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand"),
 )
+"""SMPL's joints in their order."""
 CONVENTIONS = {
     "units": "metres, radians, density in 1/m",
     "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",
-    "camera_axes": "x right, y down, z forward (OpenCV); pixel centres at +0.5",
+    "camera_axes": "x right, y down, z forward (OpenCV); pixel centers at +0.5",
     "pose": "world = R(root_rotation) (x - J0) + J0 + root_translation; axis-angle joint rotations",
     "picture": "RGBA, 8 bits, straight alpha",
 }
+"""Conventions that every manifest repeats for its readers."""
 LICENCE_NOTE = (
     "A difference of a person: use it only as that person allows. It is neither the body model's "
     "data nor code; the rights in it are those of the recording it was learnt from."
 )
+"""Default of `Manifest.licence`."""
 Record = TypeVar("Record")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TierInfo:
-    """One quality of the player.
+    """One quality tier of the player.
 
     Attributes:
-        layout: Sizes and scales of what it draws; that of "hq" says how the streams are read.
-        settings: How it is drawn.
-        psnr_to_renderer: Against the volume renderer, dB.
-        largest_difference: Between graph and reference, in 1/255, over the golden frames.
+        layout: Sizes and scales of the tables; the streams are read by the one of "hq".
+        settings: How the tables are drawn.
+        psnr_to_renderer: Mean PSNR to the volume renderer, dB.
+        largest_difference: Between graph and reference, in 1/255, over the checked frames.
     """
 
     layout: TableLayout
@@ -56,7 +60,7 @@ class TierInfo:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GoldenFrame:
-    """A picture that the player must draw again: its pose and its camera."""
+    """Pose and camera of a picture that the player must reproduce."""
 
     pose: BodyPose
     camera: Camera
@@ -64,17 +68,17 @@ class GoldenFrame:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Manifest:
-    """What a package says about itself.
+    """Skeleton, tiers, golden frames and checksums of a package.
 
     Attributes:
-        rest_joints: Rest joints, metres.
+        rest_joints: Rest positions of the joints, metres.
         parents: Parent of each joint, -1 for the root.
-        canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
-        tiers: By name, "hq" first, which is always there.
-        golden: Of the "hq" tier, at its usual number of samples.
-        metrics: What training reported, as JSON.
-        licence: A note on who may use it.
-        sha256: Of every entry but the manifest.
+        canonical_rotations: Axis-angles of joints 1 … 23 in the canonical pose, radians.
+        tiers: Quality tiers by name; "hq" comes first and always exists.
+        golden: Golden frames, drawn by "hq" with its own number of samples.
+        metrics: Training metrics, as JSON.
+        licence: Note on who may use the package.
+        sha256: Checksums of every entry but the manifest, hexadecimal, by name.
     """
 
     rest_joints: Float[np.ndarray, "24 3"]
@@ -87,7 +91,7 @@ class Manifest:
     sha256: dict[str, str]
 
     def to_json(self) -> str:
-        """The text of manifest.json."""
+        """Serialize to the text of manifest.json."""
         content = {
             "format": FORMAT_VERSION,
             **CONVENTIONS,
@@ -105,10 +109,10 @@ class Manifest:
 
     @classmethod
     def from_json(cls, text: bytes) -> "Manifest":
-        """Reads manifest.json.
+        """Parse manifest.json.
 
         Raises:
-            InputError: If it is none, or of another format, or something in it cannot be.
+            InputError: If it is not JSON, has another format, or lacks or misstates a value.
         """
         content = _parse_json(text)
         try:
@@ -132,7 +136,7 @@ class Manifest:
 
 
 def _without_nan(value: Any) -> Any:
-    """JSON knows no NaN and no infinity: they become null."""
+    """Replace NaN and infinity by null, as JSON has neither."""
     if isinstance(value, dict):
         return {str(key): _without_nan(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -144,7 +148,7 @@ def _parse_json(text: bytes) -> dict[str, Any]:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError("The package's manifest is no JSON; the file is damaged.") from error
+        raise InputError("The package's manifest is not JSON; the file is damaged.") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT_VERSION:
         found = content.get("format") if isinstance(content, dict) else None
         newer = isinstance(found, int) and found > FORMAT_VERSION
@@ -190,7 +194,7 @@ def _parse_tier(note: dict[str, Any]) -> TierInfo:
 
 
 def _parse_record(kind: type[Record], values: dict[str, Any]) -> Record:
-    """A record of numbers and of tuples of three numbers."""
+    """Parse a record of numbers and of tuples of three numbers."""
     content: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
         value, whole = values[field.name], "int" in str(field.type)

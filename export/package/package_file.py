@@ -1,4 +1,4 @@
-"""The `.iavatar` file: manifest, graph and compact streams in a zip, whole or not at all."""
+"""The `.iavatar` file: manifest, graphs and compact streams in a zip, written atomically."""
 
 import hashlib
 import zipfile
@@ -18,26 +18,32 @@ from export.package.manifest import Manifest
 from export.package.player_tables import PlayerTables
 from export.package.table_codec import TableLayout, decode_tables, encode_tables
 
-MANIFEST_ENTRY, PREVIEW_ENTRY = "manifest.json", "preview.png"
+MANIFEST_ENTRY = "manifest.json"
+"""Entry of the manifest."""
+PREVIEW_ENTRY = "preview.png"
+"""Entry of the preview."""
 MAX_ENTRIES = 64
+"""Largest number of entries that is read."""
 MAX_TEXT_BYTES = 4 << 20
-"""Bytes of a manifest, a graph or a preview."""
+"""Largest manifest, graph or preview that is read."""
 MAX_FILE_BYTES = 256 << 20
+"""Largest package that is opened."""
 MAX_DIRECTORY_BYTES = 1 << 17
-"""Bytes of the zip's list of entries, which would be read before they can be counted."""
+"""Largest central directory; `zipfile` reads it whole before entries can be counted."""
 ALLOWED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods of entries."""
 ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
-"""Time stamp of every entry: the same avatar is always the same bytes."""
+"""Time stamp of every entry, so that equal avatars give equal bytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AvatarPackage:
-    """An avatar that plays without torch.
+    """Content of a package, from which an avatar is drawn without torch.
 
     Attributes:
-        manifest: What it says about itself.
+        manifest: Skeleton, settings, checks.
         graphs: ONNX model of each tier; its tables are external.
-        tables: What each tier draws: the same, in its own way.
+        tables: Tables of each tier, the same object for all.
         golden: Pictures of `manifest.golden`, straight alpha.
         preview: A PNG.
     """
@@ -50,28 +56,28 @@ class AvatarPackage:
 
 
 def graph_entry(tier: str) -> str:
-    """Where a tier's graph lies: player.onnx is the "hq" one."""
+    """Return the entry of a tier's graph; "hq" has player.onnx."""
     return "player.onnx" if tier == "hq" else f"{tier}/player.onnx"
 
 
 def stream_entry(stream: str) -> str:
-    """Where a stream lies; all tiers draw the same."""
+    """Return the entry of a stream, which all tiers share."""
     return f"hq/{stream}.bin"
 
 
 def golden_entry(number: int) -> str:
-    """Where a golden frame lies: raw RGBA bytes."""
+    """Return the entry of a golden frame, raw RGBA bytes."""
     return f"golden/{number}.rgba"
 
 
 def write_package(package: AvatarPackage, path: Path) -> int:
-    """Writes the package under a temporary name, flushes it to the disk and renames it.
+    """Write a package under a temporary name, flush it to the disk and rename it.
 
     Returns:
         Its size in bytes.
 
     Raises:
-        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+        OSError: If the disk is full or the folder not writable; nothing is left behind.
     """
     with PackageWriter(path) as draft:
         draft.add_tables(package.tables["hq"])
@@ -80,25 +86,25 @@ def write_package(package: AvatarPackage, path: Path) -> int:
 
 @final
 class PackageWriter:
-    """A package under a temporary name, which it loses unless it is finished.
+    """Writes a package under a temporary name, and removes it unless it is finished.
 
-    The tables can go in, and be compressed, while what is drawn of them is still being checked.
+    Tables can be added and compressed while the player that draws them is still being checked.
     """
 
     def __init__(self, path: Path) -> None:
-        """Nothing is opened yet.
+        """Open nothing yet.
 
         Args:
-            path: Where the package will stand; an older one is replaced when this one is finished.
+            path: Name of the finished package; replaces an older one.
         """
         self._path = path
         self._sums: dict[str, str] = {}
 
     def __enter__(self) -> "PackageWriter":
-        """Opens the temporary file.
+        """Open the temporary file.
 
         Raises:
-            OSError: If the folder cannot be written.
+            OSError: If the folder is not writable.
         """
         self._draft = AtomicFile(self._path)
         self._file = self._draft.temporary_path.open("wb")
@@ -106,15 +112,15 @@ class PackageWriter:
         return self
 
     def add_tables(self, tables: PlayerTables) -> None:
-        """Adds what all tiers draw."""
+        """Add the streams of all tiers' tables."""
         for name, stream in encode_tables(tables).items():
             self._add(stream_entry(name), stream)
 
     def finish(self, package: AvatarPackage) -> int:
-        """Adds graphs, golden frames, preview and manifest, and gives the package its name.
+        """Add graphs, golden frames, preview and manifest, and rename the package.
 
         Args:
-            package: Its tables are in already.
+            package: Its tables have been added.
 
         Returns:
             Its size in bytes.
@@ -133,7 +139,7 @@ class PackageWriter:
         return size
 
     def __exit__(self, *_: object) -> None:
-        """Removes what was not finished."""
+        """Remove an unfinished package."""
         with suppress(OSError, ValueError):  # a full disk fails again when the rest is flushed
             self._archive.close()
         with suppress(OSError):
@@ -147,14 +153,14 @@ class PackageWriter:
 
 
 def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
-    """Reads a package, checking each entry's size before and its sum after reading.
+    """Read a package; check each entry's size before reading it and its checksum after.
 
     Args:
         path: The `.iavatar` file.
-        tier: The one that is wanted; all if None.
+        tier: Tier to read; None for all.
 
     Raises:
-        InputError: If the file is missing, truncated, altered, or no package, or has no such tier.
+        InputError: If the file is missing, truncated, altered or not a package, or lacks the tier.
     """
     try:
         if path.exists() and not path.is_file():  # a folder; a pipe would never end
@@ -170,7 +176,8 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
         raise InputError(f"There is no package {path}. Make one with ia-ingest.") from None
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as error:
         raise InputError(
-            f"{path} is no package, or truncated or altered ({error}). Copy or export it again."
+            f"{path} is not a package, or is truncated or altered ({error}). Copy or export it "
+            "again."
         ) from error
 
 
@@ -184,16 +191,16 @@ def _not_a_file_message(path: Path) -> str:
 
 @final
 class _BoundedFile:
-    """A file of which no more than so many bytes are read at a time."""
+    """A file of which one read returns at most `max_read_bytes`; None for no limit."""
 
-    def __init__(self, file: BinaryIO, most: int | None) -> None:
-        self._file, self.max_read_bytes = file, most
+    def __init__(self, file: BinaryIO, max_read_bytes: int | None) -> None:
+        self._file, self.max_read_bytes = file, max_read_bytes
 
     def read(self, size: int = -1) -> bytes:
-        """As of a file.
+        """Read as a file does.
 
         Raises:
-            zipfile.BadZipFile: If more is asked for.
+            zipfile.BadZipFile: If more bytes than the limit are there to be returned.
         """
         if self.max_read_bytes is not None and not 0 <= size <= self.max_read_bytes:
             content = self._file.read(self.max_read_bytes + 1)
@@ -207,7 +214,7 @@ class _BoundedFile:
 
 
 class _UntrustedArchive:
-    """A zip that is not trusted."""
+    """A zip whose entries are checked before they are read."""
 
     def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
         infos = archive.infolist()
@@ -231,7 +238,7 @@ class _UntrustedArchive:
         self._sizes = {info.filename: info.file_size for info in infos}
 
     def read(self, name: str, *, max_bytes: int, exact_bytes: int | None = None) -> bytes:
-        """One entry; its size is known to be right before a byte of it is unpacked."""
+        """Read one entry whose stated size is within bounds."""
         size = self._sizes.get(name)
         if size is None:
             raise InputError(f"{self.path} is incomplete: {name} is missing. Export it again.")

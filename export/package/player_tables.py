@@ -1,4 +1,4 @@
-"""What a bake leaves: surface surfels, sparse bricks and a skin, as the small integers stored."""
+"""The player's tables as stored integers: surfels, sparse bricks and a skinning grid."""
 
 from dataclasses import dataclass
 
@@ -6,32 +6,36 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, UInt, UInt8, UInt16
 
 BRICK_SIZE = 8
-"""Voxels along a brick's edge; each brick also holds the first layer of its next neighbours."""
+"""Voxels along a brick's edge that are its own."""
 BRICK_NODES = BRICK_SIZE + 1
+"""Voxels along a brick's edge with the layer it shares with its next neighbor."""
 LOG_DENSITY_RANGE = (float(np.log(0.5)), float(np.log(3000.0)))
 """Range of the 8-bit log-density, density in 1/m; code 0 means empty."""
 WEIGHT_SCALE = 65535
 """Code of the skinning weight 1."""
 THICKNESS_STEP_M = 0.0005
-COLOR_CODE_STEP, DENSITY_CODE_STEP = 8, 16
-"""Voxels' codes are rounded to multiples of these: nobody sees it, and bytes halve. A step of
-density is 54 %."""
+"""Thickness of code 1, metres."""
+COLOR_CODE_STEP = 8
+"""Multiple to which color codes are rounded: invisible, and bytes halve."""
+DENSITY_CODE_STEP = 16
+"""Multiple to which density codes are rounded: steps of 72 %, invisible, and bytes halve."""
 SURFEL_BITS = 17
-"""A z-buffer key is 14 bits of depth over 17 bits of surfel number."""
+"""Low bits of a z-buffer key, which number the surfel."""
 DEPTH_CODES = 1 << (31 - SURFEL_BITS)
+"""Depths that a z-buffer key distinguishes, in its high 14 bits."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurfelTable:
-    """Points of the surface, just outside of what can be seen, in canonical space.
+    """Points of the proxy surface, just outside the visible density, in canonical space.
 
     Attributes:
         low: Corner of the position codes' cube, metres.
         extent_m: Edge of that cube; position = low + code / 65535 · extent.
-        spacing_m: About how far neighbours lie apart.
+        spacing_m: Distance between neighbors, about, metres.
         position_codes: Sorted along a Morton curve.
         normal_codes: Outward unit normals × 127.
-        thickness_codes: How deep one sees into the surface along the normal, in half millimetres.
+        thickness_codes: Visible depth along the inward normal, in units of `THICKNESS_STEP_M`.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -42,7 +46,7 @@ class SurfelTable:
     thickness_codes: UInt8[np.ndarray, "surfels"]
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of surfels."""
         return len(self.position_codes)
 
     @property
@@ -71,7 +75,7 @@ class BrickTable:
     Attributes:
         low: Corner of the grid, canonical metres.
         voxel_m: Distance between nodes.
-        index: Which brick covers each 8×8×8 block of nodes; 0 is the empty one.
+        index: Number of the brick that covers each 8×8×8 block of nodes; 0 is the empty one.
         voxels: RGB and log-density codes of each brick's 9×9×9 nodes.
     """
 
@@ -83,15 +87,15 @@ class BrickTable:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinningGrid:
-    """Skinning weights on the nodes of a grid, stored only where something can be seen.
+    """Skinning weights on the nodes of a grid, stored only about visible density.
 
     Node (i, j, k) lies at `low + step_m · (i, j, k)`; between nodes weights are trilinear.
 
     Attributes:
         low: Corner of the grid, canonical metres.
         step_m: Distance between nodes along x, y, z.
-        index: Which column of the codes belongs to each node, numbered in C order; 0 for none.
-        weight_codes: Weights × `WEIGHT_SCALE`. Column 0 is the root's alone.
+        index: Column of the codes for each node, numbered in C order; 0 for none.
+        weight_codes: Weights × `WEIGHT_SCALE`. Column 0 is the root alone.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -110,11 +114,11 @@ class PlayerTables:
     """Everything that a tier of the player draws.
 
     Attributes:
-        surfels: The surface.
-        bricks: What is inside.
-        skin: What moves it.
-        pelvis: Rest pelvis in canonical space, metres: the middle of the depth window.
-        reach_m: No surfel gets farther from the pelvis than this in any pose.
+        surfels: The proxy surface.
+        bricks: Color and density under it.
+        skinning: Weights that move both.
+        pelvis: Rest pelvis in canonical space, metres: the middle of the z-buffer's depth range.
+        reach_m: Largest distance of a surfel from the pelvis in any pose, metres.
     """
 
     surfels: SurfelTable
@@ -125,7 +129,7 @@ class PlayerTables:
 
 
 def encode_density(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
-    """8-bit log-density; densities below the range become 0, which is empty."""
+    """Quantize densities in 1/m logarithmically; those below the range become 0, which is empty."""
     low, high = LOG_DENSITY_RANGE
     logs = np.log(np.maximum(density, 1e-9))
     return np.clip(np.round((logs - low) / (high - low) * 255.0), 0, 255).astype(np.uint8)
@@ -134,7 +138,7 @@ def encode_density(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*
 def round_codes(
     codes: UInt[np.ndarray, "*batch"], step: int, largest: int
 ) -> UInt[np.ndarray, "*batch"]:
-    """The next multiples of a step that are not above the largest code."""
+    """Round to multiples of a step, at most the last one up to the largest code."""
     most = largest // step
     return (np.minimum((codes.astype(np.uint32) + step // 2) // step, most) * step).astype(
         codes.dtype

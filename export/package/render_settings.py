@@ -82,7 +82,7 @@ class RenderSettings:
     same_sheet_ratio: float = 1.25
     """Factor of the posed distance in that test."""
     min_facing_cosine: float = 0.2
-    """Least cosine with which a surfel of a further layer faces the camera."""
+    """Least cosine between view and normal for surfels of a further layer."""
     layer_min_transmittance: float = 0.02
     """Least transmittance for which a further layer is drawn."""
 

@@ -1,4 +1,4 @@
-"""Tables to compact streams and back, without loss: what neighbours predict deflates well."""
+"""Lossless coding of tables as byte streams that deflate well: differences between neighbors."""
 
 from dataclasses import dataclass
 
@@ -18,25 +18,26 @@ from export.package.player_tables import (
 )
 
 MAX_BRICKS = 1 << 16
+"""Largest number of bricks that is read; a person of 2 m at 4 mm has 5,000."""
 MAX_BLOCKS = 1 << 20
+"""Largest number of cells of a grid's index that is read."""
 MAX_SKIN_NODES = 1 << 17
-"""Larger tables are refused before anything is allocated; a 2-m person at 4 mm has 5,000 bricks
-and 15,000 nodes."""
+"""Largest number of stored skinning nodes that is read; a person of 2 m has 15,000."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableLayout:
-    """What the streams do not hold themselves: sizes and scales. Lengths in metres.
+    """Sizes and scales of the streams. Lengths in metres.
 
     Attributes:
-        surfels: How many there are.
-        surfel_low, surfel_extent_m, surfel_spacing_m: As in `Surfels`.
-        bricks: How many there are, without the empty one.
+        surfels: Number of surfels.
+        surfel_low, surfel_extent_m, surfel_spacing_m: As in `SurfelTable`.
+        bricks: Number of bricks without the empty one.
         brick_counts: Blocks of the grid along x, y, z.
         brick_low, voxel_m: As in `BrickTable`.
-        skin_nodes: How many nodes of the skin are stored.
-        skin_counts: Nodes of its grid along x, y, z.
-        skin_low, skin_step_m: As in `Skin`.
+        skin_nodes: Number of stored nodes of the skinning grid.
+        skin_counts: Nodes of that grid along x, y, z.
+        skin_low, skin_step_m: As in `SkinningGrid`.
         pelvis, reach_m: As in `PlayerTables`.
     """
 
@@ -57,7 +58,7 @@ class TableLayout:
 
     @classmethod
     def of(cls, tables: PlayerTables) -> "TableLayout":
-        """The layout of some tables."""
+        """Describe tables."""
         surfels, bricks, skin = tables.surfels, tables.bricks, tables.skinning
         x, y, z = bricks.index.shape
         i, j, k = skin.index.shape
@@ -79,7 +80,11 @@ class TableLayout:
         )
 
     def check(self) -> None:
-        """Raises InputError if a table would be larger than the player can use."""
+        """Refuse tables larger than the player can use, before anything is allocated.
+
+        Raises:
+            InputError: If a size is out of bounds.
+        """
         sound = (
             0 < self.surfels < 1 << SURFEL_BITS
             and 0 <= self.bricks <= MAX_BRICKS
@@ -92,11 +97,11 @@ class TableLayout:
                 f"The package claims {self.surfels} surfels, {self.bricks} bricks on "
                 f"{self.brick_counts} blocks and {self.skin_nodes} nodes of "
                 f"{self.skin_counts}; at most {1 << SURFEL_BITS}, {MAX_BRICKS}, {MAX_BLOCKS}, "
-                f"{MAX_SKIN_NODES} and {MAX_BLOCKS} can be. The file is damaged or no avatar."
+                f"{MAX_SKIN_NODES} and {MAX_BLOCKS} are possible. The file is damaged."
             )
 
     def stream_types(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Element type and shape of every stream."""
+        """Return element type and shape of every stream."""
         x, y, z = self.brick_counts
         i, j, k = self.skin_counts
         return {
@@ -121,7 +126,7 @@ def _triple(vector: Shaped[np.ndarray, "3"]) -> tuple[float, float, float]:
 
 
 def encode_tables(tables: PlayerTables) -> dict[str, bytes]:
-    """The streams, ready to be deflated; `TableLayout.of(tables).streams()` says how to read them."""
+    """Encode tables as streams; `TableLayout.of(tables)` has their types and shapes."""
     surfels, bricks = tables.surfels, tables.bricks
     core = _decorrelate_colors(
         np.moveaxis(bricks.voxels[1:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE], -1, 0)
@@ -140,10 +145,10 @@ def encode_tables(tables: PlayerTables) -> dict[str, bytes]:
 
 
 def decode_tables(streams: dict[str, bytes], layout: TableLayout) -> PlayerTables:
-    """The inverse of `encode`. Sizes were checked where the streams were read.
+    """Decode the streams of `encode_tables`, whose sizes are already checked.
 
     Raises:
-        InputError: If the blocks do not count as many bricks as there are, or the nodes as weights.
+        InputError: If blocks and bricks, or nodes and weights, differ in number.
     """
     arrays = {
         name: np.frombuffer(streams[name], dtype=dtype).reshape(shape)
@@ -168,7 +173,7 @@ def decode_tables(streams: dict[str, bytes], layout: TableLayout) -> PlayerTable
 def _delta_encode(
     codes: Shaped[np.ndarray, "*shape"], *, axes: tuple[int, ...]
 ) -> Shaped[np.ndarray, "*shape"]:
-    """Each code minus the one before it along each of the axes, modulo its own type."""
+    """Subtract from each code the one before it along each axis in turn, modulo its type."""
     for axis in axes:
         first = np.take(codes, [0], axis=axis)
         codes = np.concatenate([first, np.diff(codes, axis=axis)], axis=axis)
@@ -178,18 +183,18 @@ def _delta_encode(
 def _delta_decode(
     codes: Shaped[np.ndarray, "*shape"], *, axes: tuple[int, ...]
 ) -> Shaped[np.ndarray, "*shape"]:
-    """The inverse of `_delta_encode`."""
+    """Invert `_delta_encode`."""
     for axis in axes:
         codes = np.cumsum(codes, axis=axis, dtype=codes.dtype)
     return codes
 
 
 EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
-"""Every second byte of eight."""
+"""Mask of every second byte of eight."""
 
 
 def cumsum_cubes(codes: UInt8[np.ndarray, "*cubes 8 8 8"]) -> UInt8[np.ndarray, "*cubes 8 8 8"]:
-    """`_sums` along the last three axes, with eight bytes to a word: a sixth of the time.
+    """Sum cumulatively along the last three axes, eight bytes to a word: a sixth of numpy's time.
 
     Along a word, bytes are summed in two sets of 16-bit lanes by one multiplication each (a lane's
     four bytes cannot overflow it); across words they are added lane by lane.
@@ -208,13 +213,13 @@ def cumsum_cubes(codes: UInt8[np.ndarray, "*cubes 8 8 8"]) -> UInt8[np.ndarray, 
 
 
 def _decorrelate_colors(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
-    """Red and blue minus green, modulo 256: what is bright in one channel is so in the others."""
+    """Subtract green from red and blue, modulo 256, as the channels correlate."""
     red, green, blue, density = voxels
     return np.stack([red - green, green, blue - green, density])
 
 
 def _recorrelate_colors(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
-    """The inverse of `_decorrelate_colors`."""
+    """Invert `_decorrelate_colors`."""
     red, green, blue, density = voxels
     return np.stack([red + green, green, blue + green, density])
 
@@ -234,15 +239,20 @@ def _decode_bricks(
 def add_border_voxels(
     index: Int32[np.ndarray, "bx by bz"], own_voxels: UInt8[np.ndarray, "bricks 8 8 8 4"]
 ) -> UInt8[np.ndarray, "bricks 9 9 9 4"]:
-    """Bricks' own voxels (the empty one first), and after them the first layers of neighbours."""
+    """Append to each brick's own voxels the first layers of its next neighbors.
+
+    Args:
+        index: Number of the brick that covers each block; 0 is the empty one.
+        own_voxels: Own voxels of each brick, the empty one first.
+    """
     whole = np.zeros((len(own_voxels), BRICK_NODES, BRICK_NODES, BRICK_NODES, 4), dtype=np.uint8)
     padded = np.pad(index, [(0, 1)] * 3)
     place = np.argwhere(index > 0)
-    for step in np.ndindex(2, 2, 2):  # the core itself, then the first layers of its neighbours
-        neighbour = padded[tuple((place + step).T)]
+    for step in np.ndindex(2, 2, 2):  # the brick itself, then its next neighbors
+        neighbor = padded[tuple((place + step).T)]
         target = tuple(slice(BRICK_SIZE, BRICK_NODES) if s else slice(0, BRICK_SIZE) for s in step)
         source = tuple(slice(0, 1) if s else slice(0, BRICK_SIZE) for s in step)
-        whole[(slice(1, None), *target)] = own_voxels[neighbour][(slice(None), *source)]
+        whole[(slice(1, None), *target)] = own_voxels[neighbor][(slice(None), *source)]
     return whole
 
 
@@ -263,7 +273,7 @@ def _decode_skinning(
 def _number_set_bits(
     bits: UInt8[np.ndarray, "bytes"], counts: tuple[int, int, int], expected: int
 ) -> Int32[np.ndarray, "x y z"]:
-    """Which places are used, numbered from 1 in C order; 0 for the others."""
+    """Number the set bits from 1 in C order; 0 for the others."""
     used = np.unpackbits(bits)[: int(np.prod(counts))].astype(np.int32)
     if used.sum() != expected:
         raise InputError(

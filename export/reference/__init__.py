@@ -1,1 +1,1 @@
-"""The player written plainly: what the ONNX graph must agree with."""
+"""The player in numpy: the reference of the ONNX graph."""

@@ -328,9 +328,9 @@ def _fill_holes(
     here = slice(side, -side)
     across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
     along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
-    neighbours, keys = np.minimum(across, along), keys[here, here]
+    neighbors, keys = np.minimum(across, along), keys[here, here]
     steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
-    return np.where(keys - (steps << SURFEL_BITS) > neighbours, neighbours, keys)
+    return np.where(keys - (steps << SURFEL_BITS) > neighbors, neighbors, keys)
 
 
 def _ray_entries(

@@ -1,4 +1,4 @@
-"""An avatar and a motion as the files of a page: the package's graph, unpacked tables, no CDN."""
+"""The files of a page that plays an avatar: the package's graph, expanded tables, no CDN."""
 
 import hashlib
 import json
@@ -18,20 +18,22 @@ from export.web.onnxruntime_web import SCRIPT_FILE, WASM_FILE, runtime_files
 from preprocess.body.body_pose import BodyPose
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
+"""Suffixes of the page's own files."""
 PAGE_SCRIPT = "ort.js"
-"""Hosts such as nginx serve .mjs as a stream of bytes, which browsers do not run as a script."""
+"""Name of onnxruntime's script on the page: hosts such as nginx serve .mjs as
+application/octet-stream, which browsers do not run."""
 PAGE_DTYPES = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
 """Element types that the page reads (arrays.js)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StartView:
-    """Where the page's camera stands at first; it follows the pelvis.
+    """The page's first camera; it follows the pelvis.
 
     Attributes:
-        axes: Rows: the picture's right, down and forward in the world.
-        height_m: Of the person standing.
-        middle_m: How far the person's middle is above the pelvis.
+        axes: The picture's right, down and forward in the world, as rows.
+        height_m: Height of the standing person, metres.
+        middle_m: Height of the person's middle above the pelvis, metres.
     """
 
     axes: Float[np.ndarray, "3 3"]
@@ -46,7 +48,7 @@ class PageMotion:
     Attributes:
         poses: Root rotation, root translation and 23 joint rotations, one row a pose.
         fps: Poses a second.
-        look: At the first pose, from the front.
+        start_view: View of the first pose from the front.
     """
 
     poses: Float32[np.ndarray, "poses 75"]
@@ -55,7 +57,7 @@ class PageMotion:
 
 
 def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
-    """A pose as the page takes it."""
+    """Return a pose in the page's order: root rotation, root translation, joint rotations."""
     parts = (pose.root_rotation, pose.root_translation, pose.joint_rotations.ravel())
     return np.concatenate(parts).astype(np.float32)
 
@@ -63,16 +65,16 @@ def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
 def build_page(
     path: Path, clip: PageMotion, *, name: str, compression_level: int = 6
 ) -> dict[str, bytes]:
-    """All files of the page by their relative paths; index.html is the one to open.
+    """Build all files of the page by relative path; index.html is the one to open.
 
     Args:
-        path: The `.iavatar` package; every tier of it goes in.
-        clip: What it plays.
-        name: Of the avatar, for people.
-        level: How hard arrays are deflated: 1 on the way to one's own browser, 6 for a host.
+        path: The `.iavatar` package; the page has all its tiers.
+        clip: Motion to play.
+        name: Title of the avatar.
+        compression_level: Of zlib: 1 for a local browser, 6 for a host.
 
     Raises:
-        InputError: If the package is not sound, or onnxruntime-web is not there.
+        InputError: If the package is not sound, or onnxruntime-web is missing.
     """
     runtime = runtime_files()
     draft = _ArrayFiles(compression_level)
@@ -110,7 +112,7 @@ def build_page(
 
 
 def static_page_files() -> dict[str, bytes]:
-    """The page itself, the same for every avatar."""
+    """Read the page's own files, the same for every avatar."""
     folder = resources.files("export.web").joinpath("page")
     files = [file for file in folder.iterdir() if file.name.endswith(PAGE_SUFFIXES)]
     return {file.name: file.read_bytes() for file in sorted(files, key=lambda file: file.name)}
@@ -118,14 +120,14 @@ def static_page_files() -> dict[str, bytes]:
 
 @final
 class _ArrayFiles:
-    """Files that name themselves after their content: what two tiers share is stored once."""
+    """Files named by a hash of their content, so that what tiers share is stored once."""
 
     def __init__(self, level: int) -> None:
         self.files: dict[str, bytes] = {}
         self._level = level
 
     def array(self, array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
-        """Stores an array; returns what the page must know to read it."""
+        """Store an array; return the entry by which the page reads it."""
         assert array.dtype.name in PAGE_DTYPES
         plain = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
         planes = plain.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from apps import export
-from export.player import Player, verify_package
+from export.package.package_file import read_package
+from export.player import Player, compare_golden_frames
 from preprocess.poses.pose_file import read_motion
 
 
@@ -25,7 +26,8 @@ def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_pa
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     code, said = call_export(run, "--out", tmp_path / "now.iavatar")
     assert code == 0, said.err
-    assert all(likeness.matches for likeness in verify_package(tmp_path / "now.iavatar"))
+    frames = compare_golden_frames(read_package(tmp_path / "now.iavatar"))
+    assert all(frame.matches for frame in frames)
     golden = Player.load(tmp_path / "now.iavatar").manifest.golden[0]
     shown = Player.load(tmp_path / "now.iavatar").render(golden.pose, golden.camera)
     assert 0.03 < (shown[..., 3] > 127).mean() < 0.5

@@ -67,8 +67,8 @@ class StandIn:
         best_rgb, best = np.zeros((len(points), 3)), np.zeros(len(points))
         if len(points) == 0:
             return best_rgb, best
-        for neighbour in tree.query(points, k=9)[1][:, ::4].T:
-            guess = self.rig.seeds[neighbour].astype(np.float64)
+        for neighbor in tree.query(points, k=9)[1][:, ::4].T:
+            guess = self.rig.seeds[neighbor].astype(np.float64)
             for _ in range(10):
                 blended = _blended(self.rig, guess, bones)
                 offset = (points - blended[:, :, 3])[..., None]

@@ -15,7 +15,7 @@ from export.package.graph_tables import subdivided_skinning_nodes
 from export.package.package_file import read_package
 from export.package.render_settings import RenderSettings
 from export.picture_difference import PictureDifference, premultiply
-from export.player import Player, verify_package
+from export.player import Player, compare_golden_frames
 from export.reference.compositor import VoxelCodes, composite_segments
 from export.reference.ray_segments import RaySegments
 from export.reference.reference_player import PlayerInputs, draw_reference
@@ -35,7 +35,7 @@ def on_white(picture):
 @pytest.mark.parametrize("tier", ["hq", "lite"])
 @pytest.mark.parametrize("posed", ["canonical", "bent"])
 @pytest.mark.parametrize(("size", "distance_m"), [((96, 120), 3.0), ((131, 77), 1.2)])
-def test_the_graph_draws_what_its_twin_draws(
+def test_the_graph_draws_what_the_reference_draws(
     exported, tables, stand_in, bent, camera, tier, posed, size, distance_m
 ):
     player = Player.load(exported.path, tier=tier)
@@ -56,9 +56,7 @@ def test_the_graph_draws_what_its_twin_draws(
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
-def test_folded_surfels_stand_behind_their_neighbours_in_graph_and_twin(
-    exported, tables, camera, tier
-):
+def test_folded_surfels_stand_behind_their_neighbors(exported, tables, camera, tier):
     """A shoulder from near by, with the arm turned by two radians about its axis."""
     rotations = np.zeros((23, 3))
     rotations[15], rotations[16] = [2.0, 0, 0.4], [-2.0, 0, -0.4]
@@ -81,7 +79,7 @@ def test_folded_surfels_stand_behind_their_neighbours_in_graph_and_twin(
 
 @pytest.mark.parametrize("other_sheet_gap_m", [0.01, -0.015])
 @pytest.mark.parametrize("layers", [1, 2, 3, 4])
-def test_any_number_of_layers_is_drawn_as_the_twin_draws_it(
+def test_any_number_of_layers_is_drawn_as_in_the_reference(
     exported, tables, stand_in, bent, camera, layers, other_sheet_gap_m
 ):
     package = read_package(exported.path)
@@ -148,7 +146,7 @@ def test_moving_person_and_camera_together_changes_nothing(player, stand_in, ben
     assert PictureDifference.of(premultiply(a), premultiply(b)).close_fraction > 0.995
 
 
-def test_shifting_the_centre_by_whole_pixels_shifts_the_picture(player, bent, camera):
+def test_shifting_the_center_by_whole_pixels_shifts_the_picture(player, bent, camera):
     view = camera(90, 90)
     x, y = view.center_px
     shifted = player.render(bent, replace(view, center_px=(x + 6.0, y - 4.0)))
@@ -173,7 +171,7 @@ def test_a_close_up_has_no_holes(player, stand_in, camera):
 
 
 @pytest.mark.parametrize("zoom", [3.0, 10.0, 24.0])
-def test_one_does_not_see_between_surfels_however_close(player, stand_in, camera, zoom):
+def test_close_ups_have_no_gaps_between_surfels(player, stand_in, camera, zoom):
     view = camera(160, 160, distance_m=0.75)
     (fx, fy), (x, y) = view.focal_px, view.center_px
     close = replace(  # about the same pixel of the chest
@@ -191,7 +189,7 @@ def test_more_samples_converge(player, bent, camera):
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_what_cannot_be_drawn_is_said(player, bent, camera):
+def test_inputs_that_cannot_be_drawn_are_refused(player, bent, camera):
     with pytest.raises(InputError, match="distortion"):
         player.render(bent, replace(camera(9, 9), distortion=(0.1,)))
     with pytest.raises(InputError, match="samples"):
@@ -203,9 +201,9 @@ def test_what_cannot_be_drawn_is_said(player, bent, camera):
     [
         ({"focal_px": (np.nan, 100.0)}, None, "focal"),
         ({"focal_px": (0.0, 0.0)}, None, "above 0"),
-        ({"center_px": (4.0, np.inf)}, None, "centre"),
+        ({"center_px": (4.0, np.inf)}, None, "center"),
         ({"camera_from_world": np.full((4, 4), np.nan)}, None, "camera_from_world holds NaN"),
-        ({}, 0, "size 0"),
+        ({}, 0, "size is 0"),
         ({}, (5, -3), "size"),
     ],
 )
@@ -245,13 +243,13 @@ def test_sizes_may_be_numpys_integers(player, bent, camera):
 
 
 def test_a_proof_looks_at_every_entry(exported, tmp_path):
-    """A graph of the other tier that was lost is noticed, though golden frames do not show it."""
+    """A lost graph of the other tier is noticed, though golden frames do not show it."""
     path = tmp_path / "x.iavatar"
     with zipfile.ZipFile(exported.path) as whole, zipfile.ZipFile(path, "w") as part:
         for name in set(whole.namelist()) - {"lite/player.onnx"}:
             part.writestr(name, whole.read(name))
     with pytest.raises(InputError, match=r"lite/player\.onnx is missing"):
-        verify_package(path)
+        read_package(path, tier=None)
 
 
 def test_tetrahedra_reproduce_linear_colors_and_constant_density(tables):
@@ -289,7 +287,7 @@ def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):
-    differences = verify_package(exported.path)
+    differences = compare_golden_frames(read_package(exported.path))
     assert len(differences) == 2
     assert all(difference.matches for difference in differences)
 

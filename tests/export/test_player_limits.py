@@ -19,7 +19,7 @@ def close_ups(exported, player, tables):
 
 
 def nearer(view, times):
-    """The same pixel of the chest in the middle, so many times as large."""
+    """Enlarge the picture about the same pixel of the chest."""
     (fx, fy), (x, y) = view.focal_px, view.center_px
     return replace(
         view, focal_px=(fx * times, fy * times), center_px=(x, 45.0 + (y - 45.0) * times)
@@ -61,13 +61,13 @@ def test_a_coarser_picture_enlarged_shows_what_the_finer_one_shows(player, stand
 
 
 def test_enlarging_keeps_ramps_where_they_are():
-    """Pixel centres of the coarse picture lie at (i + 0.5) · times of the fine one."""
+    """Pixel centers of the coarse picture lie at (i + 0.5) · times of the fine one."""
     times, (width, height) = 2.5, (50, 20)
     ramp = np.full((8, 20, 4), 255, dtype=np.uint8)
     ramp[..., 0] = 5 + 10 * np.arange(20)
     fine = upscale_picture(ramp, (width, height), times)
     expected = 5 + 10 * ((np.arange(width) + 0.5) / times - 0.5)
-    inside = slice(2, -2)  # beyond the outer pixels' centres there is nothing to go on with
+    inside = slice(2, -2)  # outside the outer pixels' centers there is nothing to interpolate
     assert fine.shape == (height, width, 4)
     assert np.abs(fine[:, inside, 0] - expected[inside]).max() <= 0.5
     assert (fine[..., 1:] == 255).all()

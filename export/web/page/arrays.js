@@ -5,7 +5,7 @@ const KINDS = {
   uint8: Uint8Array, int8: Int8Array,
 };
 
-/** One array. entry: {file, dtype, shape}. `arrived` hears how many packed bytes came. */
+/** Load one array. entry: {file, dtype, shape}; arrived: called with the number of packed bytes. */
 export async function load(entry, arrived = () => {}) {
   const answer = await fetched(entry.file);
   const counted = new TransformStream({
@@ -13,7 +13,7 @@ export async function load(entry, arrived = () => {}) {
   });
   const unpacked = answer.body.pipeThrough(counted).pipeThrough(new DecompressionStream("deflate"));
   const planes = new Uint8Array(await new Response(unpacked).arrayBuffer().catch(() => {
-    throw new Error(`${entry.file} came damaged or in part. Load the page again; if that changes nothing, write its folder anew.`);
+    throw new Error(`${entry.file} arrived damaged or incomplete. Load the page again; if that changes nothing, write its folder again.`);
   }));
   const Kind = KINDS[entry.dtype];
   const count = entry.shape.reduce((product, size) => product * size, 1);
@@ -23,7 +23,7 @@ export async function load(entry, arrived = () => {}) {
   return new Kind(interleaved(planes, Kind.BYTES_PER_ELEMENT).buffer);
 }
 
-/** A file beside the page. */
+/** Fetch a file of the page. */
 export async function fetched(file) {
   const gone = () => { throw new Error(`${file} could not be loaded: the server does not answer. Is it still running?`); };
   const answer = await fetch(new URL(file, import.meta.url)).catch(gone);
@@ -31,7 +31,7 @@ export async function fetched(file) {
   return answer;
 }
 
-/** First bytes of all elements, then all second ones, … back to elements. */
+/** Interleave byte planes (first bytes of all elements, then all second ones, …) to elements. */
 function interleaved(planes, width) {
   if (width === 1) return planes;
   const count = planes.length / width;

@@ -1,4 +1,4 @@
-// Draws: asks a worker, which runs the package's ONNX graph on the CPU.
+// Draws pictures in a worker, which runs the package's ONNX graph on the CPU.
 
 export class Engine {
   /** onProgress: called with {arrived: bytes} and {preparing: true} while a tier is being opened. */
@@ -24,7 +24,7 @@ export class Engine {
     await this.ask("open", { tier, note: this.avatar.tiers[tier], runtime: this.avatar.runtime });
   }
 
-  /** Straight-alpha RGBA of width × height, and the milliseconds it took. */
+  /** Draw straight-alpha RGBA of width × height: {rgba, ms}. */
   async draw(tier, shot) {
     const samples = shot.samples ?? this.avatar.tiers[tier].settings.samples;
     const { rgba, ms } = await this.ask("draw", { tier, ...shot, samples });

@@ -1,17 +1,17 @@
-// A camera that goes round the avatar and follows its pelvis.
+// A camera that orbits the avatar and follows its pelvis.
 
 import { moved, product, rigid } from "./kinematics.js";
 
-const SHARE = 0.8; // of the picture's height, how much the standing person takes
-const AWAY = 3.5; // how far the camera stands, in heights of the person
-const WIDEST = 1.3; // a narrow picture is treated as if it were this much wider than it is
-const MARGIN_M = 0.35; // nothing of the avatar is farther from every joint
+const SHARE = 0.8; // height of the standing person, in picture heights
+const AWAY = 3.5; // distance of the camera, in heights of the person
+const WIDEST = 1.3; // factor by which narrow pictures count as wider
+const MARGIN_M = 0.35; // largest distance of the avatar's surface from the nearest joint
 const NEAREST_M = 0.3;
-const ABOUT_M = 0.25; // a joint's own flesh
+const ABOUT_M = 0.25; // depth about a joint that belongs to it, metres
 const BAR_PX = 76; // the bar's height and the gap below it
-const LIFT = 0.035; // the person's middle is so much of the height above the picture's
+const LIFT = 0.035; // height of the person's middle above the picture's, in picture heights
 
-/** How much of a picture that many CSS pixels high the person takes, and how far up: above the bar. */
+/** Fraction of a picture that the person takes, and its lift above the bar; height in CSS pixels. */
 export function roomIn(height) {
   const bar = BAR_PX / Math.max(1, height);
   const share = Math.max(0.3, Math.min(SHARE, 0.97 - bar));
@@ -55,7 +55,7 @@ export class Orbit {
   }
 
   /**
-   * The camera for a pose: focal length, centre, size, and the rigid 3×4 camera-from-world.
+   * The camera for a pose: focal length, center, size, and the rigid 3×4 camera-from-world.
    * The standing person takes `share` of the height, its middle is `lift` of it above the picture's.
    */
   camera(pose, width, height, { share = SHARE, lift = 0 } = {}) {
@@ -71,7 +71,7 @@ export class Orbit {
   }
 }
 
-/** The same camera for a picture that many times coarser. */
+/** The camera of a picture coarser by a factor. */
 export function coarser({ focal, center, width, height, cameraFromWorld }, times) {
   const [wide, high] = [width, height].map((side) => Math.max(16, Math.ceil(side / times)));
   const [x, y] = [wide / width, high / height];
@@ -81,7 +81,7 @@ export function coarser({ focal, center, width, height, cameraFromWorld }, times
   };
 }
 
-/** The least depth at which something of the avatar may be in the picture. */
+/** The least depth of the avatar in the picture, metres. */
 export function nearestOf({ focal, center, width, height }, joints) {
   let nearest = Infinity;
   for (const [x, y, z] of joints) {
@@ -94,7 +94,7 @@ export function nearestOf({ focal, center, width, height }, joints) {
   return nearest;
 }
 
-/** The part of a camera's picture in which the avatar can be, from its joints in the camera's frame. */
+/** The part of a picture that may show the avatar, from its joints in the camera's frame. */
 export function windowOf({ focal, center, width, height }, joints) {
   let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
   for (const [x, y, z] of joints) {

@@ -32,7 +32,7 @@ export async function start() {
   playback.run().catch((error) => loading.failed(error.message));
 }
 
-/** What is shown while a tier is being loaded. */
+/** The status shown while a tier is being loaded. */
 class Loading {
   constructor() {
     this.bytes = 0;
@@ -59,7 +59,7 @@ class Loading {
     $("status").hidden = true;
   }
 
-  /** Something that was wished for cannot be; what is shown goes on. */
+  /** Report a failed request; the picture stays. */
   showError(message) {
     this.failed(message);
     setTimeout(() => { $("status").hidden = true; $("status").classList.remove("failed"); }, SAID_MS);
@@ -84,7 +84,7 @@ function tell({ failed, row, ms, rate, playing }, player, loading) {
   return undefined;
 }
 
-/** Radio buttons; chosen hears the value. */
+/** Radio buttons; chosen is called with the value. */
 function choices(fieldset, values, current, chosen, dress = (span, label) => { span.textContent = label; }) {
   const box = fieldset.querySelector(".choices");
   for (const [value, label] of Object.entries(values)) {
@@ -132,8 +132,8 @@ function backgrounds() {
     input.setAttribute("aria-label", name);
   });
   const other = document.createElement("input");
-  Object.assign(other, { type: "color", value: "#203040", title: "Another colour" });
-  other.setAttribute("aria-label", "Another colour");
+  Object.assign(other, { type: "color", value: "#203040", title: "Another color" });
+  other.setAttribute("aria-label", "Another color");
   other.oninput = () => {
     for (const input of box.querySelectorAll("input[type=radio]")) input.checked = false;
     paint(other.value);

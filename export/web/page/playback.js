@@ -1,14 +1,14 @@
-// Draws as fast as it can while something moves, sharply once nothing does, and not at all after.
+// Draws as fast as it can while something moves, then one sharp picture, then nothing.
 
 import { roomIn } from "./orbit.js";
 
 const QUICK_MS = 45; // below this a moving picture may become sharper …
 const SLOW_MS = 75; // … and above this it becomes coarser
 const COARSEST = 270, SHARPEST = 1080; // shorter side, pixels
-const STILL_MS = 180; // so long after the last movement the sharp picture is drawn
+const STILL_MS = 180; // delay of the sharp picture after the last movement
 
 export class Playback {
-  /** state: {tier, sharpness, playing, speed}; onNews: hears of every picture and failure. */
+  /** state: {tier, sharpness, playing, speed}; onNews: called for every picture and failure. */
   constructor(canvas, player, orbit, state, onNews) {
     Object.assign(this, { canvas, player, orbit, state, onNews });
     this.context = canvas.getContext("2d");
@@ -17,7 +17,7 @@ export class Playback {
     new ResizeObserver(() => this.changed()).observe(canvas);
   }
 
-  /** Something else is to be shown now. */
+  /** Request another picture. */
   changed() {
     this.dirty = true; this.sharp = false; this.touched = performance.now();
     this.wake();
@@ -49,7 +49,7 @@ export class Playback {
     }
   }
 
-  /** Waits until something happens; true when it is time for the sharp picture. */
+  /** Wait for a request; true when the sharp picture is due. */
   async settled() {
     if (this.sharp || this.state.sharpness !== "auto") {
       await new Promise((resolve) => { this.wake = resolve; });

@@ -5,12 +5,12 @@ import { Engine } from "./engine.js";
 import { Skeleton, bones, moved } from "./kinematics.js";
 import { Orbit, coarser, nearestOf, windowOf } from "./orbit.js";
 
-const CLOSE = 2; // two pictures are alike where no premultiplied channel differs by more, in 1/255 …
-const ALIKE = 0.999; // … on at least this share of the pixels
+const CLOSE = 2; // largest difference of a premultiplied channel between close pixels, in 1/255
+const ALIKE = 0.999; // least fraction of close pixels in pictures that count as the same
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
 export class Player {
-  /** onProgress: as of Engine. */
+  /** onProgress: see Engine. */
   static async load(onProgress) {
     const avatar = await (await fetched("avatar.json")).json();
     return new Player(avatar, await load(avatar.motion.poses), onProgress);
@@ -33,7 +33,7 @@ export class Player {
     return this.engine.open(tier);
   }
 
-  /** The camera, with fewer pixels where surfels could not cover what is near (export/player_limits.py). */
+  /** The camera, coarser where surfels would leave gaps in a close-up (export/player_limits.py). */
   drawable({ tier }, pose, camera) {
     const { settings, layout } = this.avatar.tiers[tier];
     const seen = this.skeleton.posed(pose).joints.map((joint) => moved(camera.cameraFromWorld, joint));
@@ -43,7 +43,7 @@ export class Player {
     return times > 1 ? coarser(camera, times) : camera;
   }
 
-  /** A pose seen by a camera: {x, y, width, height, rgba, ms}, the part where the avatar is; or null. */
+  /** Draw the part of a picture that shows the avatar: {x, y, width, height, rgba, ms}, or null. */
   async draw({ tier }, pose, camera) {
     const { worldFromCanonical, joints } = this.skeleton.posed(pose);
     const seen = joints.map((joint) => moved(camera.cameraFromWorld, joint));
@@ -59,7 +59,7 @@ export class Player {
     return { ...part, ...drawn };
   }
 
-  /** Draws the package's golden frames again: for each, how far the picture is from the stored one. */
+  /** Draw the package's golden frames again; return the difference of each from the stored one. */
   async verify() {
     await this.open({ tier: "hq" });
     const differences = [];
@@ -77,7 +77,7 @@ export class Player {
     return differences;
   }
 
-  /** Milliseconds of every frame of the motion, whole square pictures from the front. */
+  /** Measure milliseconds of the motion's frames as square pictures from the front. */
   async measure({ tier = "hq", size = 540, frames = 24 } = {}) {
     await this.open({ tier });
     const orbit = new Orbit(this.avatar.look);
@@ -97,7 +97,7 @@ export class Player {
   }
 }
 
-/** How far two straight-alpha pictures are apart, premultiplied, as `ia-play --verify` counts it. */
+/** Compare two straight-alpha pictures, premultiplied, as `ia-play --verify` does. */
 export function pictureDifference(a, b) {
   let largest = 0, close = 0;
   for (let i = 0; i < a.length; i += 4) {

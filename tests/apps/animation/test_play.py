@@ -244,6 +244,15 @@ def test_what_was_wrong_when_a_package_was_written_is_said(package):
     assert "6.9 dB (failed)" in failed
 
 
+@pytest.mark.parametrize("mode", ["--verify", "--bench"])
+def test_warnings_of_the_package_are_printed(call_play, package, tmp_path, mode):
+    sound, path = read_package(package, tier=None), tmp_path / "avatar.iavatar"
+    manifest = replace(sound.manifest, metrics={"warnings": ["It is fog."]})
+    write_package(replace(sound, manifest=manifest), path)
+    more = ["--size", SIZE] if mode == "--bench" else []
+    assert "It is fog." in call_play(path, mode, *more).err
+
+
 def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
     content = bytearray(package.read_bytes())
     content[len(content) // 2] ^= 0xFF

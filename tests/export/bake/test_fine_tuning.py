@@ -143,7 +143,7 @@ def test_what_is_exact_already_stays(tune, renderer, tables):
 
 def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
     def lies(pose, camera):
-        """The truth to whoever judges, who comes first; something else to whoever learns."""
+        """True pictures for the judge, which come first; swapped channels for training."""
         lies.asked += 1
         picture = renderer(pose, camera)
         return picture if lies.asked <= 4 else picture[..., [2, 1, 0, 3]]
@@ -153,7 +153,7 @@ def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
     assert lies.asked == 10
 
 
-def test_progress_is_told_and_only_grows(tune, renderer, spoilt):
+def test_progress_only_grows(tune, renderer, spoilt):
     told = []
     tune(spoilt, renderer, progress=told.append)
     assert told == sorted(told)

@@ -3,18 +3,18 @@ import pytest
 
 from export.bake.bake_kernels import dilate_colors
 from export.bake.field_grid import FieldGrid
+from export.bake.grid_filters import resample_grid
 from export.bake.proxy_surface import (
     OPAQUE_OPTICAL_DEPTH,
     THICKNESS_MARGIN_M,
     extract_proxy_surface,
 )
-from export.mesh.isosurface import resample_grid
 
 VOXEL_M = 0.004
 RADIUS_M = 0.08
 
 
-def ball_lattice(density_of_radius, size=65, extra=None) -> FieldGrid:
+def ball_grid(density_of_radius, size=65, extra=None) -> FieldGrid:
     axis = (np.arange(size) - size // 2) * VOXEL_M
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     density = density_of_radius(np.linalg.norm(points, axis=-1)).astype(np.float32)
@@ -42,8 +42,8 @@ def test_a_ramp_is_read_at_any_step_also_where_the_last_one_is_rounded_to_the_en
     assert ends  # a length over a step that divides it is at times a step too many
 
 
-def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
-    surface = extract_proxy_surface(ball_lattice(soft_ball), level=20.0, spacing_m=0.005)
+def test_the_surface_of_a_ball_is_its_level_set():
+    surface = extract_proxy_surface(ball_grid(soft_ball), level=20.0, spacing_m=0.005)
     radius = np.linalg.norm(surface.positions, axis=1)
     np.testing.assert_allclose(radius, RADIUS_M, atol=6e-4)
     cosine = (surface.positions / radius[:, None] * surface.normals).sum(axis=1)
@@ -55,7 +55,7 @@ def test_the_hull_of_a_ball_is_its_level_set_with_radial_normals():
 
 def test_thickness_is_the_depth_at_which_everything_has_been_seen():
     constant = 200.0
-    grid = ball_lattice(lambda r: np.where(r < RADIUS_M, constant, 0.0))
+    grid = ball_grid(lambda r: np.where(r < RADIUS_M, constant, 0.0))
     surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)
     np.testing.assert_allclose(
         surface.thickness, OPAQUE_OPTICAL_DEPTH / constant + THICKNESS_MARGIN_M, atol=0.006
@@ -63,7 +63,7 @@ def test_thickness_is_the_depth_at_which_everything_has_been_seen():
 
 
 def test_a_hollow_ball_has_no_surfels_inside():
-    grid = ball_lattice(lambda r: np.where((r < RADIUS_M) & (r > 0.04), 300.0, 0.0))
+    grid = ball_grid(lambda r: np.where((r < RADIUS_M) & (r > 0.04), 300.0, 0.0))
     surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)
     assert np.linalg.norm(surface.positions, axis=1).min() > RADIUS_M - 0.006
 
@@ -77,7 +77,7 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
         large = np.linalg.norm(points - part, axis=-1) < 0.035
         return np.where(small | large, 300.0, 0.0)
 
-    grid = ball_lattice(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
+    grid = ball_grid(lambda r: np.where(r < 0.18, 300.0, 0.0), size=113, extra=extra)
 
     def nearest(place):
         surface = extract_proxy_surface(grid, level=20.0, spacing_m=0.005)

@@ -116,7 +116,7 @@ class Read:
         return np.einsum("vab,vb->va", blended[:, :3, :3], points) + blended[:, :3, 3]
 
 
-def test_the_mesh_is_one_closed_body_at_the_hull(mesh, tables):
+def test_the_mesh_is_one_closed_body_at_the_surface(mesh, tables):
     assert is_closed(mesh.faces)
     assert volume(mesh.positions, mesh.faces) > 0.01
     surface = KDTree(tables.surfels.positions)

@@ -20,7 +20,7 @@ def test_stored_weights_are_the_rigs_own(stand_in, skin):
     np.testing.assert_allclose(there, stand_in.rig.weights_at(points), atol=2e-4)
 
 
-def test_the_skin_surrounds_the_hull_as_deep_as_one_sees(tables, skin):
+def test_the_skinning_grid_surrounds_all_visible_depths(tables, skin):
     """All eight corners of the cell about anything that may be seen are stored."""
     surfels = tables.surfels
     for share in (0.0, 0.3, 1.0):

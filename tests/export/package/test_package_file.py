@@ -208,14 +208,12 @@ def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(expor
 @pytest.mark.parametrize(
     ("score", "said"), [(GOOD_PSNR, None), (37.9, "simplifies"), (29.9, "poorly"), (8.0, "poorly")]
 )
-def test_what_is_said_of_a_package(score, said):
+def test_warnings_follow_the_psnr(score, said):
     warnings = quality_warnings(score)
     assert [said in warning for warning in warnings] == ([] if said is None else [True])
 
 
-def test_a_graph_that_differs_from_its_twin_is_refused_and_leaves_nothing(
-    export, tmp_path, monkeypatch
-):
+def test_a_graph_that_differs_from_its_reference_is_refused(export, tmp_path, monkeypatch):
     right = build.build_graph
     monkeypatch.setattr(
         build,
@@ -252,7 +250,7 @@ def test_voxels_follow_the_field_within_bounds():
     assert BakeConfig.for_cell_size(0.1).voxel_m == MAX_VOXEL_M
 
 
-def test_a_hasty_package_is_coarser_and_plays_the_best_quality_alone(export, coarse, views):
+def test_a_quick_package_is_coarser_and_has_one_tier(export, coarse, views):
     report = export(config=coarse.quick())
     package = read_package(report.path)
     assert list(package.manifest.tiers) == list(report.psnr_to_renderer) == ["hq"]

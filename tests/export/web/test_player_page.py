@@ -35,7 +35,7 @@ def clip(bent):
 @pytest.fixture
 def files(exported, clip, kept, monkeypatch):
     monkeypatch.setattr(player_page, "runtime_files", lambda: onnxruntime_web.runtime_files(kept))
-    return player_page.build_page(exported.path, clip, name="somebody")
+    return player_page.build_page(exported.path, clip, name="an avatar")
 
 
 def unpacked(files, entry):
@@ -64,12 +64,14 @@ def test_every_array_comes_back_as_it_was(files, exported, clip):
         assert entry["bytes"] == len(files[entry["file"]])
 
 
-def test_the_page_asks_nobody_else_for_anything(files):
+def test_the_page_loads_nothing_from_other_hosts(files):
     own = {name: text for name, text in files.items() if not name.startswith(("data/", "runtime/"))}
     assert {"index.html", "avatar.json", "graph_worker.js"} <= own.keys()
     for name, content in own.items():
         found = set(re.findall(r"(?:https?:)?//[\w.-]+\.\w+", content.decode()))
-        assert found <= {"http://www.w3.org"}, name  # SVG's name, which nobody fetches
+        assert found <= {"http://www.w3.org"}, (
+            name
+        )  # the XML namespace of SVG, which is not fetched
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', own["index.html"].decode())
     assert "default-src 'none'" in policy.group(1)
     assert "http" not in policy.group(1)
