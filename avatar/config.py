@@ -1,98 +1,108 @@
-"""How an avatar is learnt: the recipe, and what follows from how long the user will wait."""
+"""The training configuration, and how it follows from the time budget and the image size."""
 
 import math
 from dataclasses import dataclass
 
 COARSEST_M = 0.13
-"""Cells of the coarsest hash level: 16 along a two-metre box."""
+"""Cell size of the coarsest hash level, metres: 16 cells along a two-metre box."""
 FULL_DETAIL_FRAMES = 24
-"""So many frames, all round, determine the detail that their pixels show."""
+"""Frames, all round, from which the pixels' full detail can be reconstructed."""
 FEW_FRAMES = 12
-"""Fewer do not tell a pose's error from the body's shape: what they leave open becomes fog, unless
-surfaces are asked to be firm. Asked of twelve frames in exact poses it cost 0.5 dB."""
-MAX_DETAIL_SHORTAGE, MAX_FRAME_SHORTAGE = 4.0, 1.5
-"""Both count no further than to a quarter, and to two thirds."""
-FEW_FRAMES_DOUBLE_WELL_WEIGHT, FEW_FRAMES_INTERIOR_WEIGHT = 1.5, 0.15
-FEW_FRAMES_SLOPE_WEIGHT, FEW_FRAMES_COLOR_TV_WEIGHT, FEW_FRAMES_MIN_DENSITY = 0.15, 0.3, 180.0
+"""Frames below which pose error and body shape cannot be told apart, and the few-frame priors
+apply. With twelve frames in exact poses the priors cost 0.5 dB."""
+MAX_DETAIL_SHORTAGE = 4.0
+"""Largest ratio `FULL_DETAIL_FRAMES / frames` that scales the total variation."""
+MAX_FRAME_SHORTAGE = 1.5
+"""Largest ratio `FEW_FRAMES / frames` that scales the few-frame priors."""
+FEW_FRAMES_DOUBLE_WELL_WEIGHT = 1.5
+"""Few-frame weight of the double well, before the factor `1 - frames / FEW_FRAMES`."""
+FEW_FRAMES_INTERIOR_WEIGHT = 0.15
+"""Few-frame weight of the interior loss, before the same factor."""
+FEW_FRAMES_SLOPE_WEIGHT = 0.15
+"""Few-frame weight of the density slope, before the same factor."""
+FEW_FRAMES_COLOR_TV_WEIGHT = 0.3
+"""Few-frame weight of the color variation, before the same factor."""
+FEW_FRAMES_MIN_DENSITY = 180.0
+"""Few-frame minimum density of an occupied cell, 1/m, before the same factor."""
 FEW_FRAMES_INNER_LEG_WEIGHT = 0.1
-"""Of all six, times the share by which frames are fewer than `FEW_FRAMES`."""
+"""Few-frame weight of the inner-leg loss, before the same factor."""
 MAX_LOG_DENSITY_STEP = 4.0
-"""Logarithm of the density may change by so much along a finest cell, where that is asked."""
+"""Largest unpenalised change of log density across a finest cell."""
 NOMINAL_STEPS_PER_S = 50.0
-"""Training steps that count as one second where steps are counted instead: what two cores make."""
+"""Training steps that stand for one second where steps are counted; two cores make about these."""
 HELD_OUT_STRIDE = 10
-"""Every so manieth frame is held out, unless somebody says otherwise."""
+"""Default stride between held-out frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """The recipe. It stands in report.json as it was used."""
+    """Configuration of a training run; report.json stores it as `recipe`."""
 
     seconds: float = 60.0
-    """Wall time from the first frame to the last step."""
+    """Wall time from the first frame to the last step, seconds."""
     steps: int | None = None
-    """Number of steps that training takes instead, at least one a frame: the same result on any
-    machine. `seconds` is then `steps / NOMINAL_STEPS_PER_S`."""
+    """Number of training steps, at least one a frame; replaces the time budget and gives the same
+    result on any machine. `seconds` is then `steps / NOMINAL_STEPS_PER_S`."""
     rays: int = 1024
     """Rays per step."""
     sample_step_m: float = 0.01
     """Distance between samples along a ray, metres."""
     opaque_margin_m: float = 0.06
-    """How far a ray is followed once its cached optical depth says it is opaque, metres."""
+    """Distance that a ray is marched past the depth at which it is opaque, metres."""
     max_samples: int = 128
-    """Samples a ray may have."""
+    """Largest number of samples on a ray."""
     levels: int = 8
-    """Levels of the hash grid."""
+    """Number of levels of the hash grid."""
     table_size: int = 1 << 17
-    """Entries of a hashed level."""
+    """Number of entries of a hashed level."""
     finest_m: float = 0.008
-    """Cells of the finest level, metres."""
+    """Cell size of the finest level, metres."""
     learning_rate: float = 2.5e-2
-    """Of the table; the network's is 0.3 of it."""
+    """Learning rate of the hash table; the network's is `NETWORK_RATE_FACTOR` times it."""
     alpha_weight: float = 0.1
-    """Of the L1 loss on alpha; 0 turns it off."""
+    """Weight of the L1 loss on alpha; 0 turns it off."""
     hard_surface_weight: float = 0.02
-    """Of the hard-surface loss; 0 turns it off."""
+    """Weight of the hard-surface loss; 0 turns it off."""
     empty_space_weight: float = 1.0
-    """Of the opacity in cells that should be empty; 0 turns the term off."""
+    """Weight of the opacity in unoccupied cells; 0 turns the term off."""
     empty_space_points: int = 256
-    """Points at which that opacity is measured in each step."""
+    """Points per step at which that opacity is penalised."""
     density_tv_weight: float = 0.025
-    """Of the total variation of opacity; 0 turns the term off."""
+    """Weight of the total variation of opacity; 0 turns the term off."""
     initial_density_tv_factor: float = 1.0
-    """So many times that weight at first: it falls to it as the learning rate falls."""
+    """Initial factor of that weight; it falls to 1 with the learning rate."""
     double_well_weight: float = 0.0
-    """Of the double well of opacity, at the end; it grows as the learning rate falls. Where total
-    variation is asked for strongly, it keeps surfaces from becoming fog."""
+    """Final weight of the double well of opacity, which grows as the learning rate falls; it keeps
+    surfaces from turning into fog under a strong total variation."""
     interior_weight: float = 0.0
-    """Of the opacity deep under the body's skin, which must be solid; 0 turns the term off."""
+    """Weight of the loss that makes the body's interior opaque; 0 turns the term off."""
     density_slope_weight: float = 0.0
-    """Of edges steeper than `steepest_per_m`, and of needless density, at the end; it grows as the
-    learning rate falls. What is sharper than the finest cells no picture has shown."""
+    """Final weight of density slopes above `max_log_density_slope_per_m` and of excess density; it
+    grows as the learning rate falls. No image resolves edges sharper than the finest cells."""
     color_tv_weight: float = 0.0
-    """Of the variation of colour between points as close; it grows the same way."""
+    """Final weight of the color variation between close points; it grows in the same way."""
     smoothness_pairs: int = 256
-    """Pairs of close points at which both are measured in each step."""
+    """Pairs of close points per step at which slope and color variation are penalised."""
     min_occupied_density: float = 0.0
-    """Cells less dense than this, in 1/m, count as empty in the end: haze that no surface needs."""
+    """Density below which a cell counts as empty at the end, 1/m; removes haze."""
     inner_leg_weight: float = 0.0
-    """Of log density off the skin between the legs, where no ray may tell; 0 turns it off."""
+    """Weight of log density off the skin between the legs, where rays may not reach; 0: off."""
     inner_leg_points: int = 128
-    """Points at which that is measured in each step."""
+    """Points per step at which that log density is penalised."""
     interior_points: int = 128
-    """Points at which that opacity is measured in each step."""
+    """Points per step at which the interior's opacity is measured."""
     density_tv_pairs: int = 128
-    """Pairs of points at which that variation is measured in each step."""
+    """Pairs of points per step at which the total variation is measured."""
     occupancy_interval: int = 16
-    """Steps between updates of the occupancy."""
+    """Steps between updates of the occupancy grid."""
     refine_poses: bool = True
-    """Whether the frames' poses are corrected while they are learnt from."""
+    """Whether the frames' poses are corrected during training."""
     replay_capacity: int = 200
-    """Frames that stay for replay."""
+    """Frames that the replay buffer holds."""
     held_out_stride: int = HELD_OUT_STRIDE
-    """Every so manieth frame is held out; 0 for none."""
+    """Stride between held-out frames; 0 for none."""
     seed: int = 0
-    """Of everything random."""
+    """Seed of all random numbers."""
 
     def __post_init__(self) -> None:
         """Derives the seconds of the schedule from the steps, where steps are counted."""
@@ -101,11 +111,11 @@ class TrainConfig:
 
     @property
     def max_log_density_slope_per_m(self) -> float:
-        """By how much the logarithm of the density may change along a metre."""
+        """Largest unpenalised slope of the log density, 1/m."""
         return MAX_LOG_DENSITY_STEP / self.finest_m
 
     def density_tv_weight_at(self, surface_share: float) -> float:
-        """The weight of total variation when surfaces have become firm so far, in [0, 1]."""
+        """Weight of the total variation at a progress towards firm surfaces, in [0, 1]."""
         return self.density_tv_weight * self.initial_density_tv_factor ** (1.0 - surface_share)
 
     @classmethod
@@ -119,33 +129,32 @@ class TrainConfig:
         seed: int = 0,
         held_out_stride: int = HELD_OUT_STRIDE,
     ) -> "TrainConfig":
-        """The recipe for a waiting time, or a number of steps, and a picture size.
+        """Derives the configuration from a budget and the size of a pixel on the body.
+
+        Few frames in slightly wrong poses leave the finest detail undetermined, and the noise in it
+        would keep poses from being refined. Below `FULL_DETAIL_FRAMES` detail is therefore coarser
+        and the total variation stronger; below `FEW_FRAMES` the few-frame priors are added.
 
         Args:
-            seconds: How long the user will wait.
+            seconds: Time budget, seconds; 60 if neither budget is given.
             steps: Number of training steps instead of `seconds`.
-            footprint_m: What one pixel covers on the body, metres.
-            frames: How many frames there are, if that is known. Few of them, seen in poses that
-                are a little off, do not determine the finest detail: what they leave open would
-                be noise, in which no pose can be refined. So detail is coarser; surfaces are asked
-                to be smoother. Of fewer than a dozen they are, most of all at first, while poses
-                are found; the body is solid inside; and what poses do not agree upon is no fog in
-                the end, but firm; no edge is sharper than the finest cells; haze and webs between
-                the legs are gone.
-            seed: Of everything random.
-            hold_every: Every so manieth frame is held out.
+            footprint_m: Size of a pixel on the body, metres.
+            frames: Number of frames, if known.
+            seed: Seed of all random numbers.
+            held_out_stride: Stride between held-out frames.
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
-        too_few = 1.0 if frames is None else max(1.0, FULL_DETAIL_FRAMES / max(frames, 1))
-        footprint_m *= too_few**0.5
-        few = min(too_few, MAX_DETAIL_SHORTAGE)
+        detail_shortage = 1.0 if frames is None else max(1.0, FULL_DETAIL_FRAMES / max(frames, 1))
+        footprint_m *= detail_shortage**0.5
+        few = min(detail_shortage, MAX_DETAIL_SHORTAGE)
         scant = 1.0 if frames is None else FEW_FRAMES / max(frames, 1)
         scant = min(max(scant, 1.0), MAX_FRAME_SHORTAGE)
+        missing_share = 1.0 - 1.0 / scant
         finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
-        wanted = 4.0 * 2.0 / finest_m**2
-        size = 1 << min(max(round(math.log2(wanted)), 15), 19 if seconds > 120 else 17)
+        entries = 4.0 * 2.0 / finest_m**2
+        size = 1 << min(max(round(math.log2(entries)), 15), 19 if seconds > 120 else 17)
         return cls(
             seconds=seconds,
             steps=steps,
@@ -154,12 +163,12 @@ class TrainConfig:
             table_size=size,
             density_tv_weight=cls.density_tv_weight * few * scant**3,
             initial_density_tv_factor=scant**3,
-            double_well_weight=FEW_FRAMES_DOUBLE_WELL_WEIGHT * (1.0 - 1.0 / scant),
-            interior_weight=FEW_FRAMES_INTERIOR_WEIGHT * (1.0 - 1.0 / scant),
-            density_slope_weight=FEW_FRAMES_SLOPE_WEIGHT * (1.0 - 1.0 / scant),
-            color_tv_weight=FEW_FRAMES_COLOR_TV_WEIGHT * (1.0 - 1.0 / scant),
-            min_occupied_density=FEW_FRAMES_MIN_DENSITY * (1.0 - 1.0 / scant),
-            inner_leg_weight=FEW_FRAMES_INNER_LEG_WEIGHT * (1.0 - 1.0 / scant),
+            double_well_weight=FEW_FRAMES_DOUBLE_WELL_WEIGHT * missing_share,
+            interior_weight=FEW_FRAMES_INTERIOR_WEIGHT * missing_share,
+            density_slope_weight=FEW_FRAMES_SLOPE_WEIGHT * missing_share,
+            color_tv_weight=FEW_FRAMES_COLOR_TV_WEIGHT * missing_share,
+            min_occupied_density=FEW_FRAMES_MIN_DENSITY * missing_share,
+            inner_leg_weight=FEW_FRAMES_INNER_LEG_WEIGHT * missing_share,
             seed=seed,
             held_out_stride=held_out_stride,
         )

@@ -1,9 +1,9 @@
-"""Samples that a warp cell invents: skinning does not carry them to their ray.
+"""Finds spurious correspondences: canonical samples that skinning does not carry to their ray.
 
-A cell's warp is a root at its centre and how that moves about it. In the folds of armpits and
-elbows the root of a centre ends within its cell, and what the warp says beyond that is no root at
-all: a picture would show pieces of the body in mid-air, and specks. In a whole picture of a bent
-body they are few thousandths of the samples, so that each can be asked where skinning carries it.
+A cell extrapolates its warp from the root at its center. In the folds of armpits and elbows that
+root ends within the cell, and the extrapolation beyond it is no root: an image would show specks
+and floating pieces of the body. In an image of a bent body these are a few thousandths of the
+samples, few enough to skin each of them.
 """
 
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ from avatar.numba_kernels.numba_culling import find_off_ray_points, find_unrelia
 from avatar.numba_kernels.numba_skinning import MATRIX_LANES
 
 MAX_RAY_DISTANCE_M = 0.005
-"""A point that is carried farther than this from its ray is none of it: about a pixel."""
+"""Distance from its ray beyond which a skinned sample is spurious, metres: about a pixel."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorrespondenceCheck:
-    """Finds such samples in one pose.
+    """Finds the spurious samples of one pose.
 
     Attributes:
-        doubtful: Rows of the cells' roots whose warp is wrong in some corner of their cell.
-        transforms: Blended 3×4 matrices on the nodes of the weight volume.
-        low, nodes_per_m: Where these lie.
+        unreliable_rows: Root rows whose warp is wrong in some corner of their cell.
+        transforms: Blended 3×4 matrices at the nodes of the skinning volume.
+        low, nodes_per_m: Corner of that volume, metres, and nodes per metre.
     """
 
     unreliable_rows: Bool[Tensor, "rows"]
@@ -47,33 +47,33 @@ class CorrespondenceCheck:
         cells: CorrespondenceGrid,
         device: torch.device,
     ) -> "CorrespondenceCheck":
-        """Looks at every cell that is not empty.
+        """Checks the corners of every full cell.
 
         Args:
-            rig: Whose body.
-            joint_rotations: The pose that the cells warp.
-            cells: Its warp; what is pruned is not looked at.
-            device: Where samples will be.
+            rig: Rig of the person.
+            joint_rotations: Pose of the cells.
+            cells: Correspondence grid of the pose, culled.
+            device: Device of the samples.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         volume = blended_transform_volume(
             rig, bones.astype(np.float32), CLOTHING_BAND_M + 2.0 * SEARCH_MARGIN_M
         )
-        doubtful = np.zeros(len(cells.roots), dtype=bool)
+        unreliable = np.zeros(len(cells.roots), dtype=bool)
         find_unreliable_roots(
             cells.packed_cells, cells.roots[None], cells.low, np.float32(cells.cell_m), *volume,
-            np.float32(MAX_RAY_DISTANCE_M), doubtful, np.empty(MATRIX_LANES, dtype=np.float32),
+            np.float32(MAX_RAY_DISTANCE_M), unreliable, np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
         transforms, low, nodes_per_m = volume
         return cls(
-            unreliable_rows=torch.from_numpy(doubtful).to(device),
+            unreliable_rows=torch.from_numpy(unreliable).to(device),
             transforms=transforms,
             low=low,
             nodes_per_m=nodes_per_m,
         )
 
-    def find_spurious(self, samples: RaySamples, rays: RayBatch) -> Int64[Tensor, "strays"]:
-        """Numbers of the samples that are not on their rays."""
+    def find_spurious(self, samples: RaySamples, rays: RayBatch) -> Int64[Tensor, "spurious"]:
+        """Indices of the samples that skinning does not carry to their rays."""
         asked = self.unreliable_rows[samples.root_rows.long()].nonzero()[:, 0]
         ray = torch.searchsorted(samples.offsets, asked, right=True) - 1
         parts = (samples.points[asked], rays.origins[ray], rays.directions[ray])

@@ -1,12 +1,12 @@
-"""Warp cells: Fast-SNARF's canonical correspondence, solved once per cell of a frame.
+"""Correspondence grid: Fast-SNARF's canonical correspondences, solved once per cell of a frame.
 
 Fast-SNARF (Chen et al. 2022) finds for every sample the canonical point that linear blend skinning
 carries to it. The warp is smooth, so one solution per 3-cm cell, with its inverse Jacobian A,
-serves every sample in it: `x(p) = x* + A d`, d = p - center. Where joints bend it a second-order
-term is added, `Σ c_ij d_i d_j`. A is also the implicit gradient of the root with respect to the
-pose.
+serves all samples in the cell: `x(p) = x* + A d` with d = p - center. Near bent joints a
+second-order term `Σ c_ij d_i d_j` is added. A is also the implicit gradient of the root with
+respect to the pose.
 
-What one picture may skip: warp cells that lead to nothing, and pixels that see none of them.
+A rendering culls the cells that lead to unoccupied space, and the pixels that see none of the rest.
 """
 
 import dataclasses
@@ -25,23 +25,23 @@ from avatar.numba_kernels.numba_culling import cull_cells as cull_cells_numba
 from capture.camera import Camera
 
 CORRESPONDENCE_CELL_M = 0.03
+"""Edge of a cell, metres."""
 CLOTHING_BAND_M = 0.08
-"""How far from the skin clothes and hair may reach."""
+"""Distance from the skin within which clothes and hair lie, metres."""
 CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorrespondenceGrid:
-    """The warp of one frame, from its body frame to canonical space.
+    """Correspondences of one pose, from the body frame to canonical space.
 
     Attributes:
         low: Corner of the grid, body frame, metres.
         cell_m: Edge of a cell, metres.
-        index: `first_row * 8 + bent * 4 + count` for each cell, 0 where nothing of the body is
-            near. A root takes one row, in a bent cell three.
-        roots: Canonical root at the cell's centre, then A row by row. The two rows after it hold
-            c_xx, c_yy, c_zz, c_xy, c_xz and c_yz, three numbers each, if the cell is bent. Row 0
-            is unused.
+        packed_cells: `first_row * 8 + bent * 4 + count` of each cell, 0 far from the body. A root
+            takes one row, or three in a bent cell.
+        roots: Canonical root at the cell's center, then A row by row. In a bent cell the next two
+            rows hold c_xx, c_yy, c_zz, c_xy, c_xz and c_yz, three numbers each. Row 0 is unused.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -59,14 +59,14 @@ class CorrespondenceGrid:
         cell_m: float = CORRESPONDENCE_CELL_M,
         device: torch.device = CPU,
     ) -> "CorrespondenceGrid":
-        """Solves the warp of one pose.
+        """Solves the correspondences of one pose.
 
         Args:
-            rig: Whose body.
-            joint_rotations: Axis-angle of joints 1 … 23; the root plays no part.
-            band_m: How far from the skin there may be anything, metres; not beyond the rig's box.
+            rig: Rig of the person.
+            joint_rotations: Axis-angle rotations of joints 1 to 23; the root plays no part.
+            band_m: Distance from the skin that is covered, metres; at most to the rig's box.
             cell_m: Edge of a cell, metres.
-            device: Where to solve.
+            device: Device that solves.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         solved = backend_for(device).solve_correspondences(
@@ -78,14 +78,14 @@ class CorrespondenceGrid:
 
 
 MIN_DEPTH_M = 0.05
-"""What lies closer before the camera's plane than this has no place in the picture's plane."""
+"""Depth below which a corner of the box cannot be projected, metres."""
 
 
 def cull_cells(cells: CorrespondenceGrid, grid: DensityGrid) -> CorrespondenceGrid:
-    """The same warp without the cells that lead to nothing occupied; the others keep every sample.
+    """Empties the cells that lead to unoccupied space; no sample of another cell is lost.
 
-    In the index of an empty cell stands how far a ray may go on from it (`CorrespondenceTables`): the
-    paper's grid per frame (§3.3, inference), without a pass of the network.
+    An empty cell stores its distance to the next full one (`CorrespondenceTables`). This replaces
+    the paper's grid per frame (§3.3, inference) without evaluating the field.
     """
     index = np.empty_like(cells.packed_cells)
     cull_cells_numba(
@@ -104,7 +104,7 @@ def cull_cells(cells: CorrespondenceGrid, grid: DensityGrid) -> CorrespondenceGr
 def screen_bounds(
     cells: CorrespondenceGrid, camera: Camera, world_from_body: Float[np.ndarray, "4 4"]
 ) -> tuple[slice, slice]:
-    """Rows and columns of the picture outside of which no ray meets a cell that holds anything."""
+    """Rows and columns of the image outside of which no ray meets a full cell."""
     width, height = camera.size_px
     whole = slice(0, height), slice(0, width)
     held = np.argwhere(cells.packed_cells > 0)
@@ -114,7 +114,7 @@ def screen_bounds(
     corners = np.array(list(itertools.product(*sides.T)))
     in_world = corners @ world_from_body[:3, :3].T + world_from_body[:3, 3]
     depth = in_world @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    if camera.distortion or depth.min() < MIN_DEPTH_M:  # the picture of a box is no hull of corners
+    if camera.distortion or depth.min() < MIN_DEPTH_M:  # the projected corners bound no box
         return whole
     pixels = camera.project(in_world)
     left, top = np.floor(pixels.min(axis=0)).clip(0).astype(int).tolist()

@@ -1,4 +1,4 @@
-"""The avatar: one person's rig, field and occupancy, as training left them."""
+"""The avatar: rig, radiance field and occupancy of one person."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ from avatar.kernels.torch_reference import activate
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Avatar:
-    """What can be rendered in any pose.
+    """A person who can be rendered in any pose.
 
     Attributes:
-        rig: Its articulation.
-        field: Its canonical colour and density.
-        occupancy: Where it may be.
-        step_m: Distance between samples along a ray that it was trained with, metres.
+        rig: Articulation.
+        field: Canonical color and density.
+        occupancy: Occupied canonical cells.
+        sample_step_m: Distance between samples along a ray in training, metres.
     """
 
     rig: Rig
@@ -30,13 +30,13 @@ class Avatar:
     sample_step_m: float
 
     def rendering_grid(self) -> DensityGrid:
-        """Where a picture may show anything."""
+        """Occupancy for rendering, grown so that images have no holes."""
         return self.occupancy.for_rendering(self.sample_step_m)
 
     def color_and_density_at(
         self, points: Float32[Tensor, "points 3"]
     ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
-        """Color in [0, 1] and density in 1/m at canonical points; no density in empty cells."""
+        """Color in [0, 1] and density, 1/m, at canonical points; zero in empty cells."""
         held = in_occupied_cells(self.rendering_grid(), points).nonzero()[:, 0]
         color, density = activate(self.field.raw_outputs_at(points[held].contiguous()))
         all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])

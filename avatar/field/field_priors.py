@@ -1,7 +1,8 @@
-"""What a field is asked to be where no ray tells: empty off the body, solid in it, firm, smooth.
+"""Priors on the field where rays do not determine it: empty off the body, solid inside, smooth.
 
-Most terms speak of the opacity of one centimetre, α = 1 - exp(-σ · 1 cm), as in the paper's code,
-and of log density s; dα/ds = σ · 1 cm · (1 - α). Each function gives the gradient of a mean.
+Most terms penalise the opacity of one centimetre, α = 1 - exp(-σ · 1 cm), as in the paper's code,
+where s is the log density and dα/ds = σ · 1 cm · (1 - α). Each function returns the gradient of a
+mean over points with respect to the raw outputs.
 """
 
 from typing import NamedTuple
@@ -14,17 +15,19 @@ from avatar.config import TrainConfig
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 
 OPACITY_LENGTH_M = 0.01
+"""Length over which opacity is measured, metres."""
 TV_PAIR_SIGMA_M = 0.01
-"""Standard deviation of the way from one point of a pair to the other, along each axis."""
+"""Standard deviation of the offset within a total-variation pair, metres per axis."""
 MIN_OPACITY = 1e-6
+"""Opacity below which the interior loss's logarithm is clamped."""
 SMOOTHNESS_PAIR_SIGMA_CELLS = 0.5
-"""Standard deviation of the way between close points, in finest cells."""
+"""Standard deviation of the offset within a smoothness pair, in finest cells per axis."""
 MAX_USEFUL_LOG_DENSITY = 6.0
-"""Nothing needs more density than this (400 per metre: one half within two millimetres)."""
+"""Log density above which density is excess (400 per metre: opacity 0.5 in two millimetres)."""
 EXCESS_DENSITY_FACTOR = 0.4
-"""How much more density counts, beside steepness."""
+"""Weight of excess density relative to the slope penalty."""
 VISIBLE_LOG_DENSITY = 2.0
-"""Colors count where one of two points is denser than this."""
+"""Log density from which one point of a pair makes the pair's colors visible."""
 
 
 class OpacityWithSlope(NamedTuple):
@@ -35,7 +38,7 @@ class OpacityWithSlope(NamedTuple):
 
     @classmethod
     def of(cls, raw: Float32[Tensor, "points 4"]) -> "OpacityWithSlope":
-        """From a field's raw numbers."""
+        """Opacity and slope of a field's raw outputs."""
         optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * OPACITY_LENGTH_M
         through = torch.exp(-optical)
         return cls(1.0 - through, optical * through)
@@ -44,14 +47,14 @@ class OpacityWithSlope(NamedTuple):
 def empty_space_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean α where nothing should be (the paper's §3.4)."""
+    """Gradient of the mean α in space that should be empty (the paper's §3.4)."""
     return _log_density_only(raw, weight / max(len(raw), 1) * OpacityWithSlope.of(raw).slope)
 
 
 def interior_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean -log α where something must be: cross-entropy, which pulls at nothing, too."""
+    """Gradient of the mean -log α in the interior; cross-entropy acts at zero opacity as well."""
     opacity = OpacityWithSlope.of(raw)
     slope = opacity.slope / opacity.value.clamp(min=MIN_OPACITY)
     return _log_density_only(raw, -weight / max(len(raw), 1) * slope)
@@ -60,9 +63,10 @@ def interior_gradient(
 def log_density_l1_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean log density where that is above 0: what is solid is pulled at, too.
+    """Gradient of the mean log density where it is above 0.
 
-    What a ray needs it holds against a weak pull; under Adam what none needs goes, however weak.
+    Density that a ray needs withstands the small gradient; under Adam, density that no ray needs
+    vanishes however small the gradient is.
     """
     return _log_density_only(raw, weight / max(len(raw), 1) * (raw[:, 3] > 0.0))
 
@@ -70,7 +74,7 @@ def log_density_l1_gradient(
 def sample_tv_pairs(
     points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:
-    """Samples drawn at random, and after them a point near each: none if there is no weight."""
+    """Random samples followed by one neighbor of each; empty if the weight is zero."""
     count = config.density_tv_pairs if config.density_tv_weight else 0
     return _sample_pairs(points, count, TV_PAIR_SIGMA_M, generator)
 
@@ -78,7 +82,7 @@ def sample_tv_pairs(
 def sample_smoothness_pairs(
     points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:
-    """The same, about a finest cell apart: none where nothing is asked of them."""
+    """Pairs about a finest cell apart, as `sample_tv_pairs`; empty if both weights are zero."""
     count = config.smoothness_pairs if config.density_slope_weight or config.color_tv_weight else 0
     return _sample_pairs(points, count, SMOOTHNESS_PAIR_SIGMA_CELLS * config.finest_m, generator)
 
@@ -98,15 +102,15 @@ def _sample_pairs(
 def density_tv_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean |α - α'| over pairs of points.
+    """Gradient of the mean |α - α'| over pairs of points.
 
-    The total variation of a solid is its surface (Rudin, Osher and Fatemi 1992), and of all
-    surfaces that explain the pictures the smallest is the least ragged one. An edge may be as sharp
-    as it likes; but of what a ray needs not one half as opaque and twice as thick is as good.
+    The total variation of a solid is its surface area (Rudin, Osher and Fatemi 1992); of all
+    surfaces that explain the images it prefers the smallest, which is the smoothest. It does not
+    penalise sharp edges, but it does not penalise thick, half-transparent layers either.
 
     Args:
-        raw: First points of the pairs, then second ones.
-        weight: Of the term.
+        raw: Raw outputs at the first points of the pairs, then at the second.
+        weight: Weight of the term.
     """
     count, opacity = len(raw) // 2, OpacityWithSlope.of(raw)
     sign = torch.sign(opacity.value[:count] - opacity.value[count:])
@@ -116,10 +120,10 @@ def density_tv_gradient(
 def double_well_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean α (1 - α), which is least where all is solid or nothing.
+    """Gradient of the mean α (1 - α), which vanishes where space is opaque or empty.
 
-    With total variation beside it the least fog and the smallest surface are sought together, as
-    between two phases of a fluid (Modica and Mortola 1977).
+    Together with the total variation it minimises fog and surface area, as between two phases of a
+    fluid (Modica and Mortola 1977).
     """
     opacity = OpacityWithSlope.of(raw)
     return _log_density_only(
@@ -133,18 +137,18 @@ def density_slope_gradient(
     max_slope_per_m: float,
     weight: float,
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean by which log density changes too fast, |s - s'| - k · |x - x'| where that is > 0.
+    """Gradient of the mean of max(0, |s - s'| - k · |x - x'|), and of density in excess.
 
-    Few pictures in poses that are a little off are explained as well by a surface with a razor's
-    edge, rough between one pixel and the next. Such an edge neither the renderer's samples nor the
-    player's voxels can show: half a step's shift of the samples changed the picture by 38 dB.
-    Density beyond `MAX_USEFUL_LOG_DENSITY` is asked to fall, too: it only steepens.
+    A few images in slightly wrong poses are explained as well by a razor-sharp surface that is
+    rough between pixels. Neither the renderer's samples nor the player's voxels can represent it: a
+    shift of the samples by half a step changed the image by 38 dB. Density above
+    `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge.
 
     Args:
-        raw: First points of the pairs, then second ones.
-        points: Where they are, metres.
-        steepest_per_m: k.
-        weight: Of the term.
+        raw: Raw outputs at the first points of the pairs, then at the second.
+        points: Positions of these points, metres.
+        max_slope_per_m: Largest unpenalised slope k of the log density, 1/m.
+        weight: Weight of the term.
     """
     count, logs = len(raw) // 2, raw[:, 3]
     change = logs[:count] - logs[count:]
@@ -158,11 +162,11 @@ def density_slope_gradient(
 def color_tv_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Of the mean |c - c'| of visible pairs, summed over channels.
+    """Gradient of the mean |c - c'| of visible pairs, summed over channels.
 
     Args:
-        raw: First points of the pairs, then second ones.
-        weight: Of the term.
+        raw: Raw outputs at the first points of the pairs, then at the second.
+        weight: Weight of the term.
     """
     count, color = len(raw) // 2, torch.sigmoid(raw[:, :3])
     seen = torch.maximum(raw[:count, 3:], raw[count:, 3:]) > VISIBLE_LOG_DENSITY
@@ -175,7 +179,7 @@ def color_tv_gradient(
 def _log_density_only(
     raw: Float32[Tensor, "points 4"], slope: Float32[Tensor, "points"]
 ) -> Float32[Tensor, "points 4"]:
-    """No gradient for colours."""
+    """Gradient with a slope of the log density and none of the colors."""
     grad = torch.zeros_like(raw)
     grad[:, 3] = slope
     return grad

@@ -1,10 +1,8 @@
-"""Canonical occupancy: one density grid that every pose looks up after its warp.
+"""Canonical occupancy: one density grid that all poses share, with its regions of interest.
 
-The paper keeps a grid in posed space: a union over the sequence for training, one per frame for
-rendering. Looked up in canonical space a single grid is exact for every pose, forgets none, and
-needs no pass of the network per frame.
-
-Between the legs: where photographs of few poses leave matter that is no part of anybody.
+The paper keeps grids in posed space, a union over the sequence for training and one per frame for
+rendering. In canonical space a single grid is exact for every pose, forgets none, and needs no
+evaluation of the field per frame.
 """
 
 from collections.abc import Callable
@@ -24,33 +22,34 @@ from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 
 OCCUPANCY_DECAY = 0.9
-"""What a cell keeps of its density when a probe finds nothing. At 0.6 thin surfaces vanish."""
+"""Factor of a probed cell's cached density. At 0.6 thin surfaces vanish."""
 INITIAL_OCCUPANCY_DECAY = 0.7
-"""The same while the first fog clears and half of the band is probed at each update."""
+"""The factor while the initial fog clears and each update probes half of the band."""
 MIN_STEP_OPACITY = 0.02
-"""A cell counts as empty when a step through it would be less opaque than this."""
+"""Opacity of one step through a cell below which the cell is empty."""
 INITIAL_DENSITY = 1e-3
+"""Cached density of the band before the first probe, 1/m."""
 SOLID_DENSITY = 20.0
-"""What is denser than this, in 1/m, counts as solid when pieces are told apart."""
+"""Density from which a cell is solid when connected components are found, 1/m."""
 NEAR_SKIN_M = 0.03
-"""A piece of the person lies about this close to the skin; what floats does not."""
+"""Distance from the skin within which a component's cells count towards its size, metres."""
 INTERIOR_DEPTH_M = 0.015
-"""Deeper under the body's skin than this everybody is solid, however the body fits."""
+"""Depth under the skin from which the body is solid even if its shape fits badly, metres."""
 MIN_COMPONENT_SHARE = 0.003
-"""Pieces with less near the skin than this share of the largest are no part of the person."""
+"""Size, relative to the largest component, below which a component is a floater."""
 
 
 @final
 class OccupancyGrid:
-    """Where the canonical person may be.
+    """Occupied cells of canonical space.
 
     Attributes:
-        grid: What marching looks up; updated in place.
-        band: Flat indices of the cells near enough to the skin to hold anything.
+        density_grid: Occupancy and cached densities, updated in place.
+        band_cells: Flat indices of the cells in the clothing band about the skin.
     """
 
     def __init__(self, rig: Rig, device: torch.device, *, band_m: float = CLOTHING_BAND_M) -> None:
-        """Everything near the skin counts as occupied until something is known."""
+        """Starts with the whole clothing band occupied."""
         band = torch.from_numpy(rig.skin_distance <= band_m).to(device)
         cells = np.array(rig.skin_distance.shape, dtype=np.float32)
         self.density_grid = DensityGrid(
@@ -81,19 +80,17 @@ class OccupancyGrid:
         sample_step_m: float,
         generator: torch.Generator,
     ) -> None:
-        """Probes a share of the band once, at a random place in each cell, and re-thresholds.
+        """Probes a share of the band, once per cell at a random place, and updates the occupancy.
 
         Args:
             log_density_at: Log density at canonical points.
-            share: How much of the band is probed, in (0, 1].
-            decay: What a probed cell keeps of its density.
-            thinnest: Cells with less density than this, in 1/m, hold nothing, however long the
-                way through them.
-            drop_floaters: Whether pieces without contact to the rest are dropped that are small or
-                float off the skin (the paper's code keeps the largest piece alone; a foot may be
-                a piece of its own).
-            step_m: Distance between samples along a ray.
-            generator: Chooses cells and places.
+            share: Share of the band that is probed, in (0, 1].
+            decay: Factor of a probed cell's cached density.
+            min_density: Density below which a cell is empty whatever the step, 1/m.
+            drop_floaters: Whether small components, and those off the skin, are dropped. (The
+                paper's code keeps the largest component only, but a foot may be one of its own.)
+            sample_step_m: Distance between samples along a ray, metres.
+            generator: Draws cells and places.
         """
         chosen = self._draw_cells(self.band_cells, int(len(self.band_cells) * share), generator)
         log_density = log_density_at(self._jittered_points(chosen, generator))
@@ -111,11 +108,11 @@ class OccupancyGrid:
         self.density_grid.occupied.copy_(occupied)
 
     def for_rendering(self, sample_step_m: float) -> DensityGrid:
-        """The occupancy grown by one more cell, so that pruning leaves no hole in a picture.
+        """The occupancy dilated by one more cell, so that culling leaves no hole in an image.
 
-        Of what is grown those cells stay that are next to one half as dense as an occupied one, a
-        step of the paper's 1 % of opacity: a quarter fewer samples, and no farther from the sum
-        over all samples, occupied or not, than with every grown cell.
+        Dilated cells are kept only next to cells of at least half the occupancy threshold, a step
+        of the paper's 1 % opacity. This saves a quarter of the samples and stays as close to the
+        sum over all samples as full dilation does.
         """
         hazy = (self.density_grid.density > 0.5 * self._density_threshold(sample_step_m)).to(
             torch.uint8
@@ -125,14 +122,14 @@ class OccupancyGrid:
         )
 
     def _density_threshold(self, step_m: float) -> float:
-        """Density from which a cell is occupied: while all is fog, that which is above the mean."""
+        """Density from which a cell is occupied, 1/m: the mean of the band while all is fog."""
         return min(
             MIN_STEP_OPACITY / step_m,
             float(self.density_grid.density.view(-1)[self.band_cells].mean()),
         )
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Random points of cells near the skin that hold nothing, at most `count`."""
+        """Random points in unoccupied cells of the band, at most `count`."""
         return self._jittered_points(
             self._draw_cells(self._empty_cells(), count, generator), generator
         )
@@ -160,7 +157,7 @@ class OccupancyGrid:
         return self.band_cells[torch.from_numpy(between).to(self.band_cells.device)]
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
-        """Cells of the band that hold nothing: looked up when the occupancy has changed."""
+        """Unoccupied cells of the band, cached until the occupancy changes."""
         version = self.density_grid.occupied._version
         if self._cached_empty_cells is None or self._cached_empty_cells[0] != version:
             cells = self.band_cells[self.density_grid.occupied.view(-1)[self.band_cells] == 0]
@@ -210,11 +207,11 @@ def dilate(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
 def find_floaters(
     solid: Bool[Tensor, "x y z"], near_skin: Bool[np.ndarray, "x y z"]
 ) -> UInt8[Tensor, "x y z"]:
-    """Cells in and about those connected pieces that are no part of the person.
+    """Cells in and about the connected components that are not part of the person.
 
     Args:
-        firm: What is solid.
-        near_skin: Only such cells count towards a piece's size.
+        solid: Solid cells.
+        near_skin: Cells that count towards a component's size.
     """
     # scipy has no types, and what pyright guesses of this function is wrong
     pieces, count = label(solid.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
@@ -232,24 +229,26 @@ def find_floaters(
 
 
 OFF_SKIN_M = 0.02
-"""Nearer to the skin than this clothes lie, and nothing is said about them."""
+"""Distance from the skin within which clothes are spared, metres."""
 MAX_LEG_DISTANCE_M = 0.3
-"""A leg that is farther away than this has no say."""
+"""Distance beyond which a leg is ignored, metres."""
 MAX_DIRECTION_COSINE = 0.5
-"""Cosine of 60°: a place is between the legs if it sees them farther apart than this."""
-LEFT_LEG_PARTS, RIGHT_LEG_PARTS = (1, 3, 5), (2, 4, 6)
-"""Their body parts (`avatar.deformation.rig.PARTS`)."""
+"""Cosine of the smallest angle (60°) between the directions to both legs from a place between."""
+LEFT_LEG_PARTS = (1, 3, 5)
+"""Body parts of the left leg (`avatar.deformation.rig.PART_OF_JOINT`)."""
+RIGHT_LEG_PARTS = (2, 4, 6)
+"""Body parts of the right leg."""
 
 
 def inner_leg_cells(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray, "cells"]:
     """Which occupancy cells lie off the skin between the legs.
 
-    Where thighs touch in every photograph, canonical space has them apart, and skinning folds what
-    is between into them. No ray tells whether anything is there; when the legs part, it is a web.
+    Where the thighs touch in every photograph, skinning folds the canonical space between them into
+    the thighs. No ray reaches it, and density left there becomes a web once the legs part.
 
     Args:
-        rig: Whose body.
-        cells: Flat numbers of cells of `rig.distance`.
+        rig: Rig of the person.
+        cells: Flat indices of cells of `rig.skin_distance`.
     """
     found = np.zeros(len(cells), dtype=bool)
     away = (rig.skin_distance.reshape(-1)[cells] > OFF_SKIN_M) & ~rig.inside_skin.reshape(-1)[cells]
@@ -266,7 +265,7 @@ def inner_leg_cells(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndar
 def _nearest_leg_seed(
     rig: Rig, parts: tuple[int, ...], points: Float[np.ndarray, "points 3"]
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points"]]:
-    """Direction to the nearest seed of some body parts, and how far away it is."""
+    """Direction to the nearest seed of some body parts, and its distance, metres."""
     seeds = rig.seeds[np.isin(rig.seed_parts, parts)]
     if not len(seeds):
         return np.zeros_like(points), np.full(len(points), np.inf)

@@ -1,4 +1,4 @@
-"""One seam for the fast path: the operations of a step, on whatever runs them."""
+"""The operations of a training step and their operands, as every backend implements them."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -13,13 +13,13 @@ from avatar.kernels.hash_levels import HashLevels
 Points = Float32[Tensor, "points 3"]
 """Canonical positions, metres."""
 Features = Float32[Tensor, "points width"]
-"""What the hash grid holds at points."""
+"""Hash-grid features at points."""
 HashTable = Float32[Tensor, "entries 4"]
 """The hash grid's entries, level after level."""
 RawOutputs = Float32[Tensor, "samples 4"]
-"""The network's outputs: colour logits and log density (log 1/m)."""
+"""The network's outputs: color logits and log density (log 1/m)."""
 PremultipliedPixels = Float32[Tensor, "rays 4"]
-"""Premultiplied colour and alpha."""
+"""Premultiplied color and alpha of rays."""
 
 
 class RaySamples(NamedTuple):
@@ -27,9 +27,9 @@ class RaySamples(NamedTuple):
 
     Attributes:
         points: Canonical positions, metres.
-        first: Where each ray's samples begin.
-        count: How many each ray has.
-        rows: Root of its frame's cells that each sample was warped with.
+        offsets: Index of each ray's first sample.
+        counts: Number of samples of each ray.
+        root_rows: Row of the root, in its slot's grid, that each sample was warped with.
     """
 
     points: Float32[Tensor, "samples 3"]
@@ -42,11 +42,10 @@ class RayBatch(NamedTuple):
     """Rays in the body frame of the frame that each belongs to.
 
     Attributes:
-        origins: Metres.
-        directions: Unit vectors.
-        slots: Which frame's warp cells each ray runs through.
-        jitter: Offset of each ray's sample lattice, in steps; 1 and more passes so many samples
-            over.
+        origins: Origins, metres.
+        directions: Unit directions.
+        slots: Slot whose correspondence grid each ray is marched through.
+        jitter: Offset of each ray's sample lattice, in steps; the integer part skips samples.
     """
 
     origins: Float32[Tensor, "rays 3"]
@@ -56,14 +55,14 @@ class RayBatch(NamedTuple):
 
 
 class CorrespondenceTables(NamedTuple):
-    """Warp cells of many frames, one slot each (`avatar.deformation.correspondence_grid.WarpCells`, padded).
+    """Correspondence grids of several frames, padded, one slot each.
 
     Attributes:
-        index: `first_row * 8 + bent * 4 + count` of each cell. Where nothing is near it is 0, or -n
-            to say that all cells less than n away hold nothing either.
-        roots: Roots and how the warp moves about them.
+        packed_cells: `first_row * 8 + bent * 4 + count` of each cell; an empty cell holds 0, or -n
+            if all cells within n - 1 cells of it are empty as well.
+        roots: Canonical roots and the derivatives of the warp at them.
         low: Corner of each slot's grid, body frame, metres.
-        shape: Cells along each axis of each slot's grid.
+        shape: Number of cells along each axis of each slot's grid.
         cell_m: Edge of a cell, metres.
     """
 
@@ -75,12 +74,12 @@ class CorrespondenceTables(NamedTuple):
 
 
 class SolvedCorrespondences(NamedTuple):
-    """The warp cells of one frame (`avatar.deformation.correspondence_grid.WarpCells`).
+    """The correspondence grid of one frame, before `CorrespondenceGrid` names its cell size.
 
     Attributes:
-        low: Corner of their grid, body frame, metres.
-        index: `first_row * 8 + bent * 4 + count` of each cell.
-        roots: Roots and how the warp moves about them.
+        low: Corner of the grid, body frame, metres.
+        packed_cells: `first_row * 8 + bent * 4 + count` of each cell.
+        roots: Canonical roots and the derivatives of the warp at them.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -89,13 +88,13 @@ class SolvedCorrespondences(NamedTuple):
 
 
 class DensityGrid(NamedTuple):
-    """Canonical occupancy: which cells may hold anything, and the density last seen there.
+    """Canonical occupancy: the occupied cells, and the density cached in each cell.
 
     Attributes:
-        occupied: 0 or 1.
-        density: 1/m.
+        occupied: 1 in occupied cells, 0 elsewhere.
+        density: Cached density, 1/m.
         low: Corner of the box, metres.
-        cells_per_m: Along each axis.
+        cells_per_m: Cells per metre along each axis.
     """
 
     occupied: UInt8[Tensor, "x y z"]
@@ -105,11 +104,11 @@ class DensityGrid(NamedTuple):
 
 
 class SkinningVolume(NamedTuple):
-    """The skinning volume (`avatar.deformation.rig.Rig`).
+    """The volume of skinning weights (`avatar.deformation.rig.Rig`).
 
     Attributes:
-        weights: On the nodes of the canonical box.
-        low: Its corner, metres.
+        weights: Weights of the 24 bones at the nodes of the canonical box.
+        low: Corner of the box, metres.
         nodes_per_m: Nodes per metre along each axis.
     """
 
@@ -119,14 +118,14 @@ class SkinningVolume(NamedTuple):
 
 
 class MarchSettings(NamedTuple):
-    """How a ray is sampled.
+    """Spacing, end and number of the samples of a ray.
 
     Attributes:
-        step_m: Distance between samples, metres.
-        grace_m: How much farther a ray is followed once its cached optical depth says it is
-            opaque; infinity for exact rendering. Metres, never a number of samples: a grace that
-            shrinks with the step cuts grazing rays before the surface.
-        most: Samples a ray may have.
+        sample_step_m: Distance between samples, metres.
+        opaque_margin_m: Distance that a ray is marched past the depth at which the cached density
+            is opaque, metres; infinity for exact rendering. A margin in samples would shrink with
+            the step and cut grazing rays in front of the surface.
+        max_samples: Largest number of samples on a ray.
     """
 
     sample_step_m: float
@@ -135,13 +134,13 @@ class MarchSettings(NamedTuple):
 
     @property
     def opaque_margin_steps(self) -> int:
-        """The grace in samples."""
+        """The margin in samples."""
         return int(min(self.opaque_margin_m / self.sample_step_m + 1.0, 1e9))
 
 
 @runtime_checkable
 class Backend(Protocol):
-    """The operations of a training step. `avatar.kernels.torch_reference` says what each means."""
+    """The operations of a training step; `avatar.kernels.torch_reference` defines each of them."""
 
     name: str
 
@@ -169,7 +168,7 @@ class Backend(Protocol):
         cell_m: float,
         device: torch.device,
     ) -> SolvedCorrespondences:
-        """The warp of a pose whose bones go from the canonical to the body frame."""
+        """Solves the correspondence grid of a pose, given its canonical-to-body bone transforms."""
         ...
 
     def march(
@@ -181,11 +180,11 @@ class Backend(Protocol):
     def march_resumable(
         self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
     ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
-        """The same, and the jitter with which each ray goes on that has all its `how.most`."""
+        """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
         ...
 
     def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
-        """Premultiplied colour and alpha of each ray."""
+        """Premultiplied color and alpha of each ray."""
         ...
 
     def composite_loss(
@@ -198,13 +197,13 @@ class Backend(Protocol):
         alpha_weight: float,
         hard_weight: float,
     ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
-        """Rendering, loss of each ray, and the gradient of the mean loss for `raw`."""
+        """Rendering and loss of each ray, and the mean loss's gradient with respect to `raw`."""
         ...
 
     def scatter_max_density(
         self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
     ) -> None:
-        """Raises the grid's cached density, in place, to that of the samples."""
+        """Raises the cached density of the samples' cells to the samples' own, in place."""
         ...
 
     def bone_wrenches(
@@ -216,7 +215,7 @@ class Backend(Protocol):
         skin: SkinningVolume,
         bones: Float32[Tensor, "slots 24 12"],
     ) -> Float32[Tensor, "rays 24 6"]:
-        """What each ray's samples, pulled so, exert on the bones that move them."""
+        """Wrench that each ray's samples exert on every bone, given the gradient at the samples."""
         ...
 
     def update_roots(
@@ -226,5 +225,5 @@ class Backend(Protocol):
         skin: SkinningVolume,
         bones: Float32[Tensor, "24 12"],
     ) -> None:
-        """Moves a slot's roots, in place, after its pose."""
+        """Moves a slot's roots, in place, to follow its changed pose."""
         ...

@@ -1,4 +1,4 @@
-"""Online training: improves an avatar while frames arrive, and says what happens."""
+"""Online training: trains an avatar while frames arrive, and yields events."""
 
 import time
 from collections.abc import Iterator
@@ -29,24 +29,24 @@ from capture.inbox import Inbox
 from preprocess.observe import DroppedFrame
 
 READING_FIRST_AFTER_SHARE = 0.5
-"""Share of the time after which a video that is still being read comes before training."""
+"""Share of the time budget after which reading the video takes precedence over training."""
 MIN_STEPS_AFTER_LAST_FRAME = 20
-"""Steps on the last frame, at the least: a new frame's rays are drawn first."""
+"""Fewest steps after the last frame, whose rays are drawn first."""
 STREAMING_RATE_FACTOR = 0.5
-"""Factor of the learning rates while a video plays: what is shown has no falling rate behind it,
-and the mean of smaller swings is closer to what lies between them."""
+"""Factor of the learning rates while a video plays in real time: without a falling rate, smaller
+swings of the parameters leave their mean closer to the optimum."""
 EVALUATION_TIME_SHARE = 0.015
-"""Share of the whole time that scoring at one mark may take (at least one frame is scored)."""
+"""Share of the time budget that one evaluation may take; it scores at least one frame."""
 EVALUATION_TIMES_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
-"""When the curve is measured, in seconds of the schedule; then every 30 s."""
+"""Schedule times of the learning curve, seconds; 30 s apart after the last."""
 
 
 @final
 class TrainingClock:
-    """Training time, wall and CPU, on top of what earlier runs have used; pauses do not count.
+    """Training time, wall and CPU, continued from earlier runs and without pauses.
 
-    The schedule (learning rates, marks, the end) follows wall time, or, where the recipe gives a
-    number of steps, the steps made: then it is the same on every machine.
+    The schedule (learning rates, evaluations, the end) follows wall time or, where the
+    configuration counts steps, the steps made; it is then the same on every machine.
     """
 
     def __init__(self, trainer: Trainer) -> None:
@@ -56,7 +56,7 @@ class TrainingClock:
         self._cpu = time.process_time() - trainer.cpu_seconds - trainer.paused_cpu_seconds
 
     def read(self) -> float:
-        """Seconds of the schedule; the trainer's own wall and CPU seconds are set to now."""
+        """Updates the trainer's wall and CPU seconds; returns its position in the schedule, s."""
         trainer = self._trainer
         trainer.wall_seconds = time.perf_counter() - self._wall - trainer.paused_wall_seconds
         trainer.cpu_seconds = time.process_time() - self._cpu - trainer.paused_cpu_seconds
@@ -66,22 +66,21 @@ class TrainingClock:
 def train(
     trainer: Trainer, inbox: Inbox[StreamItem], held_out: list[HeldOutFrame]
 ) -> Iterator[TrainEvent]:
-    """Trains until the time is up, or the steps are made, on whatever has arrived.
+    """Trains on the frames that have arrived until the time, or the steps, are used up.
 
-    The learning rate is constant while frames arrive and falls as a cosine after the last. Of a
-    recording no frame is lost: where the time is too short to read them all beside training,
-    reading comes first, and ends after the time if it must. Frames that come at times of their own
-    are never waited for, except for the first. A live source is left when the time is up. Where
-    steps are counted, each step of a recording is preceded by one more frame until all are read.
+    The learning rate is constant while frames arrive and falls as a cosine after the last one. No
+    frame of a recording is lost: if the time is too short to read them all beside training, reading
+    takes precedence and may overrun the time. Frames of a paced source are not waited for, except
+    for the first. A live source is left when the time is up. Where steps are counted, one more
+    frame of a recording is read before each step until all are read.
 
     Args:
-        trainer: Goes on from where it stands.
-        inbox: Frames as they become ready.
-        held: Held-out frames; those that arrive are appended.
+        trainer: Trainer to continue.
+        inbox: Prepared frames.
+        held_out: Held-out frames; those that arrive are appended.
 
     Yields:
-        What happens, on the caller's thread: what the caller does with an event takes training
-        time.
+        Events, on the caller's thread; the time the caller spends on one counts as training time.
     """
     stream, marks = _FrameIntake(trainer, inbox, held_out), _EvaluationSchedule(trainer)
     while True:
@@ -105,11 +104,8 @@ def train(
 
 
 def _train_step(trainer: Trainer, stream: "_FrameIntake", now: float) -> Stepped:
-    falling, wall, cpu = (
-        cosine_decay(stream.progress(now)),
-        time.perf_counter(),
-        time.process_time(),
-    )
+    falling = cosine_decay(stream.progress(now))
+    wall, cpu = time.perf_counter(), time.process_time()
     result = trainer.step(
         rate=min(falling, stream.highest_rate),
         pose_rate=falling,
@@ -146,15 +142,15 @@ def _finish(trainer: Trainer, *, paced: bool) -> Iterator[Warned | Finished]:
 
 @final
 class _FrameIntake:
-    """What arrives while training goes on, and since when nothing more does."""
+    """Hands arriving frames to the trainer, and tracks the end of the stream."""
 
     def __init__(
         self,
         trainer: Trainer,
         inbox: Inbox[StreamItem],
-        held: list[HeldOutFrame],
+        held_out: list[HeldOutFrame],
     ) -> None:
-        self._trainer, self._inbox, self._held_out = trainer, inbox, held
+        self._trainer, self._inbox, self._held_out = trainer, inbox, held_out
         self._began = trainer.scheduled_seconds
         self._ended_at: float | None = None
         self._last_frame_step: int | None = None
@@ -163,16 +159,16 @@ class _FrameIntake:
 
     @property
     def highest_rate(self) -> float:
-        """Factor of the field's learning rates that is never exceeded."""
+        """Upper bound of the learning rates' factor."""
         return STREAMING_RATE_FACTOR if self._inbox.paced else 1.0
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will arrive."""
+        """Whether no more frames will arrive."""
         return self._ended_at is not None
 
     def receive(self, now: float) -> Iterator[FrameArrived | Warned]:
-        """Hands what has arrived to the trainer; the clock starts with the first frame."""
+        """Adds the frames that have arrived to the trainer; the clock starts with the first."""
         if self.ended or (
             self._one_frame_per_step and self._last_frame_step == self._trainer.steps
         ):
@@ -207,11 +203,11 @@ class _FrameIntake:
 
     @property
     def _one_frame_per_step(self) -> bool:
-        """Whether frames are read in step with training, so that a run can be repeated."""
+        """Whether one frame is read per step, which makes a run reproducible."""
         return bool(self._trainer.config.steps) and not self._inbox.paced
 
     def needs_frame(self) -> bool:
-        """Whether the next step waits for one more frame, because steps are counted."""
+        """Whether the next step has to wait for one more frame."""
         return (
             self._one_frame_per_step
             and not self.ended
@@ -219,7 +215,7 @@ class _FrameIntake:
         )
 
     def is_behind(self, now: float) -> bool:
-        """Whether reading must come first for a while; a video's own pace cannot be hurried."""
+        """Whether reading takes precedence over training; a paced source cannot be hurried."""
         if self._one_frame_per_step:
             return False
         began, end = self._began, self._trainer.config.seconds
@@ -227,7 +223,7 @@ class _FrameIntake:
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:
-        """Whether the schedule is over and every frame has been learnt from."""
+        """Whether the schedule is over and every frame has been trained on."""
         config, admitted_at = self._trainer.config, self._last_frame_step
         if not (self.ended and now >= config.seconds):
             return False
@@ -235,7 +231,7 @@ class _FrameIntake:
         return self._trainer.steps >= (admitted_at or 0) + farewell
 
     def progress(self, now: float) -> float:
-        """How much of the time after the last frame has gone by, in [0, 1]; 0 before it."""
+        """Elapsed share of the time after the last frame, in [0, 1]; 0 before it."""
         if self._ended_at is None:
             return 0.0
         tail = self._trainer.config.seconds - self._ended_at
@@ -244,7 +240,7 @@ class _FrameIntake:
 
 @final
 class _EvaluationSchedule:
-    """When the curve is measured, and how long that may take."""
+    """Times of the learning curve's evaluations, and how long each may take."""
 
     def __init__(self, trainer: Trainer) -> None:
         self._trainer = trainer
@@ -252,11 +248,11 @@ class _EvaluationSchedule:
         self._next = next(self._times)
 
     def is_due(self, now: float) -> bool:
-        """Whether a mark has been reached."""
+        """Whether the next evaluation is due."""
         return now >= self._next
 
     def score(self, held_out: list[HeldOutFrame], clock: TrainingClock) -> Evaluated:
-        """Scores held-out frames, evenly over the stream, until the time for it is spent."""
+        """Scores held-out frames, evenly over the stream, until the evaluation's time is spent."""
         trainer, scores = self._trainer, list[HeldOutScore]()
         at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
         enough = clock.read() + EVALUATION_TIME_SHARE * trainer.config.seconds

@@ -1,4 +1,4 @@
-"""The trainer: everything that training changes, and one step of it."""
+"""The trainer: the state that training changes, and one training step."""
 
 import time
 from collections.abc import Iterator
@@ -33,34 +33,36 @@ from avatar.training.training_step import (
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
 INITIAL_OCCUPANCY_STEPS = 300
-"""Steps during which the first fog clears: the occupancy is probed more and forgets faster."""
+"""Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
 CORRECTIONS_PER_STEP = 2
+"""Pose corrections that one training step may make."""
 
 
 @final
 class Trainer:
-    """Everything that training changes, and one step of it.
+    """The state that training changes, and one training step.
 
     Attributes:
-        avatar: As it stands and is shown; its field is the running mean of `field`.
-        field: What steps change.
-        config: The recipe.
-        sampler: Where samples lie along rays.
-        replay: The frames it learns from.
-        poses: Their poses, corrected if the recipe says so.
-        corrections: How each frame's pose was corrected, by the frame's number in its source; a
-            frame that comes again starts from there. Clear it before another source is read. At
-            most twice as many are kept as frames in replay.
-        steps, rays, samples: How much has been done.
-        wall_seconds, cpu_seconds: Training time so far; a resumed run goes on counting.
-        frames_seen: Frames taken in so far, whether or not they are still kept.
-        stepping_wall, stepping_cpu: Seconds inside steps of this process, by the wall clock and of
-            CPU time.
-        paused_wall_seconds, paused_cpu_seconds: Seconds for which somebody held training up (`paused`).
+        config: The configuration.
+        field: The field that steps change.
+        learner: Avatar with `field`, which the samplers query.
+        avatar: Avatar to render; its field is the running mean of `field`.
+        sampler: Chooses the samples along rays.
+        replay: Frames to train on.
+        poses: Poses of these frames, corrected if the configuration says so.
+        generator: Source of random numbers, on the field's device.
+        pose_corrections: Correction of each frame's pose, by the frame's index in its source; a
+            frame that is read again starts from it. To be cleared before another source is read;
+            keeps at most twice the replay capacity.
+        steps, rays, samples: Numbers of steps, rays and samples so far.
+        wall_seconds, cpu_seconds: Training time so far, continued by a resumed run.
+        frames_seen: Frames added so far, whether or not the replay buffer still holds them.
+        step_wall_seconds, step_cpu_seconds: Time inside steps of this process.
+        paused_wall_seconds, paused_cpu_seconds: Time inside `paused`.
     """
 
     def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
-        """A trainer that has seen nothing."""
+        """Starts without frames, from random parameters."""
         self.config = config
         self.backend: Backend = backend_for(device)
         levels = HashLevels.spanning(
@@ -97,7 +99,7 @@ class Trainer:
 
     @property
     def scheduled_seconds(self) -> float:
-        """Position in the schedule: wall seconds, or steps at their nominal rate."""
+        """Position in the schedule, seconds: wall time, or steps at their nominal rate."""
         if self.config.steps:
             return self.steps / NOMINAL_STEPS_PER_S
         return self.wall_seconds
@@ -125,7 +127,7 @@ class Trainer:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Time that passes in this block does not count as training."""
+        """Excludes the time spent in this block from the training time."""
         wall, cpu = time.perf_counter(), time.process_time()
         try:
             yield
@@ -136,13 +138,13 @@ class Trainer:
     def step(
         self, *, rate: float, hard_surface_share: float, pose_rate: float | None = None
     ) -> StepResult:
-        """Draws rays, follows their gradient once, and keeps the occupancy up to date.
+        """Makes one gradient step on a batch of rays, and updates poses, occupancy and mean.
 
         Args:
             rate: Factor of the learning rates, in (0, 1].
             hard_surface_share: Share of the hard-surface loss's weight, in [0, 1].
-            pose_rate: Factor of the corrections of poses, in (0, 1]; `rate` if None. As it falls,
-                surfaces become firm.
+            pose_rate: Factor of the pose corrections, in (0, 1]; `rate` if None. Surfaces are made
+                firm as it falls.
         """
         config, field = self.config, self.field
         falling = rate if pose_rate is None else pose_rate
@@ -175,7 +177,7 @@ class Trainer:
         return result
 
     def _discard_old_corrections(self) -> None:
-        """Of frames that are long gone from replay, so that memory stays bounded."""
+        """Drops corrections of frames that replay no longer holds, to bound the memory."""
         if len(self.pose_corrections) > 2 * self.replay.capacity:
             kept = set(self.replay.frame_indices)
             self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
@@ -205,7 +207,7 @@ class Trainer:
 def resolve_correspondences(
     rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, slot: int
 ) -> None:
-    """Solves a frame's warp cells again and moves its rays to its corrected pose."""
+    """Solves a frame's correspondence grid again and moves its rays to its corrected pose."""
     joints = poses.pose(slot).joint_rotations
     replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints, device=replay.device))
     replay.correct_root(slot, poses.root_correction(slot))
@@ -214,17 +216,17 @@ def resolve_correspondences(
 def correct_one_pose(
     rig: Rig, backend: Backend, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
 ) -> int | None:
-    """Corrects one pose; its frame's warp and rays follow.
+    """Corrects one pose; its frame's correspondences and rays follow.
 
     Args:
-        rig: Whose body.
-        backend: Moves the warp cells.
-        replay: Holds the frames.
-        poses: Holds their poses, slot by slot.
+        rig: Rig of the person.
+        backend: Updates the roots of the correspondences.
+        replay: The frames.
+        poses: Their poses, slot by slot.
         rate: Factor of the step, in (0, 1].
 
     Returns:
-        The slot whose pose moved, or None if too little is known about any.
+        The slot of the corrected pose, or None if no pose has enough evidence.
     """
     slot = poses.correct_next(rate=rate)
     if slot is None:
