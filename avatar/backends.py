@@ -1,11 +1,7 @@
-"""Which backend a device gets: the fastest that it has and that is right on this machine.
+"""Chooses the backend of a device: the fastest one that passes a self-test on this machine.
 
-The CPU has compiled twins of every operation (`avatar.numba_kernels.numba_backend`). A GPU has none yet: the
-reference runs there, in plain torch. Kernels of our own for it would be a class beside
-`NumbaBackend` that keeps to the same protocol; `backend_for` is where it would be chosen, after
-the same self-test.
-
-Does a fast backend mean what the reference means, on this very machine?
+The CPU has compiled kernels for every operation (`avatar.numba_kernels.numba_backend`); a GPU runs
+the reference in plain torch. The self-test compares a backend with the reference on small inputs.
 """
 
 import functools
@@ -37,7 +33,7 @@ _SELF_TEST_LOCK = threading.Lock()
 
 
 def backend_for(device: torch.device) -> Backend:
-    """The fastest backend that the device has; `IA_BACKEND=torch|numba` forces one.
+    """The fastest backend of a device; `IA_BACKEND=torch|numba` forces one.
 
     Raises:
         InputError: If the forced backend is unknown or cannot run on the device.
@@ -49,28 +45,26 @@ def backend_for(device: torch.device) -> Backend:
         )
     if forced == "numba" and device.type != "cpu":
         raise InputError(
-            f"IA_BACKEND=numba was asked for, but it runs on the CPU only, not on {device}. "
+            f"IA_BACKEND=numba runs on the CPU only, not on {device}. "
             "Leave it out, or give --device cpu."
         )
     if device.type == "cpu" and forced != "torch":
-        with _SELF_TEST_LOCK:  # kernels must not run in two threads at once: who comes second waits
+        with _SELF_TEST_LOCK:  # kernels must not run in two threads at once
             if _numba_passes_self_test():
                 return _numba_backend()
-    # a CudaBackend's seat: device.type == "cuda", and `strays` finds nothing on it
+    # A CUDA backend goes here, after the self-test.
     return TorchBackend()
 
 
 def _numba_backend() -> Backend:
-    from avatar.numba_kernels.numba_backend import (
-        NumbaBackend,  # it compiles: only where it is used
-    )
+    from avatar.numba_kernels.numba_backend import NumbaBackend  # compiles at its import
 
     return NumbaBackend()
 
 
 @functools.cache
 def _numba_passes_self_test() -> bool:
-    """Whether the compiled kernels do here what they should; asked once, answered aloud if not."""
+    """Whether the compiled kernels agree with the reference here; tested once, with a warning."""
     operation = failing_operation(_numba_backend())
     if operation is not None:
         warnings.warn(
@@ -83,16 +77,18 @@ def _numba_passes_self_test() -> bool:
 
 
 TEST_POINTS = 256
+"""Points of the self-test."""
 TEST_CELL_M = 0.05
+"""Cell size of the self-test's correspondence grid, metres."""
 RELATIVE_TOLERANCE = 1e-3
-"""Largest difference allowed, as a share of the largest value."""
+"""Largest difference from the reference, relative to the largest value."""
 
 
 def failing_operation(backend: Backend) -> str | None:
-    """The operation in which a backend differs from the reference on 256 points, or None.
+    """The first operation in which a backend differs from the reference, or None.
 
     Args:
-        backend: Any but the reference itself.
+        backend: Backend to test.
     """
     generator = torch.Generator().manual_seed(0)
     levels = HashLevels.spanning(
@@ -183,7 +179,7 @@ def _march_to_seeds(
     bones: Float32[np.ndarray, "24 12"],
     canonical: Float32[torch.Tensor, "points 3"],
 ) -> Float32[torch.Tensor, "points 3"]:
-    """Where marching finds what skinning has carried off; 0 where it finds nothing."""
+    """Canonical points that marching finds for skinned points; 0 where it finds none."""
     extent = rig.box_high - rig.box_low
     low, shape = torch.from_numpy(rig.box_low), np.array(rig.skin_distance.shape, dtype=np.float32)
     nodes_per_m = torch.from_numpy((np.array(rig.weights.shape[:3], np.float32) - 1) / extent)

@@ -1,4 +1,4 @@
-"""What training says while it goes on. Bars, pages, reports and checkpoints listen."""
+"""Events of a training run, for progress bars, pages, reports and checkpoints."""
 
 import math
 from dataclasses import dataclass
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class FrameArrived:
-    """The trainer has been given a frame.
+    """A frame has reached the trainer.
 
     Attributes:
-        index: The frame's number in its source.
-        held_out: Whether it will be scored instead of learnt from.
+        index: Index of the frame in its source.
+        held_out: Whether it is scored instead of trained on.
     """
 
     index: int
@@ -19,18 +19,18 @@ class FrameArrived:
 
 @dataclass(frozen=True, kw_only=True)
 class WaitingForFrame:
-    """There is nothing to learn from yet; it has been waited for a moment."""
+    """No frame has arrived yet; the trainer has waited for a moment."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stepped:
-    """A step was made.
+    """A training step has been made.
 
     Attributes:
-        step: How many there have been.
+        step: Number of steps so far.
         wall_seconds: Training time so far.
-        loss: Mean of its rays.
-        samples_per_ray: Mean of its rays.
+        loss: Mean loss of the step's rays.
+        samples_per_ray: Mean number of samples of the step's rays.
         frames_seen: Frames trained on so far.
     """
 
@@ -46,13 +46,13 @@ class HeldOutScore:
     """How well one held-out frame is rendered, on white.
 
     Attributes:
-        frame: Its index in the source.
-        psnr: Of the whole frame, dB.
-        psnr_mask: Where alpha > 0.5, dB.
-        ssim: In [-1, 1].
-        blur: Equivalent blur, as a share of the person's height (`avatar.evaluation.sharpness`); NaN if it
-            was not measured.
-        overlap: Of the rendered alpha with the mask, in [0, 1]; NaN if it was not measured.
+        frame: Index of the frame in its source.
+        psnr: PSNR of the whole frame, dB.
+        psnr_mask: PSNR where alpha > 0.5, dB.
+        ssim: SSIM of the whole frame, in [-1, 1].
+        blur: Equivalent blur, as a share of the person's height (`avatar.evaluation.sharpness`);
+            NaN if not measured.
+        overlap: Soft IoU of the rendered alpha and the mask, in [0, 1]; NaN if not measured.
     """
 
     frame: int
@@ -65,12 +65,12 @@ class HeldOutScore:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluated:
-    """Held-out frames that have arrived so far were scored.
+    """The held-out frames that have arrived so far have been scored.
 
     Attributes:
         wall_seconds, cpu_seconds: Training time so far.
         frames_seen: Frames trained on so far.
-        scores: One a frame.
+        scores: Score of each frame.
     """
 
     wall_seconds: float
@@ -81,18 +81,18 @@ class Evaluated:
 
 @dataclass(frozen=True, kw_only=True)
 class Warned:
-    """Something the user should know, and that does not stop the run."""
+    """A message for the user that does not stop the run."""
 
     message: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finished:
-    """The last step was made.
+    """The last step has been made.
 
     Attributes:
         wall_seconds, cpu_seconds: Training time.
-        steps, rays, samples: How much was done.
+        steps, rays, samples: Total numbers of steps, rays and samples.
     """
 
     wall_seconds: float

@@ -85,7 +85,7 @@ class Coverage:
         cosines = np.einsum("pa,pa->p", to_camera, normals)
         in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
         depths = in_camera[:, 2]
-        if depths.min() <= 0.0:  # somebody behind the camera is not in the picture either
+        if depths.min() <= 0.0:  # a person behind the camera is not in the image either
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
         free = visible_points(

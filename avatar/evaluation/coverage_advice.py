@@ -13,9 +13,10 @@ from avatar.evaluation.skin_patches import PART_NAMES, SkinPatches
 MIN_REGION_SHARE = 0.02
 """Share of the skin below which an unseen piece is not mentioned: one hand is 2.3 %."""
 HEAD_WEIGHT = 2.0
-"""A face is what people look at: the head's skin counts as so much more."""
+"""Weight of the head's skin relative to other skin, since viewers look at the face."""
 NEARLY_COMPLETE = 0.95
-NOT_SEEN_YET = "Nobody has been seen yet."
+"""Share of seen skin from which the capture counts as complete."""
+NOT_SEEN_YET = "No person has been seen yet."
 SEEN_COMPLETELY = "It was seen from all sides: no piece as large as a hand is missing."
 SMALL_REGIONS_LEFT = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
 
@@ -87,8 +88,8 @@ class UnseenRegion:
 def coverage_advice(coverage: Coverage) -> str:
     """What the person should do next, in one sentence.
 
-    It is about the largest connected piece that nobody has seen; if the same piece of the other
-    arm or leg is missing, too, about both.
+    The sentence names the largest connected unseen piece of skin, and both pieces if its mirror
+    image on the other arm or leg is unseen as well.
     """
     if not coverage.stages.any():
         return NOT_SEEN_YET
@@ -103,7 +104,7 @@ def coverage_advice(coverage: Coverage) -> str:
 
 
 def unseen_regions(coverage: Coverage) -> list[UnseenRegion]:
-    """The connected unseen pieces worth a word, the largest first."""
+    """The connected unseen pieces that are worth mentioning, the largest first."""
     patches = coverage.patches
     unseen = coverage.stages < VisibilityStage.SEEN
     links = patches.adjacent_pairs[unseen[patches.adjacent_pairs].all(axis=1)]

@@ -2,15 +2,15 @@
 
 A PSNR alone does not say whether a picture is good. On white it depends on how much of the frame
 the person fills, and inside the mask on the clothes: a plain shirt scores well however it is
-drawn, a striped one badly as soon as it is a pixel off. So each held-out frame is its own
-yardstick. The frame is blurred by Gaussians of growing width, each blurred copy is scored as a
+drawn, a striped one badly as soon as it is a pixel off. Each held-out frame is therefore its own
+scale. The frame is blurred by Gaussians of growing width, each blurred copy is scored as a
 rendering would be (PSNR where alpha > 0.5, on white), and the rendering is given the width of the
 copy that scores as it does: its **equivalent blur**, the standard deviation σ as a share of the
 person's height in the picture. A shift of the person counts as blur, too.
 
-The verdict on a picture, or on several (`verdict`), comes from the equivalent blur and from the
-**overlap** of the rendered alpha with the mask (`avatar.evaluation.image_metrics.overlap`: 1 where they agree, low
-for fog and for a body that does not cover its mask):
+The verdict on an image, or on several (`overall_verdict`), comes from the equivalent blur and from the
+**overlap** of the rendered alpha with the mask (`avatar.evaluation.image_metrics.soft_iou`: 1 where
+they agree, low for fog and for a body that does not cover its mask):
 
 | verdict | equivalent blur at most | on a person of 1.75 m | what is seen |
 |---|---|---|---|
@@ -22,8 +22,8 @@ for fog and for a body that does not cover its mask):
 Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB and 1.2 %
 at 27 dB after 45 steps; with poses 6° and 4 cm off, 4 and 8 % with overlaps of 0.68 and 0.59 in two
 frames, at 19 dB. The real person of eight photographs has 1.2 and 1.6 % at 22.8 dB in the given
-poses. Fog has an overlap of 0.38 (26 steps, 13 dB) to 0.47 (24 steps, 18 dB). A run that learnt the
-room instead of the person (masks that show everything) has 0.15 to 0.27 at 7.8 dB, beyond the
+poses. Fog has an overlap of 0.38 (26 steps, 13 dB) to 0.47 (24 steps, 18 dB). A run that reconstructed
+the room instead of the person (masks that cover everything) has 0.15 to 0.27 at 7.8 dB, beyond the
 widest blur. 14 cm is thicker than an arm or a leg: what is blurred by more shows no person any
 longer.
 """
@@ -41,36 +41,34 @@ from jaxtyping import Bool, Float32
 from avatar.evaluation.image_metrics import psnr
 
 SharpnessVerdict = Literal["sharp", "soft", "blurred", "failed"]
-"""From the best to the worst."""
+"""Verdicts from the best to the worst."""
 
-MAX_SHARP_BLUR, MAX_SOFT_BLUR, MAX_MEASURABLE_BLUR = 0.0075, 0.0125, 0.08
-"""The largest equivalent blur of each verdict, as a share of the person's height."""
+MAX_SHARP_BLUR = 0.0075
+"""Largest equivalent blur of a sharp image, as a share of the person's height."""
+MAX_SOFT_BLUR = 0.0125
+"""Largest equivalent blur of a soft image."""
+MAX_MEASURABLE_BLUR = 0.08
+"""Largest equivalent blur of a blurred image; beyond it the avatar has failed."""
 MIN_OVERLAP = 0.5
-"""Below it the picture does not show the body that the mask shows."""
+"""Overlap below which the image does not show the body of the mask."""
 CALIBRATION_BLURS = (0.0025, 0.005, 0.01, 0.02, 0.04, MAX_MEASURABLE_BLUR)
-"""Blurs of the yardstick, as shares of the person's height."""
+"""Blurs of the calibration, as shares of the person's height."""
 DOWNSAMPLE_SIGMA_PX = 4.0
-"""A picture that is blurred by this many pixels or more is shrunk first: quicker, and it loses
-nothing that the blur would have left."""
+"""Blur from which the image is downsampled first, pixels: faster, and without visible loss."""
 
 
 @runtime_checkable
 class SharpnessScore(Protocol):
-    """A scored picture.
-
-    Attributes:
-        blur: Equivalent blur, as a share of the person's height; NaN if it was not measured.
-        overlap: Of the rendered alpha with the mask, in [0, 1]; NaN if it was not measured.
-    """
+    """A score with an equivalent blur and an overlap."""
 
     @property
     def blur(self) -> float:
-        """As above."""
+        """Equivalent blur, as a share of the person's height; NaN if not measured."""
         ...
 
     @property
     def overlap(self) -> float:
-        """As above."""
+        """Soft IoU of the rendered alpha and the mask, in [0, 1]; NaN if not measured."""
         ...
 
 
@@ -93,14 +91,15 @@ def calibrate_blur(
 
 
 def equivalent_blur(psnr_mask: float, calibration: BlurCalibration) -> float:
-    """The blur that costs a frame as many decibels, as a share of the person's height.
+    """The blur that lowers a frame's PSNR as much, as a share of the person's height.
 
     Args:
-        psnr_mask: Of the rendering where alpha > 0.5, dB.
-        scale: Of the same frame.
+        psnr_mask: PSNR of the rendering where alpha > 0.5, dB.
+        calibration: Calibration of the same frame.
 
     Returns:
-        No less than the first of `CALIBRATION_BLURS`; infinite beyond the last; NaN without a silhouette.
+        A blur of at least the first of `CALIBRATION_BLURS`; infinite beyond the last; NaN without a
+        silhouette.
     """
     if not calibration or isnan(psnr_mask):
         return nan
@@ -116,7 +115,7 @@ def equivalent_blur(psnr_mask: float, calibration: BlurCalibration) -> float:
 
 
 def sharpness_verdict(blur: float | None, overlap: float | None) -> SharpnessVerdict | None:
-    """The word for an equivalent blur and an overlap; None if neither was measured."""
+    """Verdict on an equivalent blur and an overlap; None if neither was measured."""
     if overlap is not None and overlap < MIN_OVERLAP:
         return "failed"
     if blur is None or isnan(blur):
@@ -127,19 +126,19 @@ def sharpness_verdict(blur: float | None, overlap: float | None) -> SharpnessVer
 
 
 def median_blur(blurs: Iterable[float]) -> float | None:
-    """The blur that at least half of the frames stay within; None if none was measured."""
+    """Lower median of the blurs; None if none was measured."""
     known = [blur for blur in blurs if not isnan(blur)]
     return median_low(known) if known else None
 
 
 def median_overlap(overlaps: Iterable[float]) -> float | None:
-    """The overlap that at least half of the frames reach; None if none was measured."""
+    """Upper median of the overlaps; None if none was measured."""
     known = [overlap for overlap in overlaps if not isnan(overlap)]
     return median_high(known) if known else None
 
 
 def overall_verdict(scores: Iterable[SharpnessScore]) -> SharpnessVerdict | None:
-    """The word for several pictures: at least half of them are this good; None without any."""
+    """Verdict that at least half of the images reach; None without any."""
     scores = list(scores)
     return sharpness_verdict(
         median_blur(score.blur for score in scores),
@@ -150,7 +149,7 @@ def overall_verdict(scores: Iterable[SharpnessScore]) -> SharpnessVerdict | None
 def better_verdict(
     one: SharpnessVerdict | None, other: SharpnessVerdict | None
 ) -> SharpnessVerdict | None:
-    """The better of two verdicts on one avatar: poses that are off are not its fault."""
+    """The better of two verdicts on one avatar, as wrong poses are not its fault."""
     known: list[SharpnessVerdict] = [word for word in (one, other) if word is not None]
     return min(known, key=get_args(SharpnessVerdict).index) if known else None
 
@@ -158,7 +157,7 @@ def better_verdict(
 def _gaussian_blur(
     picture: Float32[np.ndarray, "height width 3"], sigma_px: float
 ) -> Float32[np.ndarray, "height width 3"]:
-    """A Gaussian blur; beyond the border the picture is mirrored."""
+    """Gaussian blur with mirrored borders."""
     height, width = picture.shape[:2]
     factor = int(sigma_px / DOWNSAMPLE_SIGMA_PX)
     if factor < 2:

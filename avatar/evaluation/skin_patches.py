@@ -25,12 +25,12 @@ ADJACENT_M = 0.045
 """Patches whose centres are this close, and that look the same way, touch."""
 OCCLUSION_TOLERANCE_M = 0.01
 MAX_SOLE_NORMAL_Y = -0.5
-"""Feet are not asked for below this upward share of their normal: nobody shows their soles."""
+"""Upward component of a foot's normal below which it is a sole, which no one is asked to show."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinPatches:
-    """Pieces of skin of about 2 cm that somebody around the person could see.
+    """Pieces of skin of about 2 cm that are visible from around the person.
 
     Attributes:
         points: Their centres in the rest pose (SMPL's T-pose), metres.
@@ -53,7 +53,7 @@ class SkinPatches:
     def from_shaped_body(cls, shaped: ShapedBody) -> "SkinPatches":
         """The patches of one person: vertices of the same 2-cm voxel, part and side, together.
 
-        Left out is what nobody sees: the mouth's inside, and the soles.
+        The inside of the mouth and the soles, which are never visible, are left out.
         """
         weights = shaped.body.weights
         surface = shaped.vertices, shaped.body.faces

@@ -1,8 +1,8 @@
-"""A pose's step: Gauss-Newton on what its rays ask for, and none where they do not agree.
+"""Gauss-Newton step of one pose from the gradients of its rays, scaled by their agreement.
 
-Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so that JᵀJ = Σ ∇ℓ ∇ℓᵀ / 2ℓ needs nothing but the
-rays' own gradients. The same gradients tell how much of their sum is chance: what the field does
-not show well yet pulls each ray another way, a pose that is off pulls them all one way.
+Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so JᵀJ = Σ ∇ℓ ∇ℓᵀ / 2ℓ follows from the rays' own
+gradients. The same gradients measure the noise in their sum: errors of the field point each ray's
+gradient another way, an error of the pose points them all one way.
 """
 
 from typing import NamedTuple
@@ -13,28 +13,30 @@ from jaxtyping import Float, Float32
 from avatar.pose.temporal_prior import UNINFORMATIVE_PRIOR, PosePrior
 
 PRIOR_SIGMA_RAD = 0.05
-"""How far a tracker's rotations are off, give or take: what no picture determines stays there."""
+"""Prior standard deviation of a tracker's rotations, radians."""
 PRIOR_SIGMA_M = 0.025
-"""The same of the root's place, metres."""
+"""Prior standard deviation of the root's position, metres."""
 OVERRELAXATION = 1.6
-"""Steps longer than Gauss-Newton's: the field that a pose is compared with follows the pose."""
-MIN_EVIDENCE, FULL_EVIDENCE = 1.5, 2.0
-"""Evidence, the frame's and all frames' halves, up to which a pose stays, and from which it moves
-wholly. Of exact poses 5 % show 1.8, and all together 1.2; poses off by 2° show 3 to 6."""
+"""Factor of the Gauss-Newton step, above 1 because the field follows the pose."""
+MIN_EVIDENCE = 1.5
+"""Evidence, averaged over the frame and all frames, up to which a pose does not move. Of exact
+poses 5 % reach 1.8, with a mean of 1.2; poses off by 2° reach 3 to 6."""
+FULL_EVIDENCE = 2.0
+"""Evidence from which a pose makes the full step."""
 MIN_RAY_LOSS = 1e-3
-"""Of a ray: an error of 0.014 in one channel. What is smaller counts no more than this."""
+"""Floor of a ray's loss in the curvature: an error of 0.014 in one channel."""
 MAX_STEP = 0.1
-"""No number changes by more at once, in radians or metres."""
+"""Largest change of a parameter in one step, radians or metres."""
 
 
 class GaussNewtonStep(NamedTuple):
-    """What a frame's rays ask its pose to do.
+    """Step of one pose correction.
 
     Attributes:
-        change: Of the correction: radians, and metres in the last row.
+        change: Change of the correction: radians, and metres in the last row.
         evidence: Mean of (Σ g)² / Σ g² over the directions that the rays determine: about 1 if
-            their gradients g are chance, about their number if all say the same.
-        alone: The correction that the rays would end at without neighbours, in units of its spread.
+            their gradients g are noise, about the number of rays if all agree.
+        unregularized: Correction that the rays alone would converge to, in prior sigmas.
     """
 
     change: Float[np.ndarray, "25 3"]
@@ -51,16 +53,16 @@ def gauss_newton_step(
     prior: PosePrior = UNINFORMATIVE_PRIOR,
     overrelaxation: float = OVERRELAXATION,
 ) -> GaussNewtonStep:
-    """The step that brings a pose to where its rays fit, as far as they determine it.
+    """The step towards the pose at which the rays fit, in the directions that they determine.
 
     Args:
-        gradients: Of each ray's loss for the correction.
-        loss: Of each ray.
-        correction: As it is; directions that the rays leave open go back to what is expected.
-        common: Mean evidence of all frames: they were tracked alike. Infinite where a pose is to
-            move in any case.
-        prior: What is believed of the correction before these rays are asked.
-        overstep: Length of the step, in Gauss-Newton's.
+        gradients: Gradient of each ray's loss with respect to the correction.
+        loss: Loss of each ray.
+        correction: Current correction; undetermined directions return to the prior.
+        shared_evidence: Mean evidence of all frames, which one tracker produced; infinite if the
+            pose is to move in any case.
+        prior: Prior of the correction.
+        overrelaxation: Factor of the Gauss-Newton step.
     """
     scale = np.full((25, 3), PRIOR_SIGMA_RAD, dtype=np.float32)
     scale[24] = PRIOR_SIGMA_M
@@ -70,7 +72,7 @@ def gauss_newton_step(
     determined = determined.clip(min=0.0)
     along = scaled @ axes
     chance, wish = (along**2).sum(axis=0), along.sum(axis=0)
-    # what one unit of curvature is worth beside one spread of the prior: the rays' mean 2ℓ
+    # the prior's stiffness in units of the curvature: one sigma weighs as much as a mean ray
     given = chance.sum() / (determined.sum() + 1e-12) + 1e-12
     told = determined > given
     evidence = float(np.mean(wish[told] ** 2 / (chance[told] + 1e-12))) if told.any() else 0.0

@@ -1,11 +1,11 @@
-"""Pose refinement: trackers' poses corrected while the avatar is learnt.
+"""Pose refinement: corrects the tracker's poses during training.
 
 A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
 gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
-wrench per bone (`avatar.numba_kernels.numba_skinning`). A few hundred rays of a frame make one Gauss-Newton
-step (`avatar.pose.gauss_newton`); exact poses are left alone, and soon asked about only seldom. What all
-frames share is no error of a frame but a change of the canonical body, so the mean correction is
-taken out again and again.
+wrench per bone (`avatar.numba_kernels.numba_skinning`). A few hundred rays of a frame make one
+Gauss-Newton step (`avatar.pose.gauss_newton`); exact poses do not move, and are soon probed rarely.
+A correction that all frames share is a change of the canonical body rather than an error of a
+frame, so the mean correction is removed continually.
 """
 
 import math
@@ -26,62 +26,63 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, rotation_matrices
 
 MAX_RAYS_PER_FRAME = 512
-"""Rays of a frame that are kept until its pose is corrected."""
+"""Rays per frame that are accumulated until its pose is corrected."""
 MIN_RAYS_PER_CORRECTION = 256
-"""A frame's pose is corrected when this many of its rays have been seen since it last was."""
+"""Rays of a frame between two corrections of its pose."""
 MIN_POSE_GRADIENT_CELL_M = 0.025
-"""Only levels of the grid with cells as large as this pull at poses: finer ones say where to go
-from a few millimetres away, and point anywhere from farther off."""
+"""Smallest cells of the hash levels whose gradient reaches the poses, metres. Finer levels point to
+the right place from a few millimetres away only."""
 EVIDENCE_EMA_DECAY = 0.95
-"""Of the mean evidence, and of the share of corrections that moved a pose."""
+"""Decay of the mean evidence and of the share of corrections that moved a pose."""
 MAX_CORRECTION_INTERVAL = 8
-"""Steps from one pull to the next where poses are exact."""
+"""Steps between pose gradients where poses are exact."""
 MAX_JOINT_STEP_M = 0.04
-"""No joint moves farther at one correction: the frame's warp must be able to follow."""
+"""Largest motion of a joint in one correction, metres; the roots must be able to follow it."""
 RESOLVE_DISTANCE_M = 0.08
-"""When a joint has moved this far since the frame's warp was solved, it is solved anew."""
+"""Motion of a joint after which the frame's correspondences are solved again, metres."""
 MEAN_CORRECTION_DECAY = 0.2
-"""Share of the mean correction taken out of a frame's at each of its corrections."""
+"""Share of the mean correction that is removed from a frame's at each of its corrections."""
 FIRST_CORRECTION_STEPS = 60
-"""A frame's pose is corrected once its frame has been learnt from for so many steps: before, the
-field does not know what is seen from there, and what is new looks like what is off."""
-MIN_STEPS_BEFORE_FREEZE, MIN_ESTIMATES_BEFORE_FREEZE = 300, 3
-"""A pose is judged once its frame has been learnt from for so many steps, by so many pulls."""
+"""Training steps on a frame before its pose is first corrected. Earlier the field does not know the
+view, and new content looks like a pose error."""
+MIN_STEPS_BEFORE_FREEZE = 300
+"""Training steps on a frame before its pose may be frozen as exact."""
+MIN_ESTIMATES_BEFORE_FREEZE = 3
+"""Gauss-Newton estimates of a pose before it may be frozen as exact."""
 MAX_EXACT_EVIDENCE = 1.3
-"""Mean evidence, the frame's and all frames' halves, below which a pose counts as exact and stays
-as it is for good. Were it asked for ever, chance would move it, what it moves would blur the field,
-and a blurred field moves the next: at 540 px that ran away after three thousand steps."""
+"""Evidence, averaged over the frame and all frames, below which a pose is exact and is frozen.
+Otherwise noise would move it, the motion would blur the field, and the blurred field would move the
+next pose: at 540 px this diverged after three thousand steps."""
 FREEZE_AFTER_STEPS = 3000
-"""Steps after which any pose stays as it is: what the field shows of it by then is as much its own
-memory of that pose as evidence."""
+"""Training steps on a frame after which its pose is frozen; by then the field has memorised it."""
 MAX_CORRECTION = 0.35
-"""A correction never grows beyond this, in radians or metres: a pose that far off is lost."""
+"""Largest correction of a parameter, radians or metres; a pose farther off cannot be recovered."""
 
 
 @final
 class PoseOptimizer:
-    """The poses of the frames in replay, each with its correction.
+    """Poses of the replay frames and their corrections.
 
-    A correction is 75 numbers: axis-angles of the root and of 23 joints, applied in each one's own
-    frame before the given rotation, and the root's shift in the given body frame, metres.
+    A correction has 75 numbers: axis-angle rotations of the root and of 23 joints, each applied in
+    its own frame before the tracker's rotation, and the root's shift in the given body frame, m.
 
     Attributes:
-        corrections: (slots, 25, 3): root rotation, joint rotations, root shift.
-        bones: Body-from-canonical matrices of the corrected poses.
+        corrections: Root rotation, joint rotations and root shift of each slot.
+        bones: Body-from-canonical transforms of the corrected poses.
     """
 
     def __init__(
         self, rig: Rig, capacity: int, device: torch.device, *, avatar_frozen: bool = False
     ) -> None:
-        """A table without poses.
+        """Starts without poses.
 
         Args:
-            rig: Whose body.
-            capacity: How many poses it may hold.
-            device: Where gradients are gathered.
-            frozen: Whether the avatar stays as it is, and only the poses are looked for: no pose
-                can blur it then, so all move, and no farther than their rays ask; and what they
-                share is no change of the canonical body.
+            rig: Rig of the person.
+            capacity: Number of slots.
+            device: Device that accumulates the gradients.
+            avatar_frozen: Whether only the poses are optimized. A pose cannot blur a fixed avatar,
+                so all poses move, without overrelaxation, and a correction that they share is not a
+                change of the canonical body.
         """
         self.rig = rig
         self._mean_decay, self._overrelaxation = (
@@ -121,14 +122,14 @@ class PoseOptimizer:
         frame: int | None = None,
         step: int = 0,
     ) -> None:
-        """Takes in a frame's given pose.
+        """Assigns a frame's pose to a slot.
 
         Args:
-            slot: Its place.
-            pose: As the tracker has it.
-            correction: If one is known.
-            frame: Its number: poses of frames in a row err alike. None if nothing is in a row.
-            step: Since when it is learnt from.
+            slot: Slot of the frame.
+            pose: The tracker's pose.
+            correction: Initial correction, if one is known.
+            frame: Index of the frame, whose neighbors have similar errors; None if it has none.
+            step: Training step from which the frame is trained on.
         """
         self._tracker_poses[slot] = pose
         self._added_at_step[slot] = step
@@ -161,10 +162,9 @@ class PoseOptimizer:
         )
 
     def freeze_converged(self, step: int) -> bool:
-        """Which poses may be corrected now; whether there are any.
+        """Freezes converged poses, and returns whether any pose may be corrected now.
 
-        Those whose frames are new wait; those that proved exact, or were refined long enough, stay
-        as they are for good.
+        Poses of new frames wait; poses that proved exact, or were refined long enough, are frozen.
         """
         held = np.array([pose is not None for pose in self._tracker_poses])
         age = step - self._added_at_step
@@ -185,7 +185,7 @@ class PoseOptimizer:
         wrenches: Float32[Tensor, "rays 24 6"],
         loss: Float32[Tensor, "rays"],
     ) -> None:
-        """Keeps what a step's rays exert on their frames' bones; slots ascend."""
+        """Accumulates the wrenches of a step's rays on their frames' bones; slots must ascend."""
         counts = torch.bincount(slots, minlength=len(self._ray_counts))
         rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
         place = self._ray_counts[slots] + rank
@@ -197,13 +197,13 @@ class PoseOptimizer:
         )
 
     def correct_next(self, *, rate: float) -> int | None:
-        """Corrects the pose about which most has been found out; cells and rays must follow.
+        """Corrects the pose with the most accumulated rays; its roots and rays have to follow.
 
         Args:
             rate: Factor of the steps, in (0, 1].
 
         Returns:
-            The slot, or None if no frame has seen enough rays or the pose stays as it is.
+            The slot, or None if no frame has enough rays or the pose does not move.
         """
         slot = int(self._ray_counts.argmax())
         rows = int(self._ray_counts[slot])
@@ -212,7 +212,8 @@ class PoseOptimizer:
         loss = self._losses[slot, :rows].cpu().numpy()
         step = gauss_newton_step(
             self.pose_gradients(slot), loss, self.corrections[slot], self._evidence,
-            prior=self._temporal_prior.prior_for(slot, self.corrections), overrelaxation=self._overrelaxation,
+            prior=self._temporal_prior.prior_for(slot, self.corrections),
+            overrelaxation=self._overrelaxation,
         )  # fmt: skip
         self._ray_counts[slot] = 0
         self._temporal_prior.record_estimate(slot, step.unregularized)
@@ -234,13 +235,13 @@ class PoseOptimizer:
 
     @property
     def correction_interval(self) -> int:
-        """Steps from one pull at poses to the next, 1 to 8: more where poses prove to be exact."""
+        """Steps between pose gradients, 1 to 8; more where poses prove to be exact."""
         return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
 
     def needs_resolve(self, slot: int) -> bool:
-        """Whether the slot's pose has left the one for which its warp was last solved.
+        """Whether the slot's pose has moved too far from the one its correspondences were solved for.
 
-        Saying so counts as solving it anew.
+        The caller is expected to solve them when the answer is True.
         """
         places = self._joint_positions(slot)
         moved = np.linalg.norm(places - self._joints_at_solve[slot], axis=1).max()
@@ -249,18 +250,18 @@ class PoseOptimizer:
         return bool(moved > RESOLVE_DISTANCE_M)
 
     def root_correction(self, slot: int) -> RootCorrection:
-        """How the slot's rays move."""
+        """Motion of the slot's rays by its root correction."""
         turn, shift = self.corrections[slot, 0], self.corrections[slot, 24]
         return RootCorrection(
             rotation=rotation_matrices(turn), shift=shift, pivot=self.rig.rest_joints[0]
         )
 
     def pose_gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
-        """Gradient of each kept ray's loss for the slot's correction, from its bones' wrenches.
+        """Gradient of each accumulated ray's loss with respect to the slot's correction.
 
-        A joint that turns by ω about its place c carries every bone below it:
-        dL/dω = -Σ (M - c × F), in the axes of the body frame; here it is expressed in those of the
-        joint, where the corrections live.
+        By virtual work: a joint at c that rotates by ω moves every bone below it, so that
+        dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in the axes of the body frame. It is
+        expressed in the axes of the joint, in which the corrections are.
         """
         wrench = self._wrenches[slot, : int(self._ray_counts[slot])].cpu().numpy()
         felt = np.zeros((25, 3, 24, 6))
@@ -274,7 +275,7 @@ class PoseOptimizer:
         return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
 
     def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
-        """Moves a pose to its new correction, or as far towards it as its cells can follow."""
+        """Applies a correction, or the part of it that the frame's roots can follow."""
         before, places = self.corrections[slot].copy(), self._joint_positions(slot)
         self.corrections[slot] = correction
         self._update_bones(slot)
@@ -284,13 +285,13 @@ class PoseOptimizer:
             self._update_bones(slot)
 
     def _joint_positions(self, slot: int) -> Float[np.ndarray, "24 3"]:
-        """Where the joints are, body frame, metres."""
+        """Joint positions in the body frame, metres."""
         posed = self._joint_transforms[slot]
         turned = np.einsum("jab,jb->ja", posed[:, :3, :3], self.rig.rest_joints)
         return turned + posed[:, :3, 3]
 
     def _update_bones(self, slot: int) -> None:
-        """Lets the slot's joints and bones follow its correction."""
+        """Updates the slot's joint and bone transforms to its correction."""
         rig = self.rig
         self._joint_transforms[slot] = body_from_rest(
             rig.rest_joints, rig.parents, self.pose(slot).joint_rotations

@@ -1,8 +1,8 @@
-"""What the poses around a frame's say of its error: trackers wander rather than flicker.
+"""Temporal prior of a pose correction: a tracker's error changes slowly from frame to frame.
 
-A tracker's error is much the same from one frame to the next, so where a frame's own rays leave its
-pose open, its neighbours' corrections are a better guess than none. Whether they are is found out
-from what the rays alone would make of each pose: where errors flicker, nothing is shared.
+Where a frame's own rays leave its pose undetermined, the corrections of neighboring frames are a
+better guess than none. Whether that holds is measured on the corrections that the rays alone would
+make: if neighbors are uncorrelated, nothing is shared.
 """
 
 from collections.abc import Mapping
@@ -12,21 +12,23 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 MIN_NEIGHBOR_PAIRS = 12
-"""Fewer neighbours do not tell whether errors hang together."""
+"""Neighbor pairs below which their correlation cannot be measured."""
 MAX_FRAME_GAP = 6
-"""Frames; neighbours farther apart say nothing."""
-MIN_CORRELATION, FULL_CORRELATION = 0.1, 0.3
-"""Correlation of neighbours' errors up to which they say nothing, and from which they say all."""
+"""Distance in frames beyond which neighbors are ignored."""
+MIN_CORRELATION = 0.1
+"""Correlation of neighbors' errors up to which they are ignored."""
+FULL_CORRELATION = 0.3
+"""Correlation of neighbors' errors from which they have their full precision."""
 NEIGHBOR_PRECISION = 8.0
-"""How much all neighbours together are then believed, in times of the given pose."""
+"""Precision of all neighbors together, relative to that of the tracker's pose."""
 
 
 class PosePrior(NamedTuple):
-    """What is believed of a correction before its frame's rays are asked.
+    """Prior of a correction, before the evidence of its frame's rays.
 
     Attributes:
-        mean: The correction that is expected: radians, and metres in the last row.
-        precision: How sure that is, in times of what is believed of a frame without neighbours.
+        mean: Expected correction: radians, and metres in the last row.
+        precision: Precision relative to that of a frame without neighbors.
     """
 
     mean: Float[np.ndarray, "25 3"]
@@ -34,26 +36,26 @@ class PosePrior(NamedTuple):
 
 
 UNINFORMATIVE_PRIOR = PosePrior(np.zeros((25, 3)), 1.0)
-"""Nobody tells anything: the given pose is as likely as it ever is."""
+"""Prior without neighbors: the tracker's pose, with its own precision."""
 
 
 @final
 class TemporalPosePrior:
-    """What is known of the frames in replay as neighbours of one another."""
+    """Estimates of the replay frames' corrections, as neighbors of one another."""
 
     def __init__(self, capacity: int) -> None:
-        """Nothing yet, of so many slots."""
+        """Starts without frames, for a number of slots."""
         self._frames = np.zeros(capacity, dtype=np.int64)
         self._unregularized = np.zeros((capacity, 25, 3))
         self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
 
     def set_frame(self, slot: int, frame: int | None) -> None:
-        """A slot takes in a frame of this number; None if it has no neighbours."""
+        """Assigns a frame number to a slot; None if the frame has no neighbors."""
         self._is_sequential[slot], self._has_estimate[slot] = frame is not None, False
         self._frames[slot] = frame or 0
 
     def record_estimate(self, slot: int, unregularized: Float[np.ndarray, "25 3"]) -> None:
-        """What a slot's rays alone would correct, in units of its spread."""
+        """Records the correction that a slot's rays alone would make, in prior sigmas."""
         self._unregularized[slot], self._has_estimate[slot] = (
             unregularized,
             self._is_sequential[slot],
