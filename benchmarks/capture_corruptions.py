@@ -107,7 +107,7 @@ def drop_first_poses(frames: int) -> Corruption:
 
 
 def resample_poses(rate: float) -> Corruption:
-    """Rows of a copy of the video that had so many times its frame rate; none has a number."""
+    """Poses of a copy of the video at a multiple of its frame rate, without frame numbers."""
 
     def spoil(folder: Path) -> None:
         _change_poses(
@@ -306,7 +306,7 @@ def keep_last_poses(frames: int) -> Corruption:
 
 
 def add_second_person(folder: Path) -> None:
-    """Somebody else stands at the left side of every mask."""
+    """Add a second person at the left side of every mask."""
     for path in sorted((folder / "masks").iterdir()):
         mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert mask is not None
@@ -317,7 +317,7 @@ def add_second_person(folder: Path) -> None:
 
 
 def rewrite_video(folder: Path, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> None:
-    """Writes the film's pictures anew, losslessly; masks and poses stay."""
+    """Rewrite the video's images losslessly; masks and poses stay."""
     path = folder / "video.mp4"
     reader = cv2.VideoCapture(str(path))
     fps, pictures = reader.get(cv2.CAP_PROP_FPS), []

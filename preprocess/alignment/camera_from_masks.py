@@ -1,4 +1,4 @@
-"""Where a camera that nobody described must have stood, found from masks alone."""
+"""Fit camera parameters to masks: focal length, principal point, or the whole pose."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,58 +14,64 @@ from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_
 from preprocess.body.silhouette import soft_iou, splat_silhouette
 
 CAMERA_SAMPLES = 6
+"""Frames to which a camera is fitted."""
 MAX_CENTER_OFFSET = 0.45
-"""Share of a picture's sides by which its principal point may be off."""
+"""Largest shift of the principal point, as a fraction of the image's sides."""
 YAW_STARTS = 24
+"""Directions around the person from which the search for a camera starts."""
 LEVEL_CAMERAS = {
     "y": np.diag([1.0, -1.0, -1.0]),
     "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
-"""Level OpenCV cameras in worlds with y or z up."""
+"""Rotations of level OpenCV cameras, by the axis that is up in the world."""
 REFINED_STARTS = 2
+"""Best starts that are refined."""
 CAMERA_EVALUATIONS = 200
-FIRST_TURN_RAD, FIRST_SHIFT_M = 0.15, 0.15
-"""Size of the first steps of the search."""
+"""Evaluations of one refinement."""
+FIRST_TURN_RAD = 0.15
+"""First step of the rotation, radians."""
+FIRST_SHIFT_M = 0.15
+"""First step of the translation, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _CameraProblem:
-    """Posed bodies in the world, and their masks, for one camera that stands still."""
+    """Posed bodies in the world and their masks, for one static camera."""
 
-    claim: CaptureGeometry
-    evidence: SilhouetteObjective
+    geometry: CaptureGeometry
+    objective: SilhouetteObjective
 
     @cached_property
     def camera_rows(self) -> list[int]:
-        """The camera of each of the bodies."""
-        witnesses = self.evidence.samples
-        return [w.camera_row for w in witnesses if self.claim.row_for_frame(w.index) is not None]
+        """Index of the camera of each body."""
+        samples = self.objective.samples
+        return [w.camera_row for w in samples if self.geometry.row_for_frame(w.index) is not None]
 
     @cached_property
     def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "_ _"]]]:
         found = []
-        for witness in self.evidence.samples:
-            row = self.claim.row_for_frame(witness.index)
+        for sample in self.objective.samples:
+            row = self.geometry.row_for_frame(sample.index)
             if row is not None:
-                points = self.evidence.posed_points(self.claim.motion, row)
-                found.append((points, witness.alpha))
+                points = self.objective.posed_points(self.geometry.motion, row)
+                found.append((points, sample.alpha))
         return found
 
     def mean_iou(self, extrinsic: Float[np.ndarray, "4 4"]) -> float:
-        """Mean agreement if the camera stood there."""
-        claim = replace(self.claim, extrinsics=extrinsic[None])
-        camera = claim.camera_at(0, self.evidence.size_px)
+        """Mean IoU of bodies and masks seen from this camera."""
+        geometry = replace(self.geometry, extrinsics=extrinsic[None])
+        camera = geometry.camera_at(0, self.objective.size_px)
         return float(np.mean([soft_iou(splat_silhouette(p, camera), a) for p, a in self.bodies]))
 
     def extrinsic_for(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-        """The camera of a given direction from which the bodies are where the masks are."""
+        """The camera of a given rotation that puts the bodies where the masks are."""
         extrinsic = np.eye(4)
         extrinsic[:3, :3] = rotation
         extrinsic[:3, 3] = -rotation @ np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
         extrinsic[2, 3] += 4.0
         for _ in range(4):
-            camera = replace(self.claim, extrinsics=extrinsic[None]).camera_at(
-                0, self.evidence.size_px
+            camera = replace(self.geometry, extrinsics=extrinsic[None]).camera_at(
+                0, self.objective.size_px
             )
             drawn = np.median(
                 [_point_bounds(camera.project(p[::8])) for p, _ in self.bodies], axis=0
@@ -110,19 +116,19 @@ def fit_factor(
 def fit_principal_point(
     geometry: CaptureGeometry, objective: SilhouetteObjective
 ) -> Correction | None:
-    """The principal point with which bodies are where the masks are.
+    """Fit the principal point that puts the bodies where the masks are.
 
-    None if no mask has a pose, or they are so far apart that no cropping explains it.
+    None if no mask has a pose, or the shift is too large to be a crop.
     """
-    scene = _CameraProblem(claim=geometry, evidence=objective.subset(CAMERA_SAMPLES))
-    if not scene.bodies:
+    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
+    if not problem.bodies:
         return None
     small = np.array(objective.size_px) / np.array(geometry.size_px)
-    wanted = np.stack([_mask_bounds(alpha) for _, alpha in scene.bodies])
+    wanted = np.stack([_mask_bounds(alpha) for _, alpha in problem.bodies])
     drawn = np.stack(
         [
             _point_bounds(geometry.camera_at(row, objective.size_px).project(points[::8]))
-            for (points, _), row in zip(scene.bodies, scene.camera_rows, strict=True)
+            for (points, _), row in zip(problem.bodies, problem.camera_rows, strict=True)
         ]
     )
     away = np.median(wanted - drawn, axis=0)
@@ -132,20 +138,23 @@ def fit_principal_point(
 
 
 def fit_extrinsics(geometry: CaptureGeometry, objective: SilhouetteObjective) -> Correction | None:
-    """The camera that fits best, if there is one camera and any masks have poses.
+    """Fit the pose of a static camera; None if there are several cameras, or no mask has a pose.
 
-    Level cameras from all sides, in worlds with y or z up; the best are moved and turned freely.
+    Starts from level cameras on all sides, in worlds with y or z up; the best are refined freely.
     """
-    scene = _CameraProblem(claim=geometry, evidence=objective.subset(CAMERA_SAMPLES))
-    if len(geometry.extrinsics) > 1 or not scene.bodies:
+    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
+    if len(geometry.extrinsics) > 1 or not problem.bodies:
         return None
+    yaws = [2.0 * np.pi * k / YAW_STARTS for k in range(YAW_STARTS)]
     starts = [
-        scene.extrinsic_for(up @ _yaw_rotation(up, 2.0 * np.pi * k / YAW_STARTS)) for up in LEVEL_CAMERAS.values()
-        for k in range(YAW_STARTS)
-    ]  # fmt: skip
-    starts.sort(key=scene.mean_iou, reverse=True)
+        problem.extrinsic_for(level @ _yaw_rotation(level, yaw))
+        for level in LEVEL_CAMERAS.values()
+        for yaw in yaws
+    ]
+    starts.sort(key=problem.mean_iou, reverse=True)
     extrinsic = max(
-        (_refine_extrinsics(scene, start) for start in starts[:REFINED_STARTS]), key=scene.mean_iou
+        (_refine_extrinsics(problem, start) for start in starts[:REFINED_STARTS]),
+        key=problem.mean_iou,
     )
     return Correction(
         cause="world_frame",
@@ -155,18 +164,18 @@ def fit_extrinsics(geometry: CaptureGeometry, objective: SilhouetteObjective) ->
     )
 
 
-def _yaw_rotation(up: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """A turn of the world about the axis that is up in it."""
-    return Rotation.from_rotvec(-angle * up[1]).as_matrix()
+def _yaw_rotation(level: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world about its up axis."""
+    return Rotation.from_rotvec(-angle * level[1]).as_matrix()
 
 
 def _refine_extrinsics(
-    scene: _CameraProblem, start: Float[np.ndarray, "4 4"]
+    problem: _CameraProblem, start: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Moved and turned about the bodies' middle until masks agree best (Nelder and Mead)."""
+    """Move the camera and turn it about the bodies' center (Nelder-Mead on the mean IoU)."""
     from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
 
-    middle = np.mean([p.mean(axis=0) for p, _ in scene.bodies], axis=0) @ start[:3, :3].T
+    middle = np.mean([p.mean(axis=0) for p, _ in problem.bodies], axis=0) @ start[:3, :3].T
 
     def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
         turn = Rotation.from_rotvec(x[:3]).as_matrix()
@@ -177,7 +186,7 @@ def _refine_extrinsics(
 
     size = np.diag([FIRST_TURN_RAD] * 3 + [FIRST_SHIFT_M] * 3)
     found = minimize(
-        lambda x: -scene.mean_iou(moved(x)), np.zeros(6), method="Nelder-Mead",
+        lambda x: -problem.mean_iou(moved(x)), np.zeros(6), method="Nelder-Mead",
         options={"maxfev": CAMERA_EVALUATIONS, "initial_simplex": np.vstack([np.zeros(6), size])},
     )  # fmt: skip
     return moved(found.x)

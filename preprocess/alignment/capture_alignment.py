@@ -1,12 +1,9 @@
-"""A focal length that nobody knows, found from masks and poses.
+"""Alignment of a capture: the poses' body model, their placement, and an unknown focal length.
 
-Poses brought to the body that is really used: another than their tracker's, or the avatar's own.
-
-Without SMPL's file, SMPL's poses move the embedded body; and poses that are added to a finished
-avatar move the person that it has, whatever their betas say. Rotations stay as they are; distance
-and place are solved anew from masks, or, where there are none, from the pictures themselves.
-
-Whose body poses were made for, where their file does not say: masks or pictures are asked.
+Poses may be for another body than the one that is used: without SMPL's file SMPL's poses move the
+embedded body, and poses that are added to a finished avatar move its own person, whatever their
+betas state. Rotations stay; distance and pelvis shift are fitted to masks or, without masks, to
+images. Where a file does not state the body model of its poses, the better fit decides.
 """
 
 from dataclasses import dataclass, replace
@@ -46,8 +43,9 @@ from preprocess.observe import associate_cameras, associate_masks
 from preprocess.poses.root_placement import place_in_camera_world
 
 FOCAL_SAMPLES = 6
+"""Frames to whose masks a focal length is fitted."""
 MIN_FOCAL_IOU = 0.6
-"""A focal length is believed if body and masks then agree by so much."""
+"""Mean IoU of body and masks from which a fitted focal length is taken."""
 
 
 def estimate_focal_length(
@@ -57,34 +55,33 @@ def estimate_focal_length(
     source: FrameSource,
     masks: Masks | None,
 ) -> CameraTrack:
-    """The assumed camera with the focal length by which the body covers the masks.
+    """Fit the focal length of an assumed camera so that the body covers the masks.
 
-    It is changed only if that fits clearly better. Of poses that another body was in mind for, size
-    and focal length cannot be told apart; then nothing is done.
+    It changes only if that fits clearly better, and not for poses of another body model: their size
+    and the focal length are ambiguous.
 
     Args:
         cameras: One camera, whose focal length was assumed (`assume_static_camera`).
-        motion: In the camera's world.
+        motion: Poses in the camera's world.
         shaped: The person.
         source: The frames; none is decoded.
-        masks: The masks; None if there are none in files, and then nothing is done.
+        masks: The masks; None if there are no mask files: then the camera stays.
     """
     if masks is None or motion.body_model != shaped.body.family:
         return cameras
-    claim = CaptureGeometry.of(motion, cameras, source)
+    geometry = CaptureGeometry.of(motion, cameras, source)
     try:
         row = associate_masks(masks, source)
         skin = SkinPoints.of(shaped)
-        evidence = sample_masks(source, masks, row, lambda frame: 0, skin, count=FOCAL_SAMPLES)
-    except InputError:  # parts that do not fit: that is said elsewhere
+        objective = sample_masks(source, masks, row, lambda frame: 0, skin, count=FOCAL_SAMPLES)
+    except InputError:  # parts that do not fit are reported elsewhere
         return cameras
-    factor = fit_factor(scale_focal_length, claim, evidence).factor or 1.0
-    before = mean_score(evidence.frame_scores(claim))
-    after = mean_score(evidence.frame_scores(scale_focal_length(factor).apply(claim)))
-    if (
-        after < max(MIN_FOCAL_IOU, before + MIN_FITTED_IOU_GAIN)
-        or abs(factor - 1.0) < MIN_FITTED_CHANGE
-    ):
+    scale = fit_factor(scale_focal_length, geometry, objective)
+    factor = scale.factor or 1.0
+    before = mean_score(objective.frame_scores(geometry))
+    after = mean_score(objective.frame_scores(scale.apply(geometry)))
+    is_better = after >= max(MIN_FOCAL_IOU, before + MIN_FITTED_IOU_GAIN)
+    if not is_better or abs(factor - 1.0) < MIN_FITTED_CHANGE:
         return cameras
     old = cameras[0]
     focal = old.focal_px[0] * factor, old.focal_px[1] * factor
@@ -99,13 +96,13 @@ def estimate_focal_length(
 
 
 MIN_OWN_SHAPE_GAIN = 0.02
-"""By how much the body's own proportions must fit better than SMPL's to be taken instead."""
+"""Gain in mean IoU by which the body's own proportions must beat SMPL's."""
 SAME_SHAPE_M = 5e-4
-"""Bodies whose resting skin is nowhere farther apart are one."""
+"""Largest distance between the resting surfaces of bodies that are the same, metres."""
 REPORTED_DIFFERENCE_M = 0.01
-"""Differences in height, or of a joint from the pelvis, that are spoken of."""
+"""Least difference in height, or of a joint relative to the pelvis, that is reported, metres."""
 MAX_HEIGHT_DIFFERENCE = 0.08
-"""Difference in height, as a share, beyond which it may not be the same person."""
+"""Relative difference in height beyond which it may not be the same person."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,9 +111,9 @@ class BodyAlignment:
 
     Attributes:
         shaped: The person's body.
-        motion: The poses, for this body.
-        words: What was done, for people; empty if nothing was.
-        refit: What was found in the masks, if something was looked for.
+        motion: The poses for this body.
+        description: What was done, for people; empty if nothing was.
+        placement: The fitted placement; None if none was attempted.
     """
 
     shaped: ShapedBody
@@ -126,7 +123,7 @@ class BodyAlignment:
 
 
 def needs_placement(motion: Motion, shaped: ShapedBody) -> bool:
-    """Whether poses were made for a body model whose size nobody knows here."""
+    """Whether poses were made for a body model whose size is unknown here."""
     return shaped.body.family not in ("smpl", motion.body_model)
 
 
@@ -137,35 +134,35 @@ def align_body(
     source: FrameSource,
     masks: Masks | None,
 ) -> BodyAlignment:
-    """Body and motion as they fit the masks, if the tracker had another body in mind.
+    """Align body and motion to the masks, if the poses are of another body model.
 
-    The body's own mean proportions are tried beside SMPL's; they are taken if they fit better by
-    `MIN_OWN_SHAPE_GAIN`: files say SMPL of poses that were fitted to something else.
+    The body's own mean proportions are tried beside SMPL's and taken if they fit better by
+    `MIN_OWN_SHAPE_GAIN`: files state SMPL for poses that were fitted to another body.
 
     Args:
-        motion: In the cameras' world.
+        motion: Poses in the cameras' world.
         shaped: The body that is used, with SMPL's mean joints (`shape_for_motion`).
-        cameras: Of the frames' size.
-        source: The frames; few are decoded, and none if there are masks in files.
-        masks: The masks; None if the pictures have an alpha channel, or nobody knows any.
+        cameras: Cameras of the frames' size.
+        source: The frames; few are decoded, and none if there are mask files.
+        masks: The masks; None if the images have an alpha channel, or there are none.
     """
     if not needs_placement(motion, shaped):
         return BodyAlignment(shaped=shaped, motion=motion)
-    claim = CaptureGeometry.of(motion, cameras, source)
+    geometry = CaptureGeometry.of(motion, cameras, source)
     if masks is None and not source.has_alpha:
-        seen = place_from_video(claim, shaped, cameras, source)
+        placement = place_from_video(geometry, shaped, cameras, source)
         fit = BodyAlignment(shaped=shaped, motion=motion)
-        return fit if seen is None else _accept(seen, shaped, motion)
-    evidence = silhouette_objective_of(shaped, cameras, source, masks)
-    if evidence is None:
+        return fit if placement is None else _accept(placement, shaped, motion)
+    objective = silhouette_objective_of(shaped, cameras, source, masks)
+    if objective is None:
         return BodyAlignment(shaped=shaped, motion=motion)
-    refit = place_body_on_masks(claim, evidence)
+    placement = place_body_on_masks(geometry, objective)
     own = shaped.body.with_shape()
-    other = place_body_on_masks(claim, _with_body(evidence, own))
-    if other.is_improvement and other.iou_after > refit.iou_after + MIN_OWN_SHAPE_GAIN:
+    other = place_body_on_masks(geometry, _with_body(objective, own))
+    if other.is_improvement and other.iou_after > placement.iou_after + MIN_OWN_SHAPE_GAIN:
         words = f"{other.describe()} Its own proportions fit better than SMPL's."
         return BodyAlignment(shaped=own, motion=other.motion, description=words, placement=other)
-    return _accept(refit, shaped, motion)
+    return _accept(placement, shaped, motion)
 
 
 def align_to_person(
@@ -176,36 +173,38 @@ def align_to_person(
     source: FrameSource,
     masks: Masks | None,
 ) -> BodyAlignment:
-    """The motion for the person that an avatar has, which never changes.
+    """Align a motion to an avatar's person, whose body stays.
 
     Args:
-        motion: In the cameras' world, for the body `shaped`.
-        shaped: The person that these poses' tracker had in mind.
-        person: The avatar's.
-        cameras, source, masks: As in `align_body`.
+        motion: Poses in the cameras' world, for the body `shaped`.
+        shaped: The person that the poses were made for.
+        person: The avatar's person.
+        cameras: Cameras of the frames' size.
+        source: The frames; few are decoded, and none if there are mask files.
+        masks: The masks; None if the images have an alpha channel, or there are none.
     """
     foreign, same = needs_placement(motion, shaped), is_same_person(person, shaped)
     if same and not foreign:
         return BodyAlignment(shaped=person, motion=motion)
     masked = masks is not None or source.has_alpha
-    evidence = silhouette_objective_of(person, cameras, source, masks) if masked else None
-    claim = CaptureGeometry.of(motion, cameras, source)
-    if not same and not (foreign and evidence is not None):
-        motion = rescale_motion(claim, shaped, person)
-        claim = CaptureGeometry.of(motion, cameras, source)
-    told = "" if foreign or same else _describe_difference(shaped, person)
-    refit = None
-    if evidence is not None:
-        refit = place_body_on_masks(claim, evidence)
+    objective = silhouette_objective_of(person, cameras, source, masks) if masked else None
+    geometry = CaptureGeometry.of(motion, cameras, source)
+    if not same and not (foreign and objective is not None):
+        motion = rescale_motion(geometry, shaped, person)
+        geometry = CaptureGeometry.of(motion, cameras, source)
+    difference = "" if foreign or same else _describe_difference(shaped, person)
+    placement = None
+    if objective is not None:
+        placement = place_body_on_masks(geometry, objective)
     elif foreign and not masked:
-        refit = place_from_video(claim, person, cameras, source)
-    if refit is None:
-        return BodyAlignment(shaped=person, motion=motion, description=told)
-    return _accept(refit, person, motion, told)
+        placement = place_from_video(geometry, person, cameras, source)
+    if placement is None:
+        return BodyAlignment(shaped=person, motion=motion, description=difference)
+    return _accept(placement, person, motion, difference)
 
 
 def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
-    """Whether two shapes of one body are the same person."""
+    """Whether two shapes of one body model are the same person."""
     same = a.vertices.shape == b.vertices.shape
     return same and all(
         bool(np.abs(one - other).max() < SAME_SHAPE_M)
@@ -216,7 +215,7 @@ def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
 def _accept(
     placement: BodyPlacement, shaped: ShapedBody, motion: Motion, prefix: str = ""
 ) -> BodyAlignment:
-    """The refit, if it is worth it."""
+    """The alignment with a placement, which is taken if it is an improvement."""
     return BodyAlignment(
         shaped=shaped,
         motion=placement.motion if placement.is_improvement else motion,
@@ -226,7 +225,7 @@ def _accept(
 
 
 def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
-    """How the body that poses were made for differs from the avatar's; empty if it hardly does."""
+    """Describe how the poses' body differs from the avatar's; empty if it hardly does."""
     theirs, ours = body_height_m(shaped), body_height_m(person)
     off = (shaped.joints - shaped.joints[0]) - (person.joints - person.joints[0])
     apart = float(np.linalg.norm(off, axis=1).max())
@@ -243,19 +242,19 @@ def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
 def place_from_video(
     geometry: CaptureGeometry, shaped: ShapedBody, cameras: CameraTrack, source: FrameSource
 ) -> BodyPlacement | None:
-    """The body fitted to a few pictures; None where parts do not fit, which is said elsewhere."""
+    """Align a body to a few images; None where parts do not fit (reported elsewhere)."""
     skin = SkinPoints.of(shaped)
     try:
-        pictures = sample_video(geometry, skin, cameras, source)
+        images = sample_video(geometry, skin, cameras, source)
     except InputError:
         return None
-    return place_body_on_images(geometry, skin, pictures)
+    return place_body_on_images(geometry, skin, images)
 
 
 def silhouette_objective_of(
     shaped: ShapedBody, cameras: CameraTrack, source: FrameSource, masks: Masks | None
 ) -> SilhouetteObjective | None:
-    """A few masks; None where parts do not fit or show nobody, which is said elsewhere."""
+    """The objective of a few masks; None where parts do not fit (reported elsewhere)."""
     try:
         rows = associate_masks(masks, source), associate_cameras(cameras, source)
         return sample_masks(
@@ -270,15 +269,15 @@ def silhouette_objective_of(
         return None
 
 
-def _with_body(evidence: SilhouetteObjective, shaped: ShapedBody) -> SilhouetteObjective:
-    """The same masks, for another person."""
-    return SilhouetteObjective(samples=evidence.samples, skin=SkinPoints.of(shaped))
+def _with_body(objective: SilhouetteObjective, shaped: ShapedBody) -> SilhouetteObjective:
+    """The objective of the same masks for another person."""
+    return SilhouetteObjective(samples=objective.samples, skin=SkinPoints.of(shaped))
 
 
 MIN_SMPL_IOU_GAIN = 0.05
-"""By how much SMPL's body must agree better with the masks to be taken."""
+"""Gain in mean IoU by which SMPL's body must beat the file's."""
 MIN_SMPL_CONTRAST_RATIO = 1.1
-"""Without masks: how many times more it must stand out from what is beside it in the pictures."""
+"""Ratio of edge contrasts by which SMPL's body must beat the file's, without masks."""
 
 
 def detect_body_model(
@@ -290,16 +289,18 @@ def detect_body_model(
     *,
     cameras_given: bool,
 ) -> Motion:
-    """The motion as it was read, called SMPL's if its file is silent and the masks say so.
+    """Label a motion as SMPL's if its file does not state the body model and SMPL's fits better.
 
-    InstantAvatar and its successors write SMPL's poses without naming the body; what this project
-    writes names it. Betas of one body make nonsense of another.
+    InstantAvatar and its successors write SMPL's poses without naming the body model; this project
+    names it. Betas of one body model are meaningless for another.
 
     Args:
-        read: As `read_poses` gives it.
-        body: The one that is used.
-        cameras, source, masks: See `align_body`.
-        cameras_given: See `placed`.
+        motion_read: The motion that `read_poses` returns.
+        body: The body model that is used.
+        cameras: Cameras of the frames' size.
+        source: The frames; few are decoded, and none if there are mask files.
+        masks: The masks; None if the images have an alpha channel, or there are none.
+        cameras_given: Whether a file states the cameras; see `place_in_camera_world`.
     """
     if motion_read.model_is_stated or body.family == "smpl":
         return motion_read
@@ -310,19 +311,22 @@ def detect_body_model(
         motion = replace(motion_read, body_model=model)
         shaped = shape_for_motion(body, motion)
         motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
-        evidence = silhouette_objective_of(shaped, cameras, source, masks)
-        if evidence is None:
+        objective = silhouette_objective_of(shaped, cameras, source, masks)
+        if objective is None:
             return motion_read
-        claim = CaptureGeometry.of(motion, cameras, source)
-        if model == motion_read.body_model and mean_score(evidence.frame_scores(claim)) >= GOOD_IOU:
+        geometry = CaptureGeometry.of(motion, cameras, source)
+        if (
+            model == motion_read.body_model
+            and mean_score(objective.frame_scores(geometry)) >= GOOD_IOU
+        ):
             return motion_read
-        after[model] = place_body_on_masks(claim, evidence).iou_after
+        after[model] = place_body_on_masks(geometry, objective).iou_after
     if after["smpl"] < after[motion_read.body_model] + MIN_SMPL_IOU_GAIN:
         return motion_read
-    found = (
-        f"with which masks agree by {after['smpl']:.2f} (else {after[motion_read.body_model]:.2f})"
+    other = after[motion_read.body_model]
+    return _label_smpl(
+        motion_read, f"whose mean IoU with the masks is {after['smpl']:.2f}, not {other:.2f}"
     )
-    return _label_smpl(motion_read, found)
 
 
 def _detect_from_images(
@@ -333,37 +337,37 @@ def _detect_from_images(
     *,
     cameras_given: bool,
 ) -> Motion:
-    """The same where there are no masks: by how the pictures' edges run along the body."""
-    stands_out = {}
+    """Detect the body model by the contrast of the images' edges along the body's outline."""
+    contrast = {}
     for model in (motion_read.body_model, "smpl"):
         motion = replace(motion_read, body_model=model)
         shaped = shape_for_motion(body, motion)
         motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
-        claim, skin = CaptureGeometry.of(motion, cameras, source), SkinPoints.of(shaped)
+        geometry, skin = CaptureGeometry.of(motion, cameras, source), SkinPoints.of(shaped)
         try:
-            pictures = sample_video(claim, skin, cameras, source)
+            images = sample_video(geometry, skin, cameras, source)
         except InputError:
             return motion_read
         if model == motion_read.body_model:
-            stands_out[model] = edge_contrast(claim, skin, pictures)
+            contrast[model] = edge_contrast(geometry, skin, images)
         else:
-            fitted = place_body_on_images(claim, skin, pictures)
-            stands_out[model] = edge_contrast(replace(claim, motion=fitted.motion), skin, pictures)
-    if stands_out["smpl"] < MIN_SMPL_CONTRAST_RATIO * max(
-        stands_out[motion_read.body_model], MIN_EDGE_CONTRAST
+            fitted = place_body_on_images(geometry, skin, images)
+            contrast[model] = edge_contrast(replace(geometry, motion=fitted.motion), skin, images)
+    if contrast["smpl"] < MIN_SMPL_CONTRAST_RATIO * max(
+        contrast[motion_read.body_model], MIN_EDGE_CONTRAST
     ):
         return motion_read
     found = (
-        f"whose outline stands out {stands_out['smpl']:.1f} times from what is beside it in the "
-        f"pictures (else {stands_out[motion_read.body_model]:.1f} times)"
+        f"across whose outline edges are {contrast['smpl']:.1f} times as strong as beside it, not "
+        f"{contrast[motion_read.body_model]:.1f} times"
     )
     return _label_smpl(motion_read, found)
 
 
 def _label_smpl(motion_read: Motion, reason: str) -> Motion:
-    said = (
-        "The poses' file does not say for which body they were made (`model`); they are taken for "
-        f"SMPL's, {reason}."
+    words = (
+        "The poses' file does not state the body model they were made for (`model`); they are "
+        f"taken for SMPL's, {reason}."
     )
-    note = said if motion_read.note is None else f"{motion_read.note} {said}"
+    note = words if motion_read.note is None else f"{motion_read.note} {words}"
     return replace(motion_read, body_model="smpl", note=note)

@@ -1,7 +1,4 @@
-"""Outlines and the edges of pictures: distances, directions and slopes.
-
-A few of a film's pictures, against which the masks' outlines are held.
-"""
+"""The edge objective: how a few images' edges follow the outlines of the masks."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,15 +17,16 @@ from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.silhouette import signed_distance_px
 
 EDGE_BLUR_PX = 1.0
+"""Gaussian σ, px, before gradients are taken."""
 
 
 def outward_normals(
     signed_distance: Float32[np.ndarray, "height width"],
 ) -> Float32[np.ndarray, "height width 2"]:
-    """Unit vector (x, y) of each pixel in which the distance from a shape grows.
+    """Unit vector (x, y) of each pixel along which the distance from a shape grows.
 
     Args:
-        away: The distance, in any unit.
+        signed_distance: The distance, in any unit.
     """
     sides = [
         cv2.Sobel(signed_distance, cv2.CV_32F, 1, 0),
@@ -42,7 +40,7 @@ def outward_normals(
 def color_gradients(
     rgb: UInt8[np.ndarray, "height width 3"],
 ) -> Float32[np.ndarray, "height width 3 2"]:
-    """Slope of each color to the right and down, by Sobel's filter after a slight blur."""
+    """Gradient of each channel to the right and down, by Sobel's filter after a slight blur."""
     smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), EDGE_BLUR_PX)
     sides = [cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)]
     return np.stack(sides, axis=-1)
@@ -51,7 +49,7 @@ def color_gradients(
 def gradient_along(
     rgb: UInt8[np.ndarray, "height width 3"], directions: Float32[np.ndarray, "height width 2"]
 ) -> Float32[np.ndarray, "height width"]:
-    """Largest absolute slope of the three colors along each pixel's direction."""
+    """Largest absolute gradient of the three channels along each pixel's direction."""
     sides = color_gradients(rgb)
     along = np.abs(sides[..., 0] * directions[..., :1] + sides[..., 1] * directions[..., 1:])
     # Numpy reduces short axes slowly.
@@ -59,35 +57,39 @@ def gradient_along(
 
 
 SAMPLED_IMAGES = 12
-"""How many pictures are looked at."""
+"""Number of images that are sampled."""
 MAX_DECODED_FRAMES = 300
-"""Frames of the film's beginning among which they are spread: more would have to be decoded."""
+"""Frames at the beginning of the video from which images are sampled: all of them are decoded."""
 ON_OUTLINE_PX = 1.6
-"""Pixels whose middle is within this distance of an outline are on it."""
-OFF_OUTLINE_MIN_PX, OFF_OUTLINE_MAX_PX = 2.5, 8.0
-"""Pixels whose distance from an outline is between these are beside it."""
+"""Largest distance of a pixel on an outline, px."""
+OFF_OUTLINE_MIN_PX = 2.5
+"""Least distance of a pixel beside an outline, px."""
+OFF_OUTLINE_MAX_PX = 8.0
+"""Largest distance of a pixel beside an outline, px."""
 GRADIENT_NOISE = 1.0
-"""Slope in gray levels a pixel that is added beside an outline: pictures without edges score 0."""
+"""Gradient, levels per px, that is added beside an outline: images without edges score 0."""
 MIN_OUTLINE_PX = 40
-"""Pixels that an outline must have within the film's picture."""
+"""Pixels that an outline must have within the video's image."""
 WINDOW_SCALES = np.exp(np.linspace(-0.5, 0.5, 21))
-"""Sizes of the film within the mask's picture that are tried."""
-WINDOW_EVALUATIONS, WINDOW_FIRST_STEP = 60, 0.015
-"""Evaluations that refine a window, and by what fraction of the picture its sides first move."""
+"""Sizes of the video relative to the masks' image that are tried."""
+WINDOW_EVALUATIONS = 60
+"""Evaluations that refine a window."""
+WINDOW_FIRST_STEP = 0.015
+"""First step of a window's sides, as a fraction of the image."""
 MAX_CACHED_OUTLINES = 256
-"""Outlines that are kept."""
+"""Outlines in the cache."""
 
-RgbPicture = UInt8[np.ndarray, "height width 3"]
+RgbThumbnail = UInt8[np.ndarray, "height width 3"]
 AlphaMask = Float32[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaskOutline:
-    """A mask's outline: distance from it, and the direction in which that grows.
+    """A mask's outline.
 
     Attributes:
-        signed_distance_px: Distance of each pixel's middle outside the mask; inside negative.
-        across: Unit vector (x, y) of each pixel that points away from the mask.
+        signed_distance_px: Distance of each pixel's center from the border, px; negative inside.
+        outward_normal: Unit vector (x, y) of each pixel that points away from the mask.
     """
 
     signed_distance_px: Float32[np.ndarray, "height width"]
@@ -102,44 +104,44 @@ class MaskOutline:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EdgeObjective:
-    """Small pictures of a few frames, and the masks of all.
+    """Scores a geometry by how the edges of a few reduced images follow the masks' outlines.
 
     Attributes:
-        pictures: Frame number and picture, in the frames' order.
-        mask_of: From a frame number to its small mask, of the pictures' size; raises InputError if
+        images: Frame number and image, in the frames' order.
+        mask_of: From a frame number to its reduced mask, of the images' size; raises InputError if
             there is none.
-        masks: How many masks there are.
+        mask_count: Number of masks.
     """
 
-    images: tuple[tuple[int, RgbPicture], ...]
+    images: tuple[tuple[int, RgbThumbnail], ...]
     mask_of: Callable[[int], AlphaMask]
     mask_count: int
     _outlines: dict[int, MaskOutline | None] = field(default_factory=dict)
 
     def subset(self, count: int) -> "EdgeObjective":
-        """At most `count` of the pictures, evenly spread."""
+        """At most `count` of the images, evenly spaced."""
         rows = spaced_indices(len(self.images), count)
         return replace(self, images=tuple(self.images[row] for row in rows))
 
     def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "images"]:
-        """How well each picture's edges follow its mask's outline, in [0, 1].
+        """How well each image's edges follow its mask's outline, in [0, 1].
 
-        It is a / (a + b), where a is the pictures' slope across the outline, in the mean along it,
-        and b that beside it: about 0.5 for an outline anywhere, 0.65 to 0.95 for a person's. NaN
-        where a picture has no mask, or of another shape.
+        The score is a / (a + b), where a is the image's mean gradient across the outline and b that
+        beside it: about 0.5 for an outline anywhere, 0.65 to 0.95 for a person's. NaN where an
+        image has no mask, or one of another shape.
         """
         return np.array(
-            [self._frame_score(geometry.video_transform, *picture) for picture in self.images]
+            [self._frame_score(geometry.video_transform, *image) for image in self.images]
         )
 
-    def _frame_score(self, transform: VideoTransform, index: int, rgb: RgbPicture) -> float:
+    def _frame_score(self, transform: VideoTransform, index: int, rgb: RgbThumbnail) -> float:
         outline = self.outline(transform.mask_frame(index))
         if outline is None:
             return float("nan")
-        picture, shown = transform.warp_to_mask(rgb)
-        if picture.shape[:2] != outline.signed_distance_px.shape:
+        image, shown = transform.warp_to_mask(rgb)
+        if image.shape[:2] != outline.signed_distance_px.shape:
             return float("nan")
-        across = gradient_along(picture, outline.outward_normal)
+        across = gradient_along(image, outline.outward_normal)
         away = np.abs(outline.signed_distance_px)
         known = cv2.erode(shown, np.ones((5, 5), np.uint8), borderValue=1) > 0
         along, beside = (
@@ -155,7 +157,7 @@ class EdgeObjective:
         return on / (on + off + GRADIENT_NOISE)
 
     def outline(self, number: int) -> MaskOutline | None:
-        """The outline of the mask of a frame number; None if there is none, or nothing in it."""
+        """The outline of a frame number's mask; None if there is none, or it is empty or full."""
         if number not in self._outlines:
             if len(self._outlines) >= MAX_CACHED_OUTLINES:
                 self._outlines.clear()
@@ -170,18 +172,17 @@ class EdgeObjective:
         return MaskOutline.of(shape) if shape.any() and not shape.all() else None
 
     def fit_window(self, geometry: CaptureGeometry) -> tuple[float, float, float, float]:
-        """Where the film's picture lies in the mask's, by the best of many sizes and places.
+        """Fit the window of the video's image within the mask's.
 
-        Edges are held against the outlines at all places at once (a product in Fourier space), once
-        for each size of `WINDOW_SCALES`; the best is then moved and scaled until the scores are best
-        (Nelder and Mead).
+        Edges are correlated with the outlines at all positions at once (a product in Fourier space)
+        for each size of `WINDOW_SCALES`; the best window is refined by Nelder-Mead on the scores.
         """
         from scipy.optimize import minimize  # 0.1 s that a first look does not need
 
         def loss(sides: Float[np.ndarray, "4"]) -> float:
             left, top, right, bottom = (float(side) for side in sides)
-            film = replace(geometry.video_transform, window=(left, top, right, bottom))
-            scores = self.frame_scores(replace(geometry, video_transform=film))
+            video = replace(geometry.video_transform, window=(left, top, right, bottom))
+            scores = self.frame_scores(replace(geometry, video_transform=video))
             return -float(np.nan_to_num(scores).mean())
 
         start = np.array(self._coarse_window(replace(geometry.video_transform, window=FULL_WINDOW)))
@@ -193,7 +194,7 @@ class EdgeObjective:
         return float(found[0]), float(found[1]), float(found[2]), float(found[3])
 
     def _coarse_window(self, transform: VideoTransform) -> tuple[float, float, float, float]:
-        """The same in whole pixels of the small pictures, and steps of 5 % in size."""
+        """The window to a whole pixel of the reduced images and a step of 5 % in size."""
         pairs = [
             (transform.reorient(rgb), self.outline(transform.mask_frame(i)))
             for i, rgb in self.images
@@ -218,7 +219,7 @@ class EdgeObjective:
             down, right = np.unravel_index(int(match.argmax()), match.shape)
             if match[down, right] > best:
                 best = float(match[down, right])
-                # The match repeats beyond the grid: places far right and below are left and above.
+                # The correlation is periodic: positions far right and below are left and above.
                 x = (right - grid[1] if right > width else right) / width
                 y = (down - grid[0] if down > height else down) / height
                 found = float(x), float(y), float(x + scale), float(y + scale)
@@ -234,15 +235,15 @@ def sample_images(
     count: int = SAMPLED_IMAGES,
     within: int = MAX_DECODED_FRAMES,
 ) -> EdgeObjective:
-    """Decodes a few pictures of the film's beginning.
+    """Decode a few images from the beginning of a video.
 
     Args:
-        source: The film; not a live one.
+        source: The video; not a live source.
         mask_of: From a frame number to its mask of `size_px`.
-        masks: How many masks there are.
-        size_px: Width and height of the small pictures.
-        count: How many pictures are wanted.
-        within: Number of frames at the beginning among which they are spread.
+        mask_count: Number of masks.
+        size_px: Width and height of the reduced images.
+        count: Number of images to sample.
+        within: Number of frames at the beginning from which they are sampled.
     """
     total = min(source.frame_count or 1, within)
     places = spaced_indices(total, count)
@@ -250,14 +251,14 @@ def sample_images(
     chosen = source.selection
     start = chosen.start + chosen.step * places[0]
     some = slice(start, chosen.start + chosen.step * total, chosen.step * stride)
-    pictures = _decode_images(source.path, some, source.size_px, size_px)
-    return EdgeObjective(images=tuple(pictures), mask_of=mask_of, mask_count=mask_count)
+    images = _decode_images(source.path, some, source.size_px, size_px)
+    return EdgeObjective(images=tuple(images), mask_of=mask_of, mask_count=mask_count)
 
 
 def _decode_images(
     path: Path, frames: slice, full_px: tuple[int, int], size_px: tuple[int, int]
-) -> Sequence[tuple[int, RgbPicture]]:
-    found: list[tuple[int, RgbPicture]] = []
+) -> Sequence[tuple[int, RgbThumbnail]]:
+    found: list[tuple[int, RgbThumbnail]] = []
     for frame in open_source(path, frames=frames).frames():
         turned = frame.size_px == full_px[::-1] and frame.size_px != full_px
         if "corrupt" not in frame.flags and (turned or frame.size_px == full_px):
@@ -267,8 +268,8 @@ def _decode_images(
     return found
 
 
-def _edge_tensor(rgb: RgbPicture) -> Float32[np.ndarray, "3 height width"]:
-    """Products xx, xy, yy of the strongest color's slope, strong edges compressed."""
+def _edge_tensor(rgb: RgbThumbnail) -> Float32[np.ndarray, "3 height width"]:
+    """Products xx, xy, yy of the strongest channel's gradient, strong edges compressed."""
     colors = color_gradients(rgb)
     strength = np.linalg.norm(colors, axis=-1)
     strongest = strength.argmax(axis=-1)[..., None]
@@ -280,7 +281,7 @@ def _edge_tensor(rgb: RgbPicture) -> Float32[np.ndarray, "3 height width"]:
 
 
 def _outline_tensor(outline: MaskOutline) -> Float32[np.ndarray, "3 height width"]:
-    """Products xx, 2xy, yy of the directions across an outline, on it; 0 elsewhere."""
+    """Products xx, 2xy, yy of the normals on an outline; 0 elsewhere."""
     x, y = outline.outward_normal[..., 0], outline.outward_normal[..., 1]
     on = (np.abs(outline.signed_distance_px) < ON_OUTLINE_PX).astype(np.float32)
     on /= on.sum()

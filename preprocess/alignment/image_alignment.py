@@ -1,11 +1,9 @@
-"""A few small pictures of a video, and how well a posed body's outline meets their edges.
+"""Alignment of a body to images without masks, and the edge contrast of its outline.
 
-A body fitted to pictures without masks: masks are found around it, it is fitted to them, again.
-
-At first it may stand off by a fifth of its size. So much around its outline is in doubt: GrabCutSegmenter
-(Rother et al. 2004) tells by colours who is person there. The body is fitted to these masks, less
-is in doubt around the fitted one, and so on until it stands. Masks of this kind follow the body;
-whether it found a person is asked of the pictures' edges.
+At first the body may be off by a fifth of its size. GrabCut (Rother et al. 2004) segments the
+person by color in a band of that width around the body's outline; the body is aligned to these
+masks, the band becomes narrower, and so on until the body stays. Such masks follow the body:
+whether there is a person at all is decided by the images' edges, which are independent of it.
 """
 
 import time
@@ -40,23 +38,29 @@ from preprocess.cameras.camera_file import CameraTrack
 from preprocess.observe import associate_cameras
 
 IMAGE_PERSON_PX = 130
-"""Height of the person in the small pictures, as the poses have it."""
-MAX_DECODED_IMAGES, ALIGNMENT_IMAGES = 24, 8
-"""Pictures that are decoded, if there is time, and how many of them are looked at."""
+"""Height of the person in the reduced images by the poses, px."""
+MAX_DECODED_IMAGES = 24
+"""Images to decode within the budget."""
+ALIGNMENT_IMAGES = 8
+"""Images to align to, of those decoded."""
 DECODE_BUDGET_S = 8.0
-"""So long pictures are decoded; of a long video the beginning is looked at."""
-MAX_CLOTHING_M, OFF_OUTLINE_MIN_M, OFF_OUTLINE_MAX_M = 0.03, 0.04, 0.1
-"""Clothes end within the first outside a body; beside its outline is between the others."""
+"""Time for decoding, seconds; of a long video only the beginning is decoded."""
+MAX_CLOTHING_M = 0.03
+"""Distance outside the body within which clothes end, metres."""
+OFF_OUTLINE_MIN_M = 0.04
+"""Least distance from the outline of pixels beside it, metres."""
+OFF_OUTLINE_MAX_M = 0.1
+"""Largest distance from the outline of pixels beside it, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImageSample:
-    """One frame, small.
+    """One frame's image, reduced.
 
     Attributes:
-        index: The frame's number.
-        camera_row: Which camera is its.
-        rgb: The picture.
+        index: Frame number.
+        camera_row: Index of the frame's camera.
+        rgb: The image.
     """
 
     index: int
@@ -72,11 +76,11 @@ class ImageSample:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyOutline:
-    """A posed body in a picture.
+    """The outline of a posed body in an image.
 
     Attributes:
-        signed_distance_m: How far the middle of each pixel is outside its outline, metres; inside negative.
-        px_per_m: What a metre is in the picture, at the body.
+        signed_distance_m: Distance of each pixel from the outline, metres; negative inside.
+        px_per_m: Pixels per metre at the body.
     """
 
     signed_distance_m: Float32[np.ndarray, "height width"]
@@ -86,16 +90,16 @@ class BodyOutline:
 def sample_video(
     geometry: CaptureGeometry, skin: SkinPoints, cameras: CameraTrack, source: FrameSource
 ) -> list[ImageSample]:
-    """Pictures of frames that have a pose, spread over the video or over what is soon decoded.
+    """Decode images of frames that have a pose, spread over the video within the decoding budget.
 
     Args:
-        claim: Poses and cameras.
-        skin: The body; its height in the pictures says how small these may be.
-        cameras: Those of the claim.
-        source: The frames; not of a live source.
+        geometry: Poses and cameras.
+        skin: The body; its height in the images determines their size.
+        cameras: The cameras of the geometry.
+        source: The frames; not a live source.
 
     Raises:
-        InputError: If cameras and frames do not belong together, or no picture can be used.
+        InputError: If cameras and frames do not belong together, or no image can be used.
     """
     camera_row, chosen = associate_cameras(cameras, source), source.selection
     stride = chosen.step * max(1, (source.frame_count or 1) // MAX_DECODED_IMAGES)
@@ -117,17 +121,17 @@ def sample_video(
         if time.perf_counter() - began > DECODE_BUDGET_S:
             break
     if not found:
-        raise InputError(f"No picture of {source.path} has both a pose and a camera.")
+        raise InputError(f"No image of {source.path} has both a pose and a camera.")
     return [found[place] for place in spaced_indices(len(found), ALIGNMENT_IMAGES)]
 
 
 def thumbnail_size_px(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple[int, int]:
-    """Width and height of pictures in which the body is about `PERSON_PX` high; never enlarged.
+    """Width and height of images in which the body is about `IMAGE_PERSON_PX` high; never larger.
 
     Args:
         skin: The body.
         pose: One of its poses.
-        camera: Of the picture's own size.
+        camera: Camera of the original image's size.
     """
     width, height = camera.size_px
     points = skin.posed(pose).astype(np.float64)
@@ -143,7 +147,7 @@ def thumbnail_size_px(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple
 def body_outline(
     geometry: CaptureGeometry, skin: SkinPoints, sample: ImageSample
 ) -> BodyOutline | None:
-    """The body in a picture; None if the claim has no pose for it, or it is not in the picture."""
+    """Outline of the body in an image; None without a pose, or if it is outside the image."""
     row = geometry.row_for_frame(sample.index)
     if row is None:
         return None
@@ -161,20 +165,19 @@ def body_outline(
 def edge_contrast(
     geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample]
 ) -> float:
-    """How many times as strong edges across the body's outline are as such edges beside it.
+    """Strength of edges across the body's outline relative to such edges beside it.
 
-    About 1 where the body is drawn anywhere, 2 to 5 where a person has its outline. A person's
-    outline is not drawn by those who are asked: so, unlike masks that are found around the body
-    itself, this says whether poses and pictures belong together at all.
+    About 1 for a body drawn anywhere, 2 to 5 for a person's outline. Unlike masks estimated around
+    the body itself, this shows whether poses and images belong together at all.
     """
     along = beside = 0.0
     along_px = beside_px = 0
-    for picture in samples:
-        body = body_outline(geometry, skin, picture)
+    for sample in samples:
+        body = body_outline(geometry, skin, sample)
         if body is None:
             continue
         away = body.signed_distance_m
-        across = gradient_along(picture.rgb, outward_normals(away))
+        across = gradient_along(sample.rgb, outward_normals(away))
         near = (away > 0.0) & (away < MAX_CLOTHING_M)
         off = (np.abs(away) > OFF_OUTLINE_MIN_M) & (np.abs(away) < OFF_OUTLINE_MAX_M)
         along, along_px = along + float(across[near].sum()), along_px + int(near.sum())
@@ -185,37 +188,42 @@ def edge_contrast(
 
 
 UNCERTAIN_BANDS_M = (0.12, 0.05, 0.035)
-"""How far inside and outside of the body's outline pixels are in doubt, round after round."""
+"""Half width of the uncertain band around the body's outline in each round, metres."""
 MAX_INNER_BAND = 0.6
-"""Pixels this deep in the body (as a share of the deepest) are person for sure, at the least."""
+"""Largest width of the band inside, as a fraction of the body's greatest depth in the image."""
 CLOTHING_GUESS_M = 0.01
-"""How far clothes stand off, as a guess."""
+"""Assumed clothing offset, metres."""
 BACKGROUND_BORDER_M = 0.25
-"""How much of the background is looked at."""
+"""Width of the background around the band from which GrabCut learns its colors, metres."""
 GRABCUT_ITERATIONS = 2
-MAX_ROUNDS, CONVERGED_DISTANCE, CONVERGED_SHIFT_M = 6, 0.005, 0.003
-"""Rounds at most; the body stands if a round changes its distance and its place by less."""
+"""GrabCut iterations per round."""
+MAX_ROUNDS = 6
+"""Rounds of segmentation and alignment."""
+CONVERGED_DISTANCE = 0.005
+"""Relative change of the distance in a round below which the alignment has converged."""
+CONVERGED_SHIFT_M = 0.003
+"""Shift of the pelvis in a round below which the alignment has converged, metres."""
 
 
 def place_body_on_images(
     geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample]
 ) -> BodyPlacement:
-    """Fits SMPL's poses to another body with a few pictures.
+    """Align SMPL's poses, on another body, to a few images.
 
     Args:
-        claim: Poses and cameras; the body may be off by a fifth of its size, or of its place.
+        geometry: Poses and cameras; the body may be off by a fifth of its size.
         skin: The body.
-        pictures: See `sample_video`.
+        samples: Images; see `sample_video`.
     """
-    nearer, shift_m, evidence, now = 1.0, np.zeros(3), None, geometry
+    nearer, shift_m, objective, now = 1.0, np.zeros(3), None, geometry
     for number in range(MAX_ROUNDS):
         found = _estimate_masks(
             now, skin, samples, UNCERTAIN_BANDS_M[min(number, len(UNCERTAIN_BANDS_M) - 1)]
         )
         if found is None:
             break
-        evidence = found
-        step = place_body_on_masks(now, evidence)
+        objective = found
+        step = place_body_on_masks(now, objective)
         now = replace(now, motion=step.motion)
         nearer, shift_m = (
             nearer * step.distance_divisor,
@@ -229,7 +237,7 @@ def place_body_on_images(
             break
 
     def scores_of(moved: CaptureGeometry) -> Float[np.ndarray, "samples"]:
-        return np.zeros(0) if evidence is None else evidence.frame_scores(moved)
+        return np.zeros(0) if objective is None else objective.frame_scores(moved)
 
     return BodyPlacement(
         motion=now.motion,
@@ -242,29 +250,29 @@ def place_body_on_images(
 
 
 def _estimate_masks(
-    claim: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample], band_m: float
+    geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample], band_m: float
 ) -> SilhouetteObjective | None:
-    """The masks of all pictures in which the body is; None if it is in none."""
-    witnesses = []
-    for picture in samples:
-        body = body_outline(claim, skin, picture)
-        person = None if body is None else grabcut_near_outline(picture.rgb, body, band_m)
+    """Estimated masks of all images that show the body; None if none does."""
+    masks = []
+    for sample in samples:
+        body = body_outline(geometry, skin, sample)
+        person = None if body is None else grabcut_near_outline(sample.rgb, body, band_m)
         if person is not None:
             alpha = person.astype(np.float32)
-            row = picture.camera_row
-            witnesses.append(MaskSample(index=picture.index, camera_row=row, alpha=alpha))
-    return SilhouetteObjective(samples=tuple(witnesses), skin=skin) if witnesses else None
+            row = sample.camera_row
+            masks.append(MaskSample(index=sample.index, camera_row=row, alpha=alpha))
+    return SilhouetteObjective(samples=tuple(masks), skin=skin) if masks else None
 
 
 def grabcut_near_outline(
     rgb: UInt8[np.ndarray, "height width 3"], outline: BodyOutline, band_m: float
 ) -> Bool[np.ndarray, "height width"] | None:
-    """Who is person in a picture, among the pixels near a body's outline; None if that fails.
+    """Segment the person in a band around a body's outline; None if that fails.
 
     Args:
-        rgb: The picture.
-        body: Where the body is, roughly.
-        band_m: How far inside and outside pixels are in doubt, if limbs are not thinner.
+        rgb: The image.
+        outline: Approximate outline of the body.
+        band_m: Half width of the uncertain band, metres; narrower inside thin bodies.
     """
     away = outline.signed_distance_m - np.float32(CLOTHING_GUESS_M)
     inwards = min(band_m, MAX_INNER_BAND * float(-away.min()))

@@ -1,10 +1,8 @@
-"""A person's stated height: body, distances and whatever hangs on them become that large.
+"""Alignment of SMPL's poses to the masks, on a body that is not SMPL's; and scaling to a height.
 
-SMPL's poses on a body that is not SMPL's: distance and place are solved anew from masks.
-
-Without SMPL's file nobody knows how tall SMPL's betas make the person. In pictures only the ratio
-of size and distance shows, so the person is moved instead of scaled: by one distance and one shift
-of the pelvis for the whole motion, so that the body covers the masks. Rotations stay.
+Without SMPL's file the height that SMPL's betas state is unknown. Images show only the ratio of
+size and distance, so the person is moved instead of scaled: one distance factor and one shift of
+the pelvis for the whole motion are fitted so that the body covers the masks. Rotations stay.
 """
 
 from dataclasses import dataclass, replace
@@ -19,16 +17,19 @@ from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.silhouette import soft_iou, splat_silhouette
 
-MIN_HEIGHT_CM, MAX_HEIGHT_CM = 40.0, 260.0
+MIN_HEIGHT_CM = 40.0
+"""Least height that a user may state, cm."""
+MAX_HEIGHT_CM = 260.0
+"""Largest height that a user may state, cm."""
 
 
 def body_height_m(shaped: ShapedBody) -> float:
-    """From the soles to the crown at rest, metres: barefoot, without hair."""
+    """Height from the soles to the crown at rest, metres: barefoot, without hair."""
     return float(np.ptp(shaped.vertices[:, 1]))
 
 
 def scale_to_height(shaped: ShapedBody, height_m: float) -> ShapedBody:
-    """The same person in another size; proportions stay."""
+    """Scale a person to a height; proportions stay."""
     factor, body = height_m / body_height_m(shaped), shaped.body
     directions = body.pose_directions
     if directions is not None:
@@ -37,14 +38,14 @@ def scale_to_height(shaped: ShapedBody, height_m: float) -> ShapedBody:
 
 
 def rescale_motion(geometry: CaptureGeometry, shaped: ShapedBody, resized: ShapedBody) -> Motion:
-    """The motion of a body that became larger, as the same pictures show it.
+    """Move a motion so that a resized body looks the same from its cameras.
 
-    What the camera sees stays if distances from it grow with the body.
+    Distances from the camera grow with the body.
 
     Args:
-        claim: Poses and cameras.
+        geometry: Poses and cameras.
         shaped: The person that the poses were made for.
-        taller: The same in the other size.
+        resized: The same person in another size.
     """
     factor = body_height_m(resized) / body_height_m(shaped)
     eyes = geometry.camera_centers()[geometry.camera_rows()]
@@ -54,30 +55,37 @@ def rescale_motion(geometry: CaptureGeometry, shaped: ShapedBody, resized: Shape
 
 
 ALIGNMENT_SAMPLES = 8
+"""Frames to whose masks a body is aligned."""
 ALIGNMENT_EVALUATIONS = 110
-FIRST_LOG_DISTANCE, FIRST_PELVIS_SHIFT_M = 0.08, 0.03
-"""First steps of the search: of the distance's logarithm, and of the pelvis's shift."""
+"""Evaluations of the search."""
+FIRST_LOG_DISTANCE = 0.08
+"""First step of the distance's logarithm."""
+FIRST_PELVIS_SHIFT_M = 0.03
+"""First step of the pelvis's shift, metres."""
 SHIFT_PENALTY = 4.0
-"""What a shift costs, in agreement per square metre: seen from one side alone, a body is nearer or
-was moved towards the camera, and nothing else tells."""
-MIN_ALIGNED_IOU, MIN_ALIGNMENT_GAIN = 0.6, 0.01
-"""A refit is taken if body and masks then agree by so much, and by more than before."""
+"""Penalty of a shift in IoU per m²: from one side, a smaller distance and a shift towards the
+camera look alike."""
+MIN_ALIGNED_IOU = 0.6
+"""Mean IoU from which an alignment is reliable."""
+MIN_ALIGNMENT_GAIN = 0.01
+"""Gain in mean IoU from which an alignment is taken."""
 MIN_EDGE_CONTRAST = 1.6
-"""Without masks edges must be so many times as strong across the body's outline as beside it."""
+"""Least edge contrast of the body's outline from which an alignment without masks is reliable."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyPlacement:
-    """What the search found.
+    """The result of aligning a body's poses.
 
     Attributes:
         motion: Poses for the body that is used.
-        before, after: Mean agreement of body and masks, in [0, 1].
-        nearer: By what distances from the camera were divided.
-        shift_m: How the pelvis was moved, in the root's own axes.
-        edges: Where masks were found around the body itself (`preprocess.alignment.image_alignment`): how many
-            times as strong the pictures' edges are across its outline as beside it, before and
-            after; None where masks were given.
+        iou_before: Mean IoU of body and masks as the poses were.
+        iou_after: Mean IoU of body and masks with `motion`.
+        distance_divisor: Factor by which distances from the camera were divided.
+        pelvis_shift_m: Shift of the pelvis in the root's own axes, metres.
+        edge_contrast: Before and after, where masks were estimated around the body itself
+            (`image_alignment`): strength of the images' edges across the body's outline relative
+            to beside it. None where masks were given.
     """
 
     motion: Motion
@@ -89,28 +97,28 @@ class BodyPlacement:
 
     @property
     def is_improvement(self) -> bool:
-        """Whether the poses fit so much better that they are to be taken."""
+        """Whether the poses fit better by enough to be taken."""
         return self.is_reliable and self.iou_after > self.iou_before + MIN_ALIGNMENT_GAIN
 
     @property
     def is_reliable(self) -> bool:
-        """Whether body and pictures agree, in the end, so much as no chance makes them."""
+        """Whether body and images agree better than by chance."""
         if self.edge_contrast is not None and self.edge_contrast[1] < MIN_EDGE_CONTRAST:
             return False
         return self.iou_after >= MIN_ALIGNED_IOU
 
     def describe(self) -> str:
-        """What was done, for people."""
+        """Describe the alignment, for people."""
         if not self.is_reliable:
             return self._describe_failure()
         agreed = f"agreement {self.iou_before:.2f} before, {self.iou_after:.2f} after"
         if self.edge_contrast is None:
             with_what = "masks"
         else:
-            with_what = "pictures, in which masks were estimated around it"
+            with_what = "images, in which masks were estimated around it"
             agreed += (
-                f"; edges across its outline are {self.edge_contrast[1]:.1f} times as strong as beside "
-                f"it, before {self.edge_contrast[0]:.1f} times"
+                f"; edges across its outline are {self.edge_contrast[1]:.1f} times as strong as "
+                f"beside it, before {self.edge_contrast[0]:.1f} times"
             )
         if not self.is_improvement:
             return f"Distances fit the {with_what}, as they are ({agreed})."
@@ -121,7 +129,7 @@ class BodyPlacement:
         )
 
     def _describe_failure(self) -> str:
-        """What is said of a search that found nothing."""
+        """Describe an alignment that is not reliable."""
         if self.edge_contrast is None:
             return (
                 f"Their distances could not be fitted to the masks ({self.iou_before:.2f} before, "
@@ -129,15 +137,15 @@ class BodyPlacement:
             )
         return (
             "There are no masks, and where the poses put the body no person was found in the "
-            f"pictures (edges across its outline are {self.edge_contrast[1]:.1f} times as strong as beside "
-            "it, 2 to 5 times is usual); distances stay as they are. Do poses and video belong "
-            "together? Give --masks, with which ia-check can tell what is wrong, or your own SMPL "
-            "file (--body)."
+            f"images (edges across its outline are {self.edge_contrast[1]:.1f} times as strong as "
+            "beside it, 2 to 5 times is usual); distances stay as they are. Do poses and video "
+            "belong together? Give --masks, from which ia-check can find what is wrong, or your "
+            "own SMPL file (--body)."
         )
 
     def as_json(self) -> dict[str, float | bool]:
-        """The same for the report."""
-        told: dict[str, float | bool] = {
+        """The alignment's figures for the report."""
+        figures: dict[str, float | bool] = {
             "taken": self.is_improvement,
             "agreement_before": round(self.iou_before, 4),
             "agreement_after": round(self.iou_after, 4),
@@ -145,65 +153,67 @@ class BodyPlacement:
             "pelvis_moved_cm": round(100.0 * float(np.linalg.norm(self.pelvis_shift_m)), 2),
         }
         if self.edge_contrast is not None:
-            told |= {
-                "edges_before": round(self.edge_contrast[0], 2), "edges_after": round(self.edge_contrast[1], 2),
-            }  # fmt: skip
-        return told
+            before, after = self.edge_contrast
+            figures |= {"edges_before": round(before, 2), "edges_after": round(after, 2)}
+        return figures
 
 
 def place_body_on_masks(geometry: CaptureGeometry, objective: SilhouetteObjective) -> BodyPlacement:
-    """Fits SMPL's poses to another body with the masks of a few frames.
+    """Align SMPL's poses, on another body, to the masks of a few frames.
 
     Args:
-        claim: Poses of SMPL's family, and cameras.
-        evidence: Masks, and the body.
+        geometry: Poses of SMPL's family, and cameras.
+        objective: Masks, and the body.
     """
     from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
 
     shaped, some = objective.skin.shaped, objective.subset(ALIGNMENT_SAMPLES)
-    scenes = [scene for witness in some.samples if (scene := _pose_sample(geometry, some, witness))]
+    posed = [_pose_sample(geometry, some, sample) for sample in some.samples]
+    posed = [sample for sample in posed if sample is not None]
 
-    def agreed(x: Float[np.ndarray, "4"]) -> float:
-        scores = [scene.iou(float(np.exp(x[0])), x[1:]) for scene in scenes]
+    def penalized_iou(x: Float[np.ndarray, "4"]) -> float:
+        scores = [sample.iou(float(np.exp(x[0])), x[1:]) for sample in posed]
         return float(np.mean(scores)) - SHIFT_PENALTY * float(x[1:] @ x[1:])
 
     found = np.zeros(4)
-    if scenes:
+    if posed:
         simplex = np.vstack(
             [np.zeros(4), np.diag([FIRST_LOG_DISTANCE, *[FIRST_PELVIS_SHIFT_M] * 3])]
         )
         found = minimize(
-            lambda x: -agreed(x), found, method="Nelder-Mead",
+            lambda x: -penalized_iou(x), found, method="Nelder-Mead",
             options={"maxfev": ALIGNMENT_EVALUATIONS, "initial_simplex": simplex},
         ).x  # fmt: skip
-    nearer = float(np.exp(found[0]))
-    motion = _move_motion(geometry, shaped, nearer, found[1:])
+    divisor = float(np.exp(found[0]))
+    motion = _move_motion(geometry, shaped, divisor, found[1:])
     return BodyPlacement(
         motion=motion,
         iou_before=mean_score(objective.frame_scores(geometry)),
         iou_after=mean_score(objective.frame_scores(replace(geometry, motion=motion))),
-        distance_divisor=nearer,
+        distance_divisor=divisor,
         pelvis_shift_m=found[1:],
     )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _PosedSample:
-    """One frame: the posed skin, and what a distance and a shift make of it."""
+    """One frame's posed skin, scored at other distances and shifts."""
 
     points: Float32[np.ndarray, "points 3"]
     pelvis: Float[np.ndarray, "3"]
     root_rotation: Float[np.ndarray, "3 3"]
-    claim: CaptureGeometry
-    witness: MaskSample
+    geometry: CaptureGeometry
+    sample: MaskSample
     size_px: tuple[int, int]
 
-    def iou(self, nearer: float, shift: Float[np.ndarray, "3"]) -> float:
-        """Agreement after both; a camera in the world's middle sees no difference."""
-        camera = self.claim.camera_at(self.witness.camera_row, self.size_px)
-        there = move_pelvis(self.pelvis, camera.center_world, self.root_rotation, nearer, shift)
+    def iou(self, distance_divisor: float, shift: Float[np.ndarray, "3"]) -> float:
+        """IoU after dividing the distance and shifting the pelvis."""
+        camera = self.geometry.camera_at(self.sample.camera_row, self.size_px)
+        there = move_pelvis(
+            self.pelvis, camera.center_world, self.root_rotation, distance_divisor, shift
+        )
         points = self.points + (there - self.pelvis).astype(np.float32)
-        return soft_iou(splat_silhouette(points, camera), self.witness.alpha)
+        return soft_iou(splat_silhouette(points, camera), self.sample.alpha)
 
 
 def move_pelvis(
@@ -213,36 +223,36 @@ def move_pelvis(
     distance_divisor: float,
     shift_m: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "*poses 3"]:
-    """Where a pelvis is after a refit: nearer to the camera's eye, then shifted in its own axes."""
+    """Divide a pelvis's distance from the camera, then shift it in the root's axes."""
     return camera_center + (pelvis - camera_center) / distance_divisor + root_rotation @ shift_m
 
 
 def _pose_sample(
-    claim: CaptureGeometry, evidence: SilhouetteObjective, witness: MaskSample
+    geometry: CaptureGeometry, objective: SilhouetteObjective, sample: MaskSample
 ) -> _PosedSample | None:
-    row = claim.row_for_frame(witness.index)
+    row = geometry.row_for_frame(sample.index)
     if row is None:
         return None
-    pose = claim.motion[row]
+    pose = geometry.motion[row]
     return _PosedSample(
-        points=evidence.posed_points(claim.motion, row),
-        pelvis=evidence.skin.shaped.joints[0] + pose.root_translation,
+        points=objective.posed_points(geometry.motion, row),
+        pelvis=objective.skin.shaped.joints[0] + pose.root_translation,
         root_rotation=rotation_matrices(pose.root_rotation),
-        claim=claim,
-        witness=witness,
-        size_px=evidence.size_px,
+        geometry=geometry,
+        sample=sample,
+        size_px=objective.size_px,
     )
 
 
 def _move_motion(
-    claim: CaptureGeometry,
+    geometry: CaptureGeometry,
     shaped: ShapedBody,
     distance_divisor: float,
     shift: Float[np.ndarray, "3"],
 ) -> Motion:
-    """The whole motion with distances divided, each from its own camera, and the pelvis shifted."""
-    eyes = claim.camera_centers()[claim.camera_rows()]
-    pelves = shaped.joints[0] + claim.motion.root_translations
-    roots = rotation_matrices(claim.motion.root_rotations)
+    """The motion with distances divided, each from its own camera, and the pelvis shifted."""
+    eyes = geometry.camera_centers()[geometry.camera_rows()]
+    pelves = shaped.joints[0] + geometry.motion.root_translations
+    roots = rotation_matrices(geometry.motion.root_rotations)
     moved = move_pelvis(pelves, eyes, roots, distance_divisor, shift)
-    return replace(claim.motion, root_translations=moved - shaped.joints[0])
+    return replace(geometry.motion, root_translations=moved - shaped.joints[0])

@@ -1,4 +1,4 @@
-"""What can be said of poses and masks without drawing a body: gaps, jumps, ranges, views."""
+"""Checks of poses and masks that need no rendering: gaps, jumps, ranges, view coverage."""
 
 from collections.abc import Iterator
 
@@ -10,15 +10,22 @@ from preprocess.alignment.capture_geometry import CaptureGeometry, frame_step
 from preprocess.alignment.silhouette_objective import SilhouetteObjective
 from preprocess.poses.plausibility import plausibility_warnings
 
-MIN_JUMP_M, MIN_JUMP_RAD = 0.25, np.deg2rad(40.0)
-"""What nobody does from one frame to the next …"""
+MIN_JUMP_M = 0.25
+"""Least step of the root between frames that is a jump, metres."""
+MIN_JUMP_RAD = np.deg2rad(40.0)
+"""Least turn of the root between frames that is a jump, radians."""
 MIN_JUMP_RATIO = 6.0
-"""… unless all frames are that far apart: a jump is so many times the usual step, too."""
+"""Ratio to the median step that a jump must also exceed."""
 VIEW_SECTORS = 12
+"""Sectors of directions around the body."""
 MIN_VIEW_COVERAGE = 0.5
+"""Fraction of the sectors below which the video shows too few sides."""
 MIN_PERSON_PX = 60
+"""Median height of the person below which there is little detail, px."""
 MAX_BETA = 6.0
+"""Largest plausible magnitude of a shape coefficient."""
 MAX_LISTED_FRAMES = 6
+"""Frame numbers that a message lists."""
 
 
 def sanity_warnings(
@@ -27,13 +34,13 @@ def sanity_warnings(
     objective: SilhouetteObjective | None,
     height_px: int,
 ) -> Iterator[str]:
-    """Sentences about what is odd, for people.
+    """Describe what is implausible, for people.
 
     Args:
-        claim: Poses and cameras.
-        frames: Numbers of the wanted frames.
-        evidence: Masks of some frames, if there are any.
-        height_px: Of the pictures.
+        geometry: Poses and cameras.
+        frames: Numbers of the selected frames.
+        objective: Masks of some frames, if there are any.
+        height_px: Height of the images.
     """
     yield from _missing_pose_warnings(geometry, frames)
     yield from _timestamp_warnings(geometry, frames)
@@ -43,7 +50,7 @@ def sanity_warnings(
     if seen < MIN_VIEW_COVERAGE:
         yield (
             f"The video shows the person from only {seen:.0%} of the directions around them; what "
-            "it does not show cannot be learnt. Film the person turning round once."
+            "it does not show cannot be learnt. Film the person turning around once."
         )
     if objective is not None:
         yield from _mask_warnings(objective)
@@ -51,7 +58,7 @@ def sanity_warnings(
 
 
 def view_coverage(geometry: CaptureGeometry) -> float:
-    """Share of the directions around the body from which a camera sees it, in twelve sectors."""
+    """Fraction of the `VIEW_SECTORS` around the body from which a camera sees it."""
     valid = geometry.motion.valid
     roots = Rotation.from_rotvec(geometry.motion.root_rotations[valid])
     eyes = geometry.camera_centers()[geometry.camera_rows()[valid]]
@@ -60,32 +67,32 @@ def view_coverage(geometry: CaptureGeometry) -> float:
     return len(np.unique(sector.clip(0, VIEW_SECTORS - 1))) / VIEW_SECTORS
 
 
-def _missing_pose_warnings(claim: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    valid = claim.motion.valid
+def _missing_pose_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
+    valid = geometry.motion.valid
     lost = int((~valid).sum())
     if lost:
         yield (
             f"{lost} of {len(valid)} poses are NaN or marked as not valid; their frames are left "
             "out."
         )
-    bare = [frame for frame in frames if claim.row_for_frame(frame) is None]
+    bare = [frame for frame in frames if geometry.row_for_frame(frame) is None]
     if len(bare) > lost:
         yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
 
 
-def _timestamp_warnings(claim: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    """Whether the poses' times are the video's."""
-    times = claim.motion.times_s
-    known = np.isfinite(claim.row_frames)
-    if times is None or claim.motion.frames is not None or not known.any():
+def _timestamp_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
+    """Times of poses that are not the video's."""
+    times = geometry.motion.times_s
+    known = np.isfinite(geometry.row_frames)
+    if times is None or geometry.motion.frames is not None or not known.any():
         return
-    inside = (claim.row_frames[known] >= frames[0] - 0.5) & (
-        claim.row_frames[known] <= frames[-1] + 0.5
+    inside = (geometry.row_frames[known] >= frames[0] - 0.5) & (
+        geometry.row_frames[known] <= frames[-1] + 0.5
     )
     last = int(np.argmax(np.where(known, np.abs(times), 0.0)))
-    if inside.mean() >= 0.5 or claim.row_frames[last] == 0.0:
+    if inside.mean() >= 0.5 or geometry.row_frames[last] == 0.0:
         return
-    seconds = times[last] / claim.row_frames[last]
+    seconds = times[last] / geometry.row_frames[last]
     yield (
         f"The poses' times run from {times[known].min():.6g} to {times[known].max():.6g} s, the "
         f"frames' from {seconds * frames[0]:.3g} to {seconds * frames[-1]:.3g} s; `time` is in "
@@ -93,15 +100,15 @@ def _timestamp_warnings(claim: CaptureGeometry, frames: list[int]) -> Iterator[s
     )
 
 
-def _range_warnings(claim: CaptureGeometry) -> Iterator[str]:
-    motion = claim.motion
+def _range_warnings(geometry: CaptureGeometry) -> Iterator[str]:
+    motion = geometry.motion
     yield from plausibility_warnings(motion)
     if len(motion.betas) and np.abs(motion.betas).max() > MAX_BETA:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
 
 
 def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
-    """Frames before which there is a step far larger than the others; share of poses that rest."""
+    """Frames before which the root jumps; the fraction of poses that repeat the one before."""
     motion = geometry.motion
     if motion.valid.sum() < 3:
         return [], 0.0
@@ -117,12 +124,15 @@ def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
     return after, float(still.sum() / max(1, near.sum()))
 
 
-def _jump_warnings(claim: CaptureGeometry) -> Iterator[str]:
-    """What those steps are called."""
-    after, still = find_jumps(claim)
+def _jump_warnings(geometry: CaptureGeometry) -> Iterator[str]:
+    """Jumps and repeated poses."""
+    after, still = find_jumps(geometry)
     if after:
         times = "once" if len(after) == 1 else f"{len(after)} times"
-        yield f"The poses jump {times}{_list_frames(after)}. Did the tracker change persons?"
+        yield (
+            f"The poses jump {times}{_list_frames(after)}. Did the tracker switch to another "
+            "person?"
+        )
     if still > 0.2:
         yield f"{still:.0%} of the poses are the same as the one before."
 
@@ -131,29 +141,29 @@ def _outliers(steps: Float[np.ndarray, "steps"], least: float) -> Bool[np.ndarra
     return (steps > least) & (steps > MIN_JUMP_RATIO * np.median(steps))
 
 
-def _mask_warnings(evidence: SilhouetteObjective) -> Iterator[str]:
-    """Masks that cannot be used, or are no outlines."""
-    looked = len(evidence.rejections) + len(evidence.samples)
-    if evidence.rejections:
-        first = evidence.rejections[0].rstrip(".")
+def _mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
+    """Masks that cannot be used, or are boxes."""
+    looked = len(objective.rejections) + len(objective.samples)
+    if objective.rejections:
+        first = objective.rejections[0].rstrip(".")
         yield (
-            f"{len(evidence.rejections)} of {looked} masks that were looked at cannot be used, and "
+            f"{len(objective.rejections)} of {looked} sampled masks cannot be used, and "
             f"their frames are left out ({first})."
         )
-    if evidence.are_boxes:
+    if objective.are_boxes:
         yield (
             "The masks are boxes, not outlines: all that is in them will be learnt as the person. "
             "Leave them out (--masks segmenter:grabcut), or give a segmenter's."
         )
 
 
-def _framing_warnings(evidence: SilhouetteObjective, height_px: int) -> Iterator[str]:
-    """Whether the whole person is in the picture, and large enough."""
-    alphas = [witness.alpha > 0.5 for witness in evidence.samples]
+def _framing_warnings(objective: SilhouetteObjective, height_px: int) -> Iterator[str]:
+    """Persons who are cut off by the image's border, or small."""
+    alphas = [sample.alpha > 0.5 for sample in objective.samples]
     touching = sum(a[0].any() or a[:, 0].any() or a[:, -1].any() or a[-1].any() for a in alphas)
     if touching > 0.2 * len(alphas):
         yield (
-            f"In {touching} of {len(alphas)} frames the person touches the picture's rim; what is "
+            f"In {touching} of {len(alphas)} frames the person touches the image's border; what is "
             "outside cannot be learnt."
         )
     heights = [np.ptp(np.flatnonzero(a.any(axis=1))) + 1 for a in alphas]

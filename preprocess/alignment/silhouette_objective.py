@@ -1,4 +1,4 @@
-"""A few frames' masks, small, against which every guess is held."""
+"""The silhouette objective: IoU of posed bodies with the small masks of a few frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,15 +18,15 @@ from preprocess.masks.mask_files import Masks
 from preprocess.observe import alpha_channel_mask
 
 SAMPLED_FRAMES = 16
-"""How many frames are looked at."""
+"""Number of frames that are sampled."""
 COARSE_MASK_PX = 256.0
-"""Longer side of the masks in which the person's height is measured."""
+"""Longer side of the masks in which the person's height is measured, px."""
 MIN_BOX_FILL = 0.95
-"""Share of its bounding box that no person's outline fills."""
+"""Fraction of its bounding box that no person's outline fills."""
 MIN_COVERED_FRACTION = 0.1
 """Fraction of a mask's connected part that the body must cover to be of the same person."""
 MAX_CACHED_POSES = 256
-"""Posed skins that are kept: 25 MB."""
+"""Posed skins in the cache: 25 MB."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,9 +34,9 @@ class MaskSample:
     """One frame's mask.
 
     Attributes:
-        index: The frame's number.
-        camera_row: Which camera is its.
-        alpha: How far each pixel is person, small.
+        index: Frame number.
+        camera_row: Index of the frame's camera.
+        alpha: The mask, reduced, in [0, 1].
     """
 
     index: int
@@ -46,12 +46,12 @@ class MaskSample:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SilhouetteObjective:
-    """The masks of a few frames, spread over the capture.
+    """Scores a geometry by the IoU of the posed body with the masks of a few frames.
 
     Attributes:
-        witnesses: In the frames' order; all masks are of one size.
-        skin: The person whose silhouette is held against them.
-        refused: Why masks that were looked at cannot be used.
+        samples: Masks in the frames' order, all of one size.
+        skin: The person whose silhouette is compared with them.
+        rejections: Why sampled masks cannot be used.
     """
 
     samples: tuple[MaskSample, ...]
@@ -63,26 +63,26 @@ class SilhouetteObjective:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of the small masks."""
+        """Width and height of the reduced masks."""
         height, width = self.samples[0].alpha.shape
         return int(width), int(height)
 
     @property
     def are_boxes(self) -> bool:
-        """Whether the masks are boxes around the person, which say nothing of its size."""
+        """Whether the masks are boxes, which do not determine the person's size."""
         return float(np.median([_box_fill(w.alpha > 0.5) for w in self.samples])) > MIN_BOX_FILL
 
     def subset(self, count: int) -> "SilhouetteObjective":
-        """Every so many-th of the frames."""
+        """At most `count` of the frames, evenly spaced."""
         rows = spaced_indices(len(self.samples), count)
         return replace(self, samples=tuple(self.samples[r] for r in rows))
 
     def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "samples"]:
-        """Agreement of each frame in [0, 1]; NaN where the claim has no pose for it."""
-        return np.array([self.frame_score(geometry, witness) for witness in self.samples])
+        """IoU of each frame; NaN where the geometry has no pose."""
+        return np.array([self.frame_score(geometry, sample) for sample in self.samples])
 
     def frame_score(self, geometry: CaptureGeometry, sample: MaskSample) -> float:
-        """Agreement of one frame."""
+        """IoU of one frame; NaN if the geometry has no pose."""
         row = geometry.row_for_frame(sample.index)
         if row is None:
             return float("nan")
@@ -96,9 +96,9 @@ class SilhouetteObjective:
     def keep_person(
         self, geometry: CaptureGeometry, frame: int, alpha: Float32[np.ndarray, "height width"]
     ) -> Float32[np.ndarray, "height width"]:
-        """Those parts of a frame's mask, of any size, that the posed body touches.
+        """The components of a frame's mask, of any size, that the posed body touches.
 
-        Unchanged where the claim has no pose for the frame.
+        Unchanged where the geometry has no pose for the frame.
         """
         row = geometry.row_for_frame(frame)
         if row is None:
@@ -109,7 +109,7 @@ class SilhouetteObjective:
         return components_touching(alpha, large > 0)
 
     def posed_points(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
-        """The skin in one of a motion's poses; the last ones are kept, as guesses share them."""
+        """The skin in one of a motion's poses; cached, as candidates share poses."""
         if (motion, row) not in self._posed_cache:
             if len(self._posed_cache) >= MAX_CACHED_POSES:
                 self._posed_cache.clear()
@@ -118,13 +118,13 @@ class SilhouetteObjective:
 
 
 def mean_score(scores: Float[np.ndarray, "samples"]) -> float:
-    """Mean agreement of the frames that have a pose; 0 if none has."""
+    """Mean score of the frames that have a pose; 0 if none has."""
     known = scores[np.isfinite(scores)]
     return float(known.mean()) if len(known) else 0.0
 
 
 def mean_with_missing(scores: Float[np.ndarray, "samples"]) -> float:
-    """Mean agreement; where more than half of the frames lack a pose, those count as 0."""
+    """Mean score; where more than half of the frames lack a pose, those count as 0."""
     if 2 * np.isfinite(scores).sum() >= len(scores):
         return mean_score(scores)
     return float(np.nansum(scores)) / len(scores)
@@ -133,7 +133,7 @@ def mean_with_missing(scores: Float[np.ndarray, "samples"]) -> float:
 def components_touching(
     alpha: Float32[np.ndarray, "height width"], body: Bool[np.ndarray, "height width"]
 ) -> Float32[np.ndarray, "height width"]:
-    """The connected parts of a mask that a body covers in part; the others become 0.
+    """The connected components of a mask that a body covers in part; the others become 0.
 
     Unchanged where the body touches none.
     """
@@ -148,7 +148,7 @@ def components_touching(
 
 
 def _box_fill(alpha: Bool[np.ndarray, "height width"]) -> float:
-    """Share of its bounding box that a mask covers."""
+    """Fraction of its bounding box that a mask covers."""
     rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
     if not len(rows):
         return 0.0
@@ -156,7 +156,7 @@ def _box_fill(alpha: Bool[np.ndarray, "height width"]) -> float:
 
 
 def spaced_indices(total: int, count: int) -> list[int]:
-    """At most `count` numbers below `total`, evenly spread, the ends left out."""
+    """At most `count` indices below `total`, evenly spaced, without the ends."""
     places = (np.arange(min(count, total)) + 0.5) / min(count, total) * total
     return [int(place) for place in places]
 
@@ -171,19 +171,19 @@ def sample_masks(
     count: int = SAMPLED_FRAMES,
     excluded_frames: frozenset[int] = frozenset(),
 ) -> SilhouetteObjective:
-    """Reads a few masks; pictures are decoded only where the masks are in them.
+    """Read a few masks; images are decoded only where their alpha channel is the mask.
 
     Args:
-        source: Says which frames there are.
-        masks: The masks; None if the pictures have an alpha channel.
-        mask_row: From a frame's number to its mask.
-        camera_row: From a frame's number to its camera.
+        source: The frames.
+        masks: The masks; None if the images have an alpha channel.
+        mask_row: From a frame number to its mask.
+        camera_row: From a frame number to its camera.
         skin: The person.
-        count: How many frames are looked at.
-        without: Frames that cannot be used.
+        count: Number of frames to sample.
+        excluded_frames: Frames that cannot be used.
 
     Raises:
-        InputError: If no mask shows anybody.
+        InputError: If no mask shows a person.
     """
     start, step = source.selection.start, source.selection.step
     usable = [start + step * n for n in range(source.frame_count or 1)]
@@ -198,7 +198,7 @@ def sample_masks(
     found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
     if not found:
         raise InputError(
-            f"None of the masks of {len(frames)} frames of {source.path} shows anybody."
+            f"None of the masks of {len(frames)} frames of {source.path} shows a person."
         )
     heights = [_mask_height(alpha) for _, alpha in found]
     longer = max(size_px) * SILHOUETTE_PERSON_PX / max(float(np.median(heights)), 1.0)
@@ -216,7 +216,7 @@ def sample_masks(
 def _sample_mask_files(
     masks: Masks, frames: Sequence[int], row: Callable[[int], int], size_px: tuple[int, int]
 ) -> tuple[list[tuple[int, Float32[np.ndarray, "_ _"]]], list[str]]:
-    """Those of the masks that can be used, and why others cannot."""
+    """The usable masks, and why others cannot be used."""
     found, refused = [], []
     for index in frames:
         try:
@@ -229,14 +229,14 @@ def _sample_mask_files(
 def _sample_alpha_channels(
     source: FrameSource, frames: Sequence[int], size_px: tuple[int, int]
 ) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
-    found, pictures = [], list_images(source.path)  # only pictures have alpha channels
+    found, pictures = [], list_images(source.path)  # only images have alpha channels
     for index in frames:
         try:
             rgb, alpha = read_image(pictures[index])
             if rgb.shape[1::-1] == source.size_px:
                 frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
                 found.append((index, alpha_channel_mask(frame, size_px)))
-        except (InputError, OSError):  # one of many; that it is damaged is said elsewhere
+        except (InputError, OSError):  # one of many; damaged frames are reported elsewhere
             continue
     return found
 

@@ -1,4 +1,4 @@
-"""The surface of a triangle mesh: vertex normals, vertex areas, and which of its points are seen."""
+"""The surface of a triangle mesh: vertex normals, vertex areas and visible points."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int

@@ -1,6 +1,7 @@
-"""Where a posed body lands in a small picture, and how well that agrees with a mask.
+"""Silhouettes of posed bodies, their agreement with masks, and distances from an outline.
 
-The outline of a posed body in a picture, and how far pixels are from one.
+Skin points are splatted where speed counts (small images, a thousand times in a search); the mesh
+is filled where sub-pixel accuracy counts (masks).
 """
 
 from dataclasses import dataclass
@@ -15,21 +16,21 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
 SKIN_POINTS = 8000
-"""On the skin: about three on each pixel of a person who is `PERSON_PX` high."""
+"""Points sampled on the skin: about three per pixel of a person `SILHOUETTE_PERSON_PX` high."""
 SILHOUETTE_PERSON_PX = 96
-"""Height of a person in the small pictures, in pixels: one is about 2 cm."""
+"""Height of a person in small images, px: a pixel is about 2 cm."""
 NEAR_PLANE_M = 0.05
-"""Points nearer to the camera than this are not drawn."""
+"""Least depth of a point that is drawn, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinPoints:
-    """Points all over one person's skin, evenly spread: enough to draw a silhouette from.
+    """Points spread evenly over one person's skin, dense enough to draw a silhouette.
 
     Attributes:
         shaped: The person.
-        rest: Where they lie at rest, metres.
-        weights: Their skinning weights.
+        rest: Rest positions, metres.
+        weights: Skinning weights.
     """
 
     shaped: ShapedBody
@@ -38,9 +39,9 @@ class SkinPoints:
 
     @classmethod
     def of(cls, shaped: ShapedBody, count: int = SKIN_POINTS) -> "SkinPoints":
-        """Systematic samples of the surface: every `count`-th part of the area has its point.
+        """Sample the surface systematically: one point per equal share of the area.
 
-        Within a triangle they follow the R2 sequence (the plane's golden ratio).
+        Within a triangle points follow the R2 sequence (the plane's golden ratio).
         """
         corners = shaped.vertices[shaped.body.faces]
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -59,7 +60,7 @@ class SkinPoints:
         )
 
     def posed(self, pose: BodyPose) -> Float32[np.ndarray, "points 3"]:
-        """Where they are in the world, by linear blend skinning (without pose blend shapes)."""
+        """World positions by linear blend skinning (without pose blend shapes), metres."""
         transforms = self.shaped.with_pose(pose).world_from_rest()[:, :3]
         blended = (self.weights @ transforms.reshape(24, 12).astype(np.float32)).reshape(-1, 3, 4)
         return np.einsum("pab,pb->pa", blended[:, :, :3], self.rest) + blended[:, :, 3]
@@ -68,7 +69,7 @@ class SkinPoints:
 def splat_silhouette(
     points_world: Float[np.ndarray, "points 3"], camera: Camera
 ) -> Bool[np.ndarray, "height width"]:
-    """The pixels that dense points of a surface cover; nothing of what is behind the camera.
+    """The pixels that dense points of a surface in front of the camera cover.
 
     Holes of a pixel or two between the points are closed.
     """
@@ -83,9 +84,9 @@ def splat_silhouette(
 def _project(
     points_world: Float[np.ndarray, "points 3"], camera: Camera
 ) -> Float32[np.ndarray, "3 points"]:
-    """x and y in pixels, and the depth; as `Camera.project`, but twice as fast without a lens.
+    """x and y, px, and depth, metres, in single precision (errors of 0.01 px).
 
-    A hundredth of a pixel, which is what single precision costs, is enough here.
+    Twice as fast as `Camera.project` where the lens has no distortion.
     """
     matrix = (camera.intrinsic @ camera.camera_from_world[:3]).astype(np.float32)
     projected = matrix[:, :3] @ points_world.T.astype(np.float32) + matrix[:, 3:]
@@ -100,9 +101,9 @@ def _project(
 def soft_iou(
     body: Bool[np.ndarray, "height width"], alpha: Float32[np.ndarray, "height width"]
 ) -> float:
-    """Intersection over union of a silhouette and a soft mask, in [0, 1].
+    """Soft intersection over union of a silhouette and a mask, in [0, 1].
 
-    The soft kind: the sum of the smaller over the sum of the larger of each pixel's two.
+    The sum over the pixels of the smaller value over the sum of the larger.
     """
     both, either = float(alpha[body].sum()), float(alpha.sum() + body.sum())
     union = either - both
@@ -110,19 +111,19 @@ def soft_iou(
 
 
 SUBPIXEL_BITS = 4
-"""Corners are drawn to a sixteenth of a pixel."""
+"""Fractional bits of drawn corners: 1/16 px."""
 
 
 @final
 class MeshSilhouette:
-    """Draws one person's body, or what has its triangles, as a filled shape.
+    """Draws one person's body, or any vertices with its triangles, as a filled shape.
 
-    OpenCV fills many polygons at once by the even-odd rule; so each call gets the triangles of one
-    limb that look towards the camera, or away from it: these do not lie over each other.
+    OpenCV fills many polygons at once by the even-odd rule. So each call gets the triangles of one
+    limb that face the camera, or those that face away: these do not overlap.
     """
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Sorts the triangles by limbs."""
+        """Group the triangles by limb."""
         self._shaped = shaped
         faces = shaped.body.faces
         limb = shaped.body.weights[faces].sum(axis=1).argmax(axis=1)
@@ -136,11 +137,11 @@ class MeshSilhouette:
     def draw_vertices(
         self, vertices: Float[np.ndarray, "vertices 3"], camera: Camera
     ) -> UInt8[np.ndarray, "height width"]:
-        """The pixels that the body's triangles cover, their corners elsewhere: 1, else 0.
+        """Draw the body's triangles between the given vertices: 1, else 0.
 
         Args:
-            vertices: In the world, metres.
-            camera: If any of them is too near to it or behind it, nothing is drawn.
+            vertices: World positions, metres.
+            camera: Camera of the image; if a vertex is too near or behind it, nothing is drawn.
         """
         width, height = camera.size_px
         picture = np.zeros((height, width), dtype=np.uint8)
@@ -171,7 +172,7 @@ class MeshSilhouette:
 def signed_distance_px(
     mask: Bool[np.ndarray, "height width"],
 ) -> Float32[np.ndarray, "height width"]:
-    """How far the middle of each pixel is outside a shape, in pixels; inside negative."""
+    """Distance of each pixel's center from a shape's border, px; negative inside."""
     hard = mask.astype(np.uint8)
     outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)
     inside = cv2.distanceTransform(hard, cv2.DIST_L2, 5)

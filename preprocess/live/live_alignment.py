@@ -1,8 +1,9 @@
-"""SMPL's poses on another body while they come: fitted to what was seen so far, ever again.
+"""Incremental alignment of streamed SMPL poses to a body that is not SMPL's.
 
-The first picture says how far away the person is, turning says the rest. So what
-`preprocess.alignment.mask_alignment` does is done with the first frame, and whenever there are twice as many; or,
-where no masks will come, what `preprocess.alignment.image_alignment` does.
+The first frame determines the person's distance, turning the rest. So the alignment is solved with
+the first frame and again whenever the number of frames has doubled: by masks
+(`preprocess.alignment.mask_alignment`) or, where there are none, by images
+(`preprocess.alignment.image_alignment`).
 """
 
 from collections.abc import Callable
@@ -38,7 +39,7 @@ from preprocess.observe import DroppedFrame
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _KeptFrame:
-    """A frame that is kept: the tracker's own pose, and the mask or the picture, small."""
+    """A kept frame: the tracker's own pose, and the mask or the image, small."""
 
     pose: BodyPose
     thumbnail: Shaped[np.ndarray, "height width *_"]
@@ -46,21 +47,21 @@ class _KeptFrame:
 
 @final
 class LiveAlignment:
-    """Fits the poses of one stream, seen by a camera that stands still, to one body.
+    """Fits the poses of one stream of a static camera to one body.
 
     Attributes:
-        refit: What was found last; None before the first frame.
-        frames: On how many frames it rests.
-        masked: Whether it looks at masks, or at pictures.
+        placement: The last solution; None before the first frame.
+        frame_count: Number of frames that it rests on.
+        uses_masks: Whether it is fitted to masks rather than images.
     """
 
     def __init__(self, shaped: ShapedBody, model: str, *, masked: bool = True) -> None:
-        """Nothing was seen yet.
+        """Start without frames.
 
         Args:
             shaped: The body that is used.
-            model: Whose poses they are.
-            masked: Whether masks come along; else pictures are looked at.
+            model: Body model of the poses.
+            masked: Whether frames come with masks; else images are used.
         """
         self.placement: BodyPlacement | None = None
         self.frame_count = 0
@@ -69,14 +70,14 @@ class LiveAlignment:
         self._count, self._every = 0, 1
 
     def align(self, observation: Observation) -> Observation:
-        """The observation with its pose as it fits the masks, this one among them."""
+        """The observation with its pose fitted to the masks so far, this one included."""
         pose = self._align_pose(observation.pose, observation.camera, observation.alpha)
         return observation if pose is observation.pose else replace(observation, pose=pose)
 
     def align_observations(
         self, observe: Callable[[Frame], Observation | DroppedFrame]
     ) -> Callable[[Frame], Observation | DroppedFrame]:
-        """What makes observations of frames, their poses fitted to the masks in them."""
+        """Wrap an observer: its observations' poses are fitted to their masks."""
 
         def fitted(frame: Frame) -> Observation | DroppedFrame:
             seen = observe(frame)
@@ -87,7 +88,7 @@ class LiveAlignment:
     def align_poses(
         self, pose_of: Callable[[Frame], BodyPose | str], camera: Camera
     ) -> Callable[[Frame], BodyPose | str]:
-        """What gives frames their poses, fitted to the pictures, before masks are estimated."""
+        """Wrap a source of poses: they are fitted to the images before masks are estimated."""
 
         def fitted(frame: Frame) -> BodyPose | str:
             pose = pose_of(frame)
@@ -98,7 +99,7 @@ class LiveAlignment:
     def _align_pose(
         self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
     ) -> BodyPose:
-        """The pose of a new frame as it fits all masks, or pictures, that are kept."""
+        """The pose of a new frame, fitted to all kept masks or images."""
         if self._count % self._every == 0:
             self._keep(pose, camera, seen)
         self._count += 1
@@ -112,7 +113,7 @@ class LiveAlignment:
     def _keep(
         self, pose: BodyPose, camera: Camera, seen: Shaped[np.ndarray, "height width *_"]
     ) -> None:
-        """Remembers a frame; of more than twice what a search takes, every other one goes."""
+        """Keep a frame; from twice the number of samples on, drop every other one."""
         if self._seen:
             height, width = self._seen[0].thumbnail.shape[:2]
         elif self.uses_masks:
@@ -128,7 +129,7 @@ class LiveAlignment:
             del self._seen[1::2]
 
     def _solve(self, camera: Camera) -> BodyPlacement:
-        """What all that is remembered says."""
+        """Solve the placement from all kept frames."""
         poses = [seen.pose for seen in self._seen]
         count = len(poses)
         motion = Motion(

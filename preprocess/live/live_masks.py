@@ -1,4 +1,4 @@
-"""Masks that a segmenter still writes: each is waited for, and belongs to a picture by its name."""
+"""Masks of a live source: a segmenter still writes them, and frames wait for theirs."""
 
 import re
 from pathlib import Path
@@ -16,28 +16,28 @@ from preprocess.masks.mask_files import Masks, read_mask
 
 
 class _InvertedMask(InputError):  # noqa: N818 - a finding, not an error
-    """A mask that is the other way round than those before it: waiting does not help."""
+    """A mask that is inverted unlike those before it: waiting does not help."""
 
 
 @final
 class LiveMasks:
-    """The masks of a live source: a folder of pictures, written one after the other.
+    """The masks of a live source: a folder of images, written one after the other.
 
-    A mask belongs to the picture of the same name; of a camera, whose pictures have none, to the
-    one whose number is the last in the mask's name. Which side is the person, if nobody has said
-    it, is what most of them show so far, and the first if they are even; the others are refused.
+    A mask belongs to the image of the same name; a camera's frames have no names: there it is the
+    last number in the mask's name that counts. Unless it is given, the polarity is that of most
+    masks so far, of the first if they are even; masks of the other polarity are refused.
     """
 
     def __init__(
         self, path: Path, pace: PacingClock, *, invert: bool | None, patience_s: float = MAX_WAIT_S
     ) -> None:
-        """Nothing is read yet.
+        """Remember the folder; masks are read on demand.
 
         Args:
             path: The folder.
-            pace: Its clock; ending it ends every wait.
-            invert: Whether the person is dark; None finds out from the masks.
-            patience_s: How long after it was filmed a frame waits for its mask.
+            pace: Clock of the source; stopping it ends every wait.
+            invert: Whether the person is dark; None detects it from the masks.
+            patience_s: Time after its capture that a frame waits for its mask, seconds.
         """
         self._path, self._pace, self._invert, self._patience_s = path, pace, invert, patience_s
         self._by_name: dict[str, Path] = {}
@@ -47,11 +47,11 @@ class LiveMasks:
     def wait_for_mask(
         self, frame: Frame, size_px: tuple[int, int]
     ) -> Float32[np.ndarray, "height width"]:
-        """The mask of a frame, scaled to a picture's size; waits for it.
+        """Wait for the mask of a frame and scale it to an image's size.
 
         Raises:
-            InputError: If it did not come in time, cannot be read, is of another shape, or the other
-                way round than most.
+            InputError: If it did not come in time, cannot be read, has another aspect ratio, or is
+                inverted unlike most.
         """
         deadline = (self._pace.now() if frame.due_s is None else frame.due_s) + self._patience_s
         while True:
@@ -62,7 +62,7 @@ class LiveMasks:
                 trouble = InputError(f"no mask within {self._patience_s:g} s")
             except _InvertedMask:
                 raise
-            except InputError as cause:  # perhaps it is half written
+            except InputError as cause:  # the file may be half written
                 trouble = cause
             if self._pace.now() >= deadline or self._pace.stopped:
                 raise trouble
@@ -72,19 +72,19 @@ class LiveMasks:
         stored = read_mask(path)
         if self._invert is not None:
             return Masks(path, 1, lambda row: stored, invert=self._invert).alpha(0, size_px)
-        if not stored.any():  # it tells nothing of the others either
+        if not stored.any():  # an empty mask has no polarity
             return np.zeros(size_px[::-1], dtype=np.float32)
         before = self._majority_inverted()
         try:
             turned = Masks(path, 1, lambda row: stored, invert=None).inverted
-        except InputError:  # full, or undecidable, or no mask at all, which is said below
+        except InputError:  # full or undecidable; the reading below refuses what is no mask
             if before is None:
                 raise
             return Masks(path, 1, lambda row: stored, invert=before).alpha(0, size_px)
         alpha = Masks(path, 1, lambda row: stored, invert=turned).alpha(0, size_px)
         self._ways.append(turned)
         if turned != self._majority_inverted():
-            raise _InvertedMask(f"{path.name} is the other way round than most masks so far")
+            raise _InvertedMask(f"{path.name} is inverted unlike most masks so far")
         return alpha
 
     def _majority_inverted(self) -> bool | None:

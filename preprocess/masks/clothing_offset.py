@@ -1,11 +1,10 @@
-"""Hair that stands off the head farther than clothes do: where it may be, and what is no leak.
+"""Offset of clothes and hair from the body, per vertex, learnt from where masks end.
 
-How far clothes and hair stand off the body, learnt frame by frame from where masks end.
-
-The shell is a thickness for each vertex of the skin. Where a vertex is on the body's rim, seen from
-the camera, the mask along its normal tells how far out the person reaches there. These votes are
-kept in layers at rest, so that what one picture leaves in doubt, others settle: backgrounds change
-behind a person who turns or a camera that walks, clothes do not.
+Where a vertex is on the body's rim as the camera sees it, the mask along its normal shows how far
+the person extends there. These votes are kept per vertex in layers of height over the skin, so that
+later images settle what one leaves uncertain: behind a person who turns or a camera that moves the
+background changes, clothes do not. Hair protrudes further than the layers: around the head a wider
+region is uncertain, and solid regions in it are hair rather than segmentation leaks.
 """
 
 from typing import NamedTuple, final
@@ -22,15 +21,15 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.silhouette import NEAR_PLANE_M, MeshSilhouette
 
 HEAD_JOINT = 15
-"""The head's joint."""
+"""SMPL's head joint."""
 
-HEAD_RADIUS_M, HAIR_BAND_M = 0.3, 0.06
-"""So near to the head's middle, outside the shell at least so much is in doubt; what is found there
-does not make a cut less trusted."""
+HEAD_RADIUS_M = 0.3
+"""Radius around the center of the head in which pixels may be hair, metres."""
+HAIR_BAND_M = 0.06
+"""Least width of the uncertain band outside the clothed shape within that radius, metres."""
 
 MIN_HAIR_WIDTH_M = 0.025
-"""What is so wide in all directions is a knot or a bun, however little the shell knows of it; what
-is narrower may be a leak."""
+"""Least width of a bun in all directions, metres; thinner regions may be segmentation leaks."""
 
 
 def head_region(
@@ -39,9 +38,9 @@ def head_region(
     """The pixels that may be hair.
 
     Args:
-        skin: The head's, in the world.
-        camera: Of the picture.
-        px_per_m: What a metre is in the picture, at the body.
+        skin: Vertices of the head in the world, metres.
+        camera: Camera of the image.
+        px_per_m: Pixels per metre at the body.
     """
     x, y = camera.project(skin.mean(axis=0, keepdims=True))[0]
     width, height = camera.size_px
@@ -52,11 +51,11 @@ def head_region(
 def solid_hair(
     protruding: Bool[np.ndarray, "height width"], px_per_m: float
 ) -> Bool[np.ndarray, "height width"]:
-    """Of hair outside the shell what stands off in one piece, and the pixels beside it.
+    """Hair that protrudes in one wide piece, dilated by a pixel.
 
     Args:
-        beyond: The pixels of hair outside the shell.
-        px_per_m: What a metre is in the picture, at the body.
+        protruding: Pixels of possible hair outside the clothed shape.
+        px_per_m: Pixels per metre at the body.
     """
     wide = np.ones((max(3, int(MIN_HAIR_WIDTH_M * px_per_m) | 1),) * 2, np.uint8)
     solid = cv2.morphologyEx(protruding.astype(np.uint8), cv2.MORPH_OPEN, wide)
@@ -64,55 +63,63 @@ def solid_hair(
 
 
 OFFSET_LAYERS_M = np.arange(-0.015, 0.0901, 0.0075)
-"""Heights over the skin at which votes are kept."""
+"""Heights over the skin at which votes are kept, metres."""
 
 PRIOR_OFFSET_M = 0.01
-"""How thick clothes are, as long as nobody has voted."""
+"""Prior mean of the clothing offset, metres."""
 PRIOR_OFFSET_WIDTH_M = 0.015
-PRIOR_VOTES, LIMB_MEAN_VOTES, LIMB_VOTE_WEIGHT = 1.0, 0.5, 0.02
-"""A limb's mean thickness is worth so many votes of a vertex; a vote of a vertex is worth so much
-of one of its limb, where the guess has one."""
+"""Width of the prior's transition from person to background, metres."""
+PRIOR_VOTES = 1.0
+"""Weight of the prior, in votes of a limb."""
+LIMB_MEAN_VOTES = 0.5
+"""Weight of a limb's mean offset, in votes of a vertex."""
+LIMB_VOTE_WEIGHT = 0.02
+"""Weight of a vertex's vote in its limb's mean."""
 
 KNOWN_VOTES = 4.0
-"""A vertex with so many votes is known."""
+"""Votes from which a vertex is known."""
 
 RIM_COSINE = 0.15
-"""Vertices whose normal is so nearly across the ray are on the rim (the cosine)."""
+"""Largest cosine between normal and ray of a vertex on the rim."""
 
 CLEAR_CONTRAST = 25.0
-"""Colors on both sides of the mask's border less far apart than this vote less."""
-BAND_LIMIT_M, BAND_LIMIT_WEIGHT = 0.006, 0.1
-"""A border so near to the limit of what was in doubt was not found but cut off; its vote is so much
-worth."""
+"""Color difference across the mask's border, in levels, from which a vote has full weight."""
+BAND_LIMIT_M = 0.006
+"""Distance to the uncertain band's limit within which a border was cut off, not found, metres."""
+BAND_LIMIT_WEIGHT = 0.1
+"""Weight of a vote whose border was cut off."""
 
 FOOT_JOINTS = 7, 8, 10, 11
+"""SMPL's ankle and foot joints."""
 SOLE_VOTE_FRACTION = 0.35
-"""A vertex is as thick as half of its votes say. Soles are dark in their own shadow, and cuts more
-often miss them than add to them; so at the ankles' and feet's joints fewer are enough, where a
-vertex is known."""
+"""Fraction of person votes up to which a known vertex of a foot extends; elsewhere 0.5. Soles are
+dark in their own shadow: segmentations miss them more often than they add to them."""
 
 OVERSHOOT_KNOWN_FRACTION = 0.4
-"""From so much of the rim known, the thickness makes up for how far the drawn outline stands beyond
-the vertices. Before, the shell stays too large rather: what is too much GrabCutSegmenter takes away, but it
-does not look for what is not in doubt."""
-MAX_OVERSHOOT_M, MAX_OVERSHOOT_PX = 0.01, 1.5
-"""A vertex farther than this from the drawn outline is not on it."""
+"""Known fraction of the rim from which offsets compensate for the drawn outline overshooting the
+vertices. Until then the shape errs on the large side: GrabCut can remove pixels but never adds any
+beyond the uncertain band."""
+MAX_OVERSHOOT_M = 0.01
+"""Largest overshoot to compensate, metres."""
+MAX_OVERSHOOT_PX = 1.5
+"""Distance from the drawn outline beyond which a vertex is not on it, px."""
 
 SUPERSAMPLING = 3
-"""The shell is drawn so many times finer than the picture in which masks are found."""
+"""Resolution of the drawn shape relative to the image."""
 FILL_BIAS_PX = 0.25
-"""So much too large are shapes that are filled with all pixels that they touch."""
+"""`fillPoly` also fills pixels that it touches: shapes come out this many pixels too large."""
 
 
 class ClothedBody(NamedTuple):
-    """The shell around a posed body, as a camera sees it.
+    """A posed body with its clothing offsets, as a camera sees it.
 
     Attributes:
-        skin, normals: Of each vertex, in the world.
-        thickness: Of each vertex, metres.
-        rim: The vertices on the body's rim.
-        known: How much of the rim is known, in [0, 1].
-        px_per_m: What a metre is in the picture, at the body.
+        skin: Vertices in the world, metres.
+        normals: Unit normals of the vertices in the world.
+        offset_m: Clothing offset of each vertex, metres.
+        rim_vertices: The vertices on the body's rim.
+        known_fraction: Mean certainty of the rim's offsets, in [0, 1].
+        px_per_m: Pixels per metre at the body.
     """
 
     skin: Float[np.ndarray, "vertices 3"]
@@ -125,13 +132,15 @@ class ClothedBody(NamedTuple):
 
 @final
 class ClothingOffset:
-    """The thickness of what one person wears."""
+    """Clothing offsets of one person, learnt from votes of masks."""
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Nobody has voted yet."""
+        """Start without votes."""
         self._shaped, self._outline = shaped, MeshSilhouette(shaped)
         count = len(shaped.vertices)
-        self._votes = np.zeros((count, 2 * len(OFFSET_LAYERS_M)))  # for person, and all
+        self._votes = np.zeros(
+            (count, 2 * len(OFFSET_LAYERS_M))
+        )  # votes for person, then all votes
         self._smooth = _smoothing_matrix(shaped.body.faces, count)
         self._limb = shaped.body.weights.argmax(axis=1)
         self._foot = np.isin(self._limb, FOOT_JOINTS)
@@ -139,7 +148,7 @@ class ClothingOffset:
         self._limbs = csr_matrix(coo_matrix((ones, (self._limb, vertices)), shape=(24, count)))
 
     def clothe(self, pose: BodyPose, camera: Camera) -> ClothedBody | None:
-        """The shell around a pose; None if the body comes too near or behind the camera."""
+        """Dress a pose; None if the body comes too near or behind the camera."""
         skin = self._shaped.with_pose(pose).vertices()
         depth = skin @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
         if depth.min() < NEAR_PLANE_M:
@@ -148,18 +157,18 @@ class ClothingOffset:
         rays = skin - camera.center_world
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rim = np.flatnonzero(np.abs(np.einsum("va,va->v", normals, rays)) < RIM_COSINE)
-        thickness, known = self._offsets_m()
+        offsets, known = self._offsets_m()
         return ClothedBody(
             skin=skin,
             normals=normals,
-            offset_m=thickness,
+            offset_m=offsets,
             rim_vertices=rim,
             known_fraction=float(known[rim].mean()) if len(rim) else 0.0,
             px_per_m=max(camera.focal_px) / float(np.median(depth)),
         )
 
     def draw(self, clothed: ClothedBody, camera: Camera) -> Float32[np.ndarray, "rows columns"]:
-        """The shape of the shell, `SUPERSAMPLING` times finer than the camera's picture: 1, else 0."""
+        """Draw the clothed shape (1, else 0), `SUPERSAMPLING` times finer than the image."""
         width, height = camera.size_px
         out = clothed.offset_m - FILL_BIAS_PX / clothed.px_per_m
         outer = clothed.skin + clothed.normals * out[:, None]
@@ -175,15 +184,15 @@ class ClothingOffset:
         signed_distance_px: Float32[np.ndarray, "height width"],
         band_m: tuple[float, float],
     ) -> None:
-        """Lets a mask say how far out the person reaches.
+        """Add a mask's votes on how far the person extends beyond the skin.
 
         Args:
-            around: The shell as it was when the mask was found.
-            camera: Of the mask's size.
-            rgb: The picture.
+            clothed: The clothed body when the mask was estimated.
+            camera: Camera of the mask's size.
+            rgb: The image.
             alpha: The mask.
-            signed_distance_px: How far each pixel is outside the shell's shape; inside negative.
-            band_m: How far inside and outside the shell the mask was in doubt.
+            signed_distance_px: Distance from the clothed shape's border, positive outside, px.
+            band_m: Width of the uncertain band inside and outside the shape, metres.
         """
         rim, count = clothed.rim_vertices, len(OFFSET_LAYERS_M)
         from_skin = (
@@ -198,7 +207,7 @@ class ClothingOffset:
         )
         over = OFFSET_LAYERS_M - clothed.offset_m[rim, None]
         should = over * clothed.px_per_m
-        # elsewhere another limb is nearer, or the same one is seen before or behind the point
+        # Elsewhere another limb is nearer, or this one is seen in front of or behind the point.
         told = (np.abs(away - should) < 0.35 * np.abs(should) + 1.0) & (mask >= 0.0)
         inside = np.minimum.accumulate(np.where(told, mask, 1.0) > 0.5, axis=1).sum(axis=1)
         rows = np.arange(len(rim))
@@ -208,9 +217,9 @@ class ClothingOffset:
         weight[(border > outwards - BAND_LIMIT_M) | (border < BAND_LIMIT_M - inwards)] = (
             BAND_LIMIT_WEIGHT
         )
-        colours = cv2.remap(rgb, x, y, cv2.INTER_LINEAR).astype(np.float32)
-        before = colours[rows, np.clip(inside - 2, 0, count - 1)]
-        behind = colours[rows, np.clip(inside + 1, 0, count - 1)]
+        colors = cv2.remap(rgb, x, y, cv2.INTER_LINEAR).astype(np.float32)
+        before = colors[rows, np.clip(inside - 2, 0, count - 1)]
+        behind = colors[rows, np.clip(inside + 1, 0, count - 1)]
         weight *= np.clip(np.abs(before - behind).max(axis=1) / CLEAR_CONTRAST, 0.0, 1.0) ** 2
         self._votes[rim, :count] += np.where(told, mask, 0.0) * weight[:, None]
         self._votes[rim, count:] += told * weight[:, None]
@@ -223,9 +232,9 @@ class ClothingOffset:
     ) -> Float[np.ndarray, "rim"]:
         """How far the outline was drawn beyond each vertex of the rim, metres.
 
-        An outline is the envelope of all triangles: where vertices are dense and their thickness
-        is noisy, as on the head, the farthest of them make it. By so much less a vertex must be
-        lifted for the outline to lie where the mask ends.
+        An outline is the envelope of all triangles: where vertices are dense and their offsets
+        noisy, as on the head, the outermost vertices make it. Offsets are reduced by the overshoot
+        so that the outline lies where the mask ends.
         """
         rim = clothed.rim_vertices
         shell = clothed.skin[rim] + clothed.normals[rim] * clothed.offset_m[rim, None]
@@ -241,7 +250,7 @@ class ClothingOffset:
     def _offsets_m(
         self,
     ) -> tuple[Float[np.ndarray, "vertices"], Float[np.ndarray, "vertices"]]:
-        """Of each vertex: where enough of the votes end, and how well that is known."""
+        """Offset of each vertex, metres, and its certainty in [0, 1]."""
         count = len(OFFSET_LAYERS_M)
         votes = self._smooth @ (self._smooth @ self._votes)
         of_limb = LIMB_VOTE_WEIGHT * np.asarray(self._limbs @ self._votes)
@@ -257,14 +266,14 @@ class ClothingOffset:
         rows, last = np.arange(len(person)), np.maximum(first - 1, 0)
         high, low = person[rows, last], person[rows, first]
         share = np.clip((high - enough) / np.maximum(high - low, 1e-6), 0.0, 1.0)
-        thickness = OFFSET_LAYERS_M[last] + np.where(first > 0, share, 0.0) * (
+        offsets = OFFSET_LAYERS_M[last] + np.where(first > 0, share, 0.0) * (
             OFFSET_LAYERS_M[first] - OFFSET_LAYERS_M[last]
         )
-        return thickness, known
+        return offsets, known
 
 
 def _smoothing_matrix(faces: Int[np.ndarray, "faces 3"], count: int) -> csr_matrix:
-    """Half of each vertex and half of the mean of its neighbours."""
+    """Matrix that takes half of each vertex and half of the mean of its neighbors."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     links = csr_matrix(coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)))

@@ -1,9 +1,9 @@
-"""What earlier frames have shown behind the person, if the camera stands still.
+"""Color models of the background, per pixel, and of the person's surface, per vertex.
 
-What colours the person has, vertex by vertex, learnt where the surface faces the camera.
-
-A pixel of the border is a mixture, and two pixels farther in the person may look different: a sole
-below a shoe, a collar, a stripe. But who turns shows each part of the surface from the front once.
+The background model averages what earlier frames of a static camera have shown behind the person.
+The appearance model averages each vertex's color over the frames in which it faces the camera: near
+the border pixels are mixtures, and two pixels further in the surface may look different (a sole, a
+collar, a stripe), but a person who turns shows each part of the surface from the front once.
 """
 
 from typing import NamedTuple, final
@@ -15,41 +15,46 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from capture.camera import Camera
 from preprocess.masks.clothing_offset import ClothedBody
 
-BACKGROUND_MAX_DIFFERENCE, FOREGROUND_MIN_DIFFERENCE = 10.0, 18.0
-"""Colors nearer to what was seen behind the person are background, farther ones are person."""
+BACKGROUND_MAX_DIFFERENCE = 10.0
+"""Largest difference from the background model, in levels, of a pixel that is background."""
+FOREGROUND_MIN_DIFFERENCE = 18.0
+"""Least difference from the background at any brightness, in levels, of a pixel that is person."""
 
-MIN_LIGHT_GAIN, MAX_LIGHT_GAIN = 0.5, 1.1
-"""Shadows, and what the person reflects, darken and brighten the background by such factors."""
+MIN_LIGHT_GAIN = 0.5
+"""Darkest factor by which the person's shadow changes the background."""
+MAX_LIGHT_GAIN = 1.1
+"""Brightest factor by which light reflected by the person changes the background."""
 
 MIN_BACKGROUND_COUNT = 2.0
-"""How often a pixel must have been background before it says anything."""
+"""Frames in which a pixel must have been background before the model is used there."""
 
 BACKGROUND_MEMORY_FRAMES = 20.0
-"""Over how many frames the background is averaged; light changes."""
+"""Length of the running mean, frames: light changes."""
 
 CAMERA_MOVED_PX = 0.5
-"""A camera that moved more than this in the picture sees another background."""
+"""Motion of the image corners at 5 m, px, from which the camera sees another background."""
 
 MIN_BACKGROUND_SPREAD = 5.0
-"""The background is never known better than this, in levels."""
+"""Least standard deviation of the background, in levels."""
 LIGHT_BLUR_PX = 3.0
-"""How far around the brightness of the background is the same (a Gaussian's σ)."""
+"""Gaussian σ, px, over which the background's brightness is estimated."""
 
-CHANGED_DIFFERENCE, MAX_CHANGED_FRACTION = 12.0, 0.25
-"""Where more of the background than this differs by so much from before, the camera has moved even
-if nobody says so."""
+CHANGED_DIFFERENCE = 12.0
+"""Difference from the model, in levels, of a background pixel that has changed."""
+MAX_CHANGED_FRACTION = 0.25
+"""Fraction of changed background pixels from which the camera has moved, whatever its pose says."""
 CHANGE_CHECK_STRIDE = 2
-"""Every so manieth row and column is asked about that."""
+"""Check every n-th row and column for changes."""
 
 PixelMask = Bool[np.ndarray, "height width"]
 
 
 @final
 class BackgroundModel:
-    """The background of one camera, pixel by pixel."""
+    """Running mean and variance of the background of one static camera, per pixel."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
+        """Start empty."""
         self._mean: Float32[np.ndarray, "height width 3"] | None = None
         self._variance: Float32[np.ndarray, "height width"] | None = None
         self._times: Float32[np.ndarray, "height width"] | None = None
@@ -57,17 +62,17 @@ class BackgroundModel:
 
     @property
     def is_initialized(self) -> bool:
-        """Whether anything is remembered."""
+        """Whether the model holds any background."""
         return self._mean is not None
 
     def classify(
         self, rgb: UInt8[np.ndarray, "height width 3"], uncertain: PixelMask
     ) -> tuple[PixelMask, PixelMask]:
-        """Doubtful pixels that look like what was seen there before, and those that do not.
+        """Uncertain pixels that are background, and those that are person; others are neither.
 
-        A shadow of the person is neither: it is the background's colour, only darker, I = g B
+        A shadow of the person is neither: it has the background's color, only darker, I = g B
         (Horprasert et al. 1999, a statistical approach for background subtraction and shadow
-        detection). So person is what no brightness g of the background comes near to.
+        detection). So a pixel is person if no brightness g of the background comes near it.
         """
         if self._mean is None or self._times is None:
             nothing = np.zeros(uncertain.shape, dtype=bool)
@@ -86,12 +91,12 @@ class BackgroundModel:
     def reset_if_moved(
         self, camera: Camera, rgb: UInt8[np.ndarray, "height width 3"], background: PixelMask
     ) -> None:
-        """Forgets all if the camera looks elsewhere.
+        """Clear the model if the camera has moved.
 
         Args:
-            camera: Of the picture's size.
-            rgb: The picture.
-            free: Where the person surely is not.
+            camera: Camera of the image's size.
+            rgb: The image.
+            background: Pixels that are certainly not person.
         """
         before, self._camera = self._camera, camera
         if before is None or self._mean is None or self._times is None:
@@ -113,14 +118,14 @@ class BackgroundModel:
     def predict(
         self, rgb: UInt8[np.ndarray, "height width 3"], background: PixelMask
     ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]] | None:
-        """What lies behind the person, as bright as it is beside, and its standard deviation.
+        """Background behind the person at the brightness beside them, and its standard deviation.
 
         Args:
-            rgb: The picture.
-            free: Where the person surely is not.
+            rgb: The image.
+            background: Pixels that are certainly not person.
 
         Returns:
-            None if nothing is known yet; where not enough is, the deviation is infinite.
+            None of an empty model; where too few frames were seen, the deviation is infinite.
         """
         if self._mean is None or self._variance is None or self._times is None:
             return None
@@ -138,7 +143,7 @@ class BackgroundModel:
         return mean * gain[..., None], np.where(known, spread, np.float32(np.inf))
 
     def update(self, rgb: UInt8[np.ndarray, "height width 3"], background: PixelMask) -> None:
-        """Takes in the pixels of a picture where the person surely is not."""
+        """Average the certain background pixels of an image into the model."""
         if self._mean is None or self._variance is None or self._times is None:
             self._mean = np.zeros(rgb.shape, np.float32)
             self._variance = np.zeros(background.shape, np.float32)
@@ -149,42 +154,44 @@ class BackgroundModel:
         )
         off = rgb - self._mean
         self._mean += off * share[..., None]
-        # Welford 1962: of what is new, its part across the new mean is the variance's
+        # Welford 1962: the variance takes the squared deviation across the old and the new mean.
         squared = np.einsum("hwc,hwc->hw", off, off) / np.float32(3.0)
         self._variance += share * ((np.float32(1.0) - share) * squared - self._variance)
 
 
 MIN_FACING_COSINE = 0.5
-"""Colors are learnt where the cosine between normal and ray is greater."""
+"""Least cosine between normal and ray at which a vertex's color is learnt."""
 MIN_INSIDE_PX = 2.0
-"""And where the mask's border is farther away than this."""
+"""Least distance from the mask's border at which a color is learnt, px."""
 RIM_COSINES = -0.3, 0.6
-"""Vertices between these cosines show their colour along the outline."""
+"""Range of cosines in which vertices predict the color along the outline."""
 
 DEPTH_CELL_PX = 2
-"""So large are the pixels in which it is seen which vertex hides which."""
+"""Edge of the depth buffer's cells, px."""
 OCCLUSION_SLACK_M = 0.06
-"""What is so much deeper than the nearest vertex beside it is hidden."""
+"""Depth behind the nearest vertex of neighboring cells from which a vertex is hidden, metres."""
 
 COLOR_BLUR_PX = 1.0
-"""How far around it a vertex tells the colour (a Gaussian's σ)."""
-COLOR_MARGIN_PX, MIN_COLOR_WEIGHT = 6, 1e-4
-"""Farther away, and where so little is told, nothing is."""
+"""Gaussian σ, px, by which vertex colors are spread over the image."""
+COLOR_MARGIN_PX = 6
+"""Margin around the rim's vertices in which colors are predicted, px."""
+MIN_COLOR_WEIGHT = 1e-4
+"""Least weight of spread vertex colors at which a color is predicted."""
 KNOWN_VIEW_WEIGHT = 1.0
-"""A vertex seen so often from the front is known."""
+"""Sum of squared cosines over the views from which a vertex's color is known."""
 MIN_COLOR_SPREAD = 8.0
-"""Colors are never surer than this, in levels."""
+"""Least standard deviation of a predicted color, in levels."""
 UNSEEN_COLOR_SPREAD = 30.0
-"""And this sure where only neighbours are known."""
+"""Further standard deviation where only neighboring vertices are known, in levels."""
 
 
 class VertexVisibility(NamedTuple):
-    """How a camera sees the vertices of the shell.
+    """How a camera sees the vertices of the clothed body.
 
     Attributes:
-        pixels: Where, in pixels.
-        facing: The cosine between normal and ray; negative if it looks away.
-        seen: Whether nothing nearer hides it.
+        pixels: Image coordinates, px.
+        facing: Cosine between normal and ray; negative if a vertex faces away.
+        visible: Whether no nearer vertex occludes it.
     """
 
     pixels: Float[np.ndarray, "vertices 2"]
@@ -193,7 +200,7 @@ class VertexVisibility(NamedTuple):
 
     @classmethod
     def of(cls, clothed: ClothedBody, camera: Camera) -> "VertexVisibility":
-        """The sight of a shell, every vertex lifted by its thickness."""
+        """Visibility of the body's vertices, each lifted by its clothing offset."""
         points = clothed.skin + clothed.normals * clothed.offset_m[:, None]
         rays = camera.center_world - points
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -213,12 +220,12 @@ class VertexVisibility(NamedTuple):
 
 @final
 class AppearanceModel:
-    """The colours of one person's surface."""
+    """Mean color and spread of one person's surface, per vertex."""
 
     def __init__(self, count: int) -> None:
-        """Nothing is known yet of so many vertices."""
+        """Start with this many unobserved vertices."""
         self._seen = np.zeros(count)
-        self._sums = np.zeros((count, 4))  # of red, green, blue, and of their squares' mean
+        self._sums = np.zeros((count, 4))  # red, green, blue, and the mean of their squares
 
     def update(
         self,
@@ -226,50 +233,53 @@ class AppearanceModel:
         rgb: UInt8[np.ndarray, "height width 3"],
         inside_px: Float32[np.ndarray, "height width"],
     ) -> None:
-        """Takes in what a picture shows of the vertices that face the camera.
+        """Learn the colors of the vertices that face the camera.
 
         Args:
-            sight: How the camera sees them.
-            rgb: The picture.
-            inside_px: How far each pixel is inside the person.
+            visibility: How the camera sees them.
+            rgb: The image.
+            inside_px: Distance of each pixel inside the person's border, px.
         """
         facing = np.flatnonzero(visibility.visible & (visibility.facing > MIN_FACING_COSINE))
         x, y = (visibility.pixels[facing] - 0.5).astype(np.float32).T.reshape(2, -1, 1)
         inside = cv2.remap(inside_px, x, y, cv2.INTER_LINEAR)[:, 0] > MIN_INSIDE_PX
-        colours = cv2.remap(rgb, x, y, cv2.INTER_LINEAR).reshape(-1, 3)[inside].astype(np.float64)
+        colors = cv2.remap(rgb, x, y, cv2.INTER_LINEAR).reshape(-1, 3)[inside].astype(np.float64)
         facing = facing[inside]
         weight = visibility.facing[facing] ** 2
         self._seen[facing] += weight
-        self._sums[facing, :3] += weight[:, None] * colours
-        self._sums[facing, 3] += weight * (colours**2).mean(axis=1)
+        self._sums[facing, :3] += weight[:, None] * colors
+        self._sums[facing, 3] += weight * (colors**2).mean(axis=1)
 
     def predict(
         self, visibility: VertexVisibility, size_px: tuple[int, int]
     ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-        """The colour that the person should have in each pixel along the outline, and its spread.
+        """Predicted color of the person in each pixel along the outline, and its spread.
 
-        Far from all known vertices of the rim the spread is infinite.
+        The spread is infinite far from all vertices of the rim.
         """
         width, height = size_px
-        colour = np.zeros((height, width, 3), dtype=np.float32)
+        color = np.zeros((height, width, 3), dtype=np.float32)
         spread = np.full((height, width), np.inf, dtype=np.float32)
         low, high = RIM_COSINES
         rim = visibility.visible & (visibility.facing > low) & (visibility.facing < high)
         rim &= ((visibility.pixels >= 0.0) & (visibility.pixels < size_px)).all(axis=1)
         if rim.any():
             column, row = visibility.pixels[rim].astype(int).T
-            box = np.s_[max(0, row.min() - COLOR_MARGIN_PX) : row.max() + COLOR_MARGIN_PX,
-                        max(0, column.min() - COLOR_MARGIN_PX) : column.max() + COLOR_MARGIN_PX]  # fmt: skip
+            margin = COLOR_MARGIN_PX
+            box = (
+                slice(max(0, row.min() - margin), row.max() + margin),
+                slice(max(0, column.min() - margin), column.max() + margin),
+            )
             rows, columns = spread[box].shape
             flat = (row - box[0].start) * columns + column - box[1].start
-            laid = self._splat(flat, rim, rows * columns).reshape(rows, columns, 6)
-            colour[box], spread[box] = _interpolate_colors(laid)
-        return colour, spread
+            splatted = self._splat(flat, rim, rows * columns).reshape(rows, columns, 6)
+            color[box], spread[box] = _interpolate_colors(splatted)
+        return color, spread
 
     def _splat(
         self, pixels: Int[np.ndarray, "rim"], rim: Bool[np.ndarray, "vertices"], count: int
     ) -> Float32[np.ndarray, "count 6"]:
-        """Sums over the vertices in each pixel: colour, square, known vertices, and all."""
+        """Sums over the vertices in each pixel: color, square, known vertices, all vertices."""
         seen = self._seen[rim]
         known = np.minimum(seen / KNOWN_VIEW_WEIGHT, 1.0)
         mean = self._sums[rim] / np.maximum(seen, 1e-9)[:, None]
@@ -281,7 +291,7 @@ class AppearanceModel:
 def _interpolate_colors(
     splatted: Float32[np.ndarray, "rows columns 6"],
 ) -> tuple[Float32[np.ndarray, "rows columns 3"], Float32[np.ndarray, "rows columns"]]:
-    """Color and spread around what vertices tell."""
+    """Blurred color and spread of splatted vertex colors."""
     splatted = cv2.GaussianBlur(splatted, (0, 0), COLOR_BLUR_PX)
     told = np.maximum(splatted[..., 4], np.float32(MIN_COLOR_WEIGHT))
     mean = splatted[..., :4] / told[..., None]

@@ -1,4 +1,4 @@
-"""Masks in one file for all frames: a video, arrays, or COCO's run-length codes."""
+"""Masks of all frames in one file: a video, or COCO's run-length encoding (RLE)."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,19 +14,21 @@ from capture.source import FrameSelection
 from capture.video import VideoFile
 
 MAX_RLE_PIXELS = 1 << 28
-"""Of one run-length coded mask."""
+"""Largest number of pixels of one run-length encoded mask."""
 
 MAX_TRACK_FRAMES = 1_000_000
-"""That a file of tracks may name."""
+"""Largest frame number that a file of tracks may name."""
 
-VIDEO_BLACK, VIDEO_WHITE = 16.0, 239.0
-"""Compressed videos ring around edges: what is darker is 0, what is brighter 1."""
+VIDEO_BLACK = 16.0
+"""Brightness of a video up to which alpha is 0: compression rings around edges."""
+VIDEO_WHITE = 239.0
+"""Brightness of a video from which alpha is 1."""
 
 RawMaskReader = Callable[[int], Shaped[np.ndarray, "height width"]]
 
 
 def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
-    """How many frames a video has, and what reads the brightness of one.
+    """Number of frames of a mask video, and the function that reads one.
 
     Raises:
         InputError: If it cannot be opened.
@@ -37,7 +39,7 @@ def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
 
 
 class _MaskVideo:
-    """Frames of a video by number; cheap in ascending order, which is how they are asked for."""
+    """Random access to a video's frames; fast in ascending order."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -46,7 +48,7 @@ class _MaskVideo:
         self._last: Float32[np.ndarray, "height width"] | None = None
 
     def read(self, row: int) -> Float32[np.ndarray, "height width"]:
-        """The mask in one frame.
+        """Read the mask of one frame.
 
         Raises:
             InputError: If it cannot be decoded.
@@ -63,9 +65,9 @@ class _MaskVideo:
         ok, picture = self._capture.retrieve()
         if not ok:
             raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
-        grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float32)
         self._last = np.clip(
-            (grey - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
+            (gray - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
         )
         return self._last
 
@@ -73,16 +75,16 @@ class _MaskVideo:
 def open_rle_masks(
     content: Any, path: Path, person: str | None = None
 ) -> tuple[int, RawMaskReader] | None:
-    """How many run-length coded masks there are, and what decodes one; None if there are none.
+    """Number of run-length encoded masks, and the function that decodes one; None without any.
 
-    A list with one a frame (TRAM's masks.npy; an empty entry is an empty mask), a dictionary of
-    them by file names, a COCO file with `images` and `annotations`, or the tracks of PHALP. Several
-    in a frame are one, but of PHALP's people one is taken.
+    Accepts a list with one mask per frame (TRAM's masks.npy; an empty entry is an empty mask), a
+    dictionary by file name, a COCO file with `images` and `annotations`, or PHALP's tracks. Several
+    masks of a frame are united, except PHALP's, of which one person is selected.
 
     Args:
-        content: What the file holds.
-        path: For messages.
-        person: Whose, in a file of tracks; None for who was seen most.
+        content: Content of the file.
+        path: File that messages name.
+        person: Track identity; None for the person with the most frames.
     """
     frames = _track_rle(content, person) if is_phalp_tracks(content) else _frame_rle(content)
     if not frames or not any(frames):
@@ -100,14 +102,14 @@ def open_rle_masks(
 
 
 def is_phalp_tracks(content: Any) -> bool:
-    """Whether these are PHALP's tracks with masks: {picture: {tid, mask, …}}, lists in parallel."""
+    """Whether content is PHALP's tracks with masks: {image: {tid, mask, …}} of parallel lists."""
     if not isinstance(content, dict) or not content:
         return False
     return all(isinstance(one, dict) and {"tid", "mask"} <= one.keys() for one in content.values())
 
 
 def _track_rle(content: Any, person: str | None) -> list[list[dict[str, Any]]]:
-    """The masks of one track; a frame in which it was only guessed has none."""
+    """The masks of one track; frames in which PHALP only predicted it have none."""
     seen: dict[str, dict[int, Any]] = {}
     last = -1
     for place, frame in enumerate(content.values()):
@@ -155,14 +157,14 @@ def _is_rle(thing: Any) -> bool:
 
 
 def decode_rle(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
-    """A mask of COCO's run-length code: lengths of runs of 0 and 1, down the columns.
+    """Decode a mask of COCO's RLE: lengths of runs of 0 and 1, down the columns.
 
-    `counts` is a list, or the text in which each length is written in groups of five bits, the
-    lowest first, from the third on as the difference to the one before the last (COCO's maskApi).
-    None is an empty mask.
+    `counts` is a list, or text that holds each length in groups of five bits, the lowest first,
+    from the third length on as the difference to the length two before (COCO's maskApi). None is an
+    empty mask.
 
     Raises:
-        ValueError: If the runs do not fill the picture.
+        ValueError: If the runs do not fill the image.
     """
     height, width = (int(side) for side in code["size"])
     if not 0 < height * width <= MAX_RLE_PIXELS:

@@ -1,14 +1,14 @@
-"""Masks without a segmenter: GrabCutSegmenter, seeded by the posed body and by what it was seen to wear.
+"""Person masks without a trained segmenter: GrabCut, seeded by the posed body and its appearance.
 
-GrabCutSegmenter (Rother et al. 2004) tells person from background by two mixtures of colours and by edges.
-Alone it leaks into backgrounds of the person's colours; so the posed body, with the clothes that
-earlier frames have shown on it (`ClothingOffset`), says where to look: only a narrow band around that shape
-is in doubt. If the camera stands still, pixels that were background in earlier frames also say what
-lies behind the person (`BackgroundModel`). The mask is the mean of cut and shape, weighted by how far they
-were found to be off; where they are far apart though the poses are good, the cut has leaked. Last,
-where it is known what lies behind, border pixels are split by colours (`refine_border`).
+GrabCut (Rother et al. 2004) separates person and background by two mixtures of colors and by edges.
+Alone it leaks into backgrounds of similar color. So the posed body, with the clothes that earlier
+frames have shown on it (`ClothingOffset`), limits it to a narrow uncertain band around that shape.
+If the camera is static, pixels that were background in earlier frames also predict what lies behind
+the person (`BackgroundModel`). The mask is the mean of segmentation and shape, weighted by their
+inverse variances; where they are far apart although the poses are good, the segmentation has
+leaked. Last, where the background is known, border pixels are split by color (`refine_border`).
 
-How large the picture is in which a mask is found.
+Masks are estimated at a working resolution that depends on the person's height in pixels.
 """
 
 from typing import NamedTuple, final
@@ -36,82 +36,101 @@ from preprocess.masks.color_models import AppearanceModel, BackgroundModel, Vert
 from preprocess.masks.matting import border_distance_px, refine_border, soften_border
 
 WORKING_PERSON_PX = 220
-"""Masks are found in pictures in which the person is about so large, or smaller."""
+"""Height of the person, px, to which larger images are reduced before a mask is estimated."""
 
 UPSAMPLE_BELOW_PX = 150
-"""Pictures of smaller persons are enlarged twice: masks then know parts of a pixel."""
+"""Height of the person, px, below which images are enlarged twice: masks gain sub-pixel detail."""
 
 DOWNSAMPLE_ABOVE = 1.1
-"""A person who is little larger is not worth a smaller picture."""
+"""Ratio to `WORKING_PERSON_PX` from which an image is reduced."""
 
 JOINT_HEIGHT_FRACTION = 0.87
-"""Of a standing person's height, how much lies between head joint and toes."""
+"""Fraction of a standing person's height between head joint and toes."""
 
 RESCALE_RATIO = 1.4
-"""The scale is chosen anew when the person has become so many times larger or smaller."""
+"""Change of the person's height, as a ratio, from which the scale is chosen again."""
 
 
 @final
 class WorkingResolution:
-    """The scale for one person; it seldom changes."""
+    """Scale of the images in which one person is segmented; it seldom changes."""
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Nobody was seen yet."""
+        """Start without a measured height."""
         self._shaped = shaped
-        self._tall_px: float | None = None
+        self._height_px: float | None = None
 
     def scale_for(self, pose: BodyPose, camera: Camera) -> float:
-        """How many times larger than the frame the picture is in which its mask is found."""
+        """Size of the image to segment, relative to the frame."""
         joints = self._shaped.with_pose(pose).joints()
         depth = joints @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
         if depth.min() > 0.0:
-            tall = float(np.ptp(camera.project(joints), axis=0).max()) / JOINT_HEIGHT_FRACTION
-            before = self._tall_px
-            if before is None or not 1.0 / RESCALE_RATIO < tall / before < RESCALE_RATIO:
-                self._tall_px = tall
-        tall = max(self._tall_px or 0.0, 1.0)
-        if tall < UPSAMPLE_BELOW_PX:
+            height_px = float(np.ptp(camera.project(joints), axis=0).max()) / JOINT_HEIGHT_FRACTION
+            before = self._height_px
+            if before is None or not 1.0 / RESCALE_RATIO < height_px / before < RESCALE_RATIO:
+                self._height_px = height_px
+        height_px = max(self._height_px or 0.0, 1.0)
+        if height_px < UPSAMPLE_BELOW_PX:
             return 2.0
-        return 1.0 if tall < DOWNSAMPLE_ABOVE * WORKING_PERSON_PX else WORKING_PERSON_PX / tall
+        return (
+            1.0
+            if height_px < DOWNSAMPLE_ABOVE * WORKING_PERSON_PX
+            else WORKING_PERSON_PX / height_px
+        )
 
 
-UNKNOWN_BAND_M, KNOWN_BAND_M, MIN_OUTER_BAND_M = 0.02, 0.008, 0.012
-"""How far inside and outside the shell pixels are in doubt, where nothing is known of it and where
-everything is; outside at least the last, or nothing would ever grow."""
+UNKNOWN_BAND_M = 0.02
+"""Half width of the uncertain band around the shape while clothes are unobserved, metres."""
+KNOWN_BAND_M = 0.008
+"""Half width of the uncertain band once clothes are observed all along the rim, metres."""
+MIN_OUTER_BAND_M = 0.012
+"""Least width of the band outside the shape, metres: with less, the shape could never grow."""
 
 MAX_INNER_LIMIT_FRACTION = 0.1
-"""Where more of the cut than this runs along the inner limit of what is in doubt, the pose is off
-and the limits must be wider."""
-BAND_GROWTH_M, BAND_SHRINK_M, MAX_BAND_GROWTH_M = 0.012, 0.002, 0.05
+"""Fraction of the border along the band's inner limit beyond which the pose is off: widen it."""
+BAND_GROWTH_M = 0.012
+"""Growth of the band after a frame in which the pose was off, metres."""
+BAND_SHRINK_M = 0.002
+"""Shrinking of the band after any other frame, metres."""
+MAX_BAND_GROWTH_M = 0.05
+"""Largest sum of growths, metres."""
 OUTER_GROWTH_RATIO = 1.5
-"""By how much the limits follow from frame to frame; outside it counts so much more."""
+"""Growth of the band outside the shape relative to inside."""
 
 BACKGROUND_MARGIN_M = 0.25
-"""How much of the background is looked at."""
+"""Width of the background around the band from which GrabCut learns its colors, metres."""
 
-BACKGROUND_GAP_M, BACKGROUND_GAP_PX = 0.015, 2.0
-"""Background is what is at least so far from the person, by both measures."""
+BACKGROUND_GAP_M = 0.015
+"""Least distance of a background pixel from the person, metres at the body."""
+BACKGROUND_GAP_PX = 2.0
+"""Least distance of a background pixel from the person, px; both limits hold."""
 
-ITERATIONS, FEWER_ITERATIONS = 2, 1
-"""Rounds of GrabCutSegmenter; the fewer where the shell, and what lies behind it, are known."""
+ITERATIONS = 2
+"""GrabCut iterations."""
+FEWER_ITERATIONS = 1
+"""GrabCut iterations where both clothes and background are known."""
 
 CUT_ERROR_M = 0.006
-"""How far the cut's border is off, for whatever reason, where it has not leaked."""
-MIN_SHAPE_ERROR_M, UNKNOWN_SHAPE_ERROR_M = 0.002, 0.012
-"""How far the shell is off at the least, and how far as long as nothing is known of it."""
+"""Standard error of the segmentation's border where it has not leaked, metres."""
+MIN_SHAPE_ERROR_M = 0.002
+"""Least standard error of the clothed shape's border, metres."""
+UNKNOWN_SHAPE_ERROR_M = 0.012
+"""Further standard error of the shape while clothes are unobserved, metres."""
+INITIAL_SHAPE_ERROR_M = 0.012
+"""Standard deviation between segmentation and shape that is assumed at first, metres."""
 
 MIN_SHAPE_IOU = 0.4
-"""Masks that agree less with the shell's shape (intersection over union) are not used."""
+"""Least IoU of a mask with the clothed shape; masks below it are rejected."""
 
 
 class _ExpectedShape(NamedTuple):
-    """The shell in a picture.
+    """The clothed body as it should appear in an image.
 
     Attributes:
-        fine: Its shape, finer than the picture.
-        covered: How much of each pixel it covers.
-        away: How far each pixel is outside of it, in pixels; inside negative.
-        hair: Which pixels may be hair.
+        supersampled: Its shape, finer than the image.
+        coverage: Fraction of each pixel that it covers.
+        signed_distance_px: Distance of each pixel from its border, positive outside, px.
+        hair_region: The pixels that may be hair.
     """
 
     supersampled: Float32[np.ndarray, "rows columns"]
@@ -121,13 +140,13 @@ class _ExpectedShape(NamedTuple):
 
 
 class _Segmentation(NamedTuple):
-    """What GrabCutSegmenter says about a picture.
+    """GrabCut's result for an image.
 
     Attributes:
-        person: Who is.
-        away: How far each pixel is outside of the person, in pixels; inside negative.
-        sure: Where what lies behind decided, 1, else 0.
-        band_m: How far inside and outside the shell pixels were in doubt.
+        foreground: The person's pixels.
+        signed_distance_px: Distance of each pixel from the person's border, positive outside, px.
+        decided_by_background: 1 where the background model decided, else 0.
+        band_m: Width of the uncertain band inside and outside the clothed shape, metres.
     """
 
     foreground: Bool[np.ndarray, "height width"]
@@ -138,34 +157,33 @@ class _Segmentation(NamedTuple):
 
 @final
 class GrabCutSegmenter:
-    """Masks of one person, frame by frame.
+    """Segments one person, frame by frame.
 
     Attributes:
-        name: How the report calls it.
-        found: How many masks were made.
-        agreement: Their mean intersection over union with the shape of body and clothes that was
-            expected; 0 of none.
+        name: Its name in the report.
+        mask_count: Number of masks made.
+        agreement: Mean IoU of these masks with the expected shape of body and clothes; 0 of none.
     """
 
     name = "GrabCut"
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Nothing is known about clothes and background yet."""
-        self._shell, self._behind = ClothingOffset(shaped), BackgroundModel()
-        self._colours = AppearanceModel(len(shaped.vertices))
+        """Start with unobserved clothes and background."""
+        self._clothing, self._background = ClothingOffset(shaped), BackgroundModel()
+        self._appearance = AppearanceModel(len(shaped.vertices))
         self._head = shaped.body.weights.argmax(axis=1) == HEAD_JOINT
         self._scale = WorkingResolution(shaped)
         self._wider_m = 0.0
-        self._off_m = 0.012
+        self._shape_error_m = INITIAL_SHAPE_ERROR_M
         self.mask_count, self.agreement = 0, 0.0
 
     def __call__(
         self, frame: Frame, pose: BodyPose, camera: Camera
     ) -> Float32[np.ndarray, "height width"]:
-        """The mask of a picture; see `Segmenter`.
+        """Estimate the mask of a frame; see `Segmenter`.
 
         Raises:
-            InputError: If the body is not in the picture, or nothing that agrees with it is found.
+            InputError: If the body is outside the image, or the mask disagrees with it.
         """
         scale = self._scale.scale_for(pose, camera)
         size_px = (max(1, round(frame.size_px[0] * scale)), max(1, round(frame.size_px[1] * scale)))
@@ -174,7 +192,7 @@ class GrabCutSegmenter:
             way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
             rgb = cv2.resize(rgb, size_px, interpolation=way)
         around, shape = self._expected_shape(pose, small)
-        self._behind.reset_if_moved(
+        self._background.reset_if_moved(
             small, rgb, shape.signed_distance_px > 2.0 * UNKNOWN_BAND_M * around.px_per_m
         )
         cut = self._segment(rgb, around, shape)
@@ -204,21 +222,21 @@ class GrabCutSegmenter:
         clothed: ClothedBody,
         camera: Camera,
     ) -> Float32[np.ndarray, "height width"]:
-        """The mask with its border where colours put it, if it is known what lies behind."""
+        """Move the border to where the colors change, if the background is known."""
         outside = border_distance_px(alpha)
-        behind = self._behind.predict(rgb, outside > BACKGROUND_GAP_PX)
-        if behind is None:
+        background = self._background.predict(rgb, outside > BACKGROUND_GAP_PX)
+        if background is None:
             return alpha
-        sight = VertexVisibility.of(clothed, camera)
-        self._colours.update(sight, rgb, -outside)
-        person = self._colours.predict(sight, camera.size_px)
-        return refine_border(rgb, alpha, behind, person)
+        visibility = VertexVisibility.of(clothed, camera)
+        self._appearance.update(visibility, rgb, -outside)
+        foreground = self._appearance.predict(visibility, camera.size_px)
+        return refine_border(rgb, alpha, background, foreground)
 
     def _expected_shape(self, pose: BodyPose, camera: Camera) -> tuple[ClothedBody, _ExpectedShape]:
-        around = self._shell.clothe(pose, camera)
+        around = self._clothing.clothe(pose, camera)
         if around is None:
             raise InputError("the posed body is not in the picture")
-        fine = self._shell.draw(around, camera)
+        fine = self._clothing.draw(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
         hair = head_region(around.skin[self._head], camera, around.px_per_m)
         shape = _ExpectedShape(
@@ -234,7 +252,7 @@ class GrabCutSegmenter:
     def _segment(
         self, rgb: UInt8[np.ndarray, "height width 3"], clothed: ClothedBody, shape: _ExpectedShape
     ) -> _Segmentation:
-        """Who is person, among the pixels that the shell leaves in doubt."""
+        """Separate person and background in the uncertain band around the clothed shape."""
         inwards = (
             clothed.known_fraction * KNOWN_BAND_M
             + (1.0 - clothed.known_fraction) * UNKNOWN_BAND_M
@@ -246,10 +264,12 @@ class GrabCutSegmenter:
         doubtful = near & (away > -inwards)
         labels = np.full(away.shape, cv2.GC_BGD, np.uint8)
         labels[doubtful] = np.where(away[doubtful] < 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
-        like, unlike = self._behind.classify(rgb, doubtful)
+        like, unlike = self._background.classify(rgb, doubtful)
         labels[like], labels[unlike] = cv2.GC_PR_BGD, cv2.GC_PR_FGD
         labels[away <= -inwards] = cv2.GC_FGD
-        settled = self._behind.is_initialized and clothed.known_fraction > OVERSHOOT_KNOWN_FRACTION
+        settled = (
+            self._background.is_initialized and clothed.known_fraction > OVERSHOOT_KNOWN_FRACTION
+        )
         rounds = FEWER_ITERATIONS if settled else ITERATIONS
         margin = int(BACKGROUND_MARGIN_M * clothed.px_per_m) + 1
         rows, columns = np.nonzero(near)
@@ -282,7 +302,7 @@ class GrabCutSegmenter:
         clothed: ClothedBody,
         shape: _ExpectedShape,
     ) -> None:
-        """How far poses are off, what the person wears, and what lies behind."""
+        """Learn the shape's error, the clothes and the background from a segmentation."""
         from_cut, per_m = segmentation.signed_distance_px, clothed.px_per_m
         rim = (from_cut > 0.0) & (from_cut < 1.2)
         deep = rim & (shape.signed_distance_px < 1.5 - segmentation.band_m[0] * per_m)
@@ -293,32 +313,32 @@ class GrabCutSegmenter:
             np.abs(shape.signed_distance_px) < (segmentation.band_m[0] + 0.005) * per_m
         )
         if near.any():
-            # the standard deviation of a normal error is 1.25 times its mean
+            # The standard deviation of a normal error is 1.25 times its mean absolute value.
             off = 1.25 * float(np.abs(shape.signed_distance_px[near]).mean()) / per_m
-            self._off_m += 0.2 * (off - self._off_m)
-        self._shell.update(
+            self._shape_error_m += 0.2 * (off - self._shape_error_m)
+        self._clothing.update(
             clothed, camera, rgb, alpha, shape.signed_distance_px, segmentation.band_m
         )
         margin = max(BACKGROUND_GAP_PX, BACKGROUND_GAP_M * per_m)
-        self._behind.update(rgb, (from_cut > margin) & (shape.signed_distance_px > margin))
+        self._background.update(rgb, (from_cut > margin) & (shape.signed_distance_px > margin))
 
     def _shape_weight(
         self, segmentation: _Segmentation, shape: _ExpectedShape, clothed: ClothedBody
     ) -> Float32[np.ndarray, "height width"]:
-        """The shell's share of the mask: both count with the inverse of their variance.
+        """Weight of the clothed shape in the mask: both count with their inverse variance.
 
-        Cut and shell are usually `_off_m` apart. What that is more than the cut's own error is the
-        pose's, and so the shell's. Where they are farther apart than that, one of them is wrong:
-        the cut, as far as the shell is known and the poses are good. Where what lies behind
-        decided, and about hair that stands off in one piece, the shell has no say.
+        Segmentation and shape are usually `_shape_error_m` apart. What exceeds the segmentation's
+        own error is the pose's, and so the shape's. Where they are farther apart, one is wrong: the
+        segmentation, as far as clothes are known and poses are good. Where the background decided,
+        and for hair that protrudes in one piece, the shape has no weight.
         """
-        shell = max(self._off_m**2 - CUT_ERROR_M**2, MIN_SHAPE_ERROR_M**2)
+        shell = max(self._shape_error_m**2 - CUT_ERROR_M**2, MIN_SHAPE_ERROR_M**2)
         shell += (UNKNOWN_SHAPE_ERROR_M * (1.0 - clothed.known_fraction)) ** 2
         trusted = clothed.known_fraction * CUT_ERROR_M**2 / (CUT_ERROR_M**2 + shell)
         apart = (segmentation.signed_distance_px - shape.signed_distance_px) / np.float32(
             clothed.px_per_m
         )
-        leaked = np.maximum(apart**2 - np.float32(self._off_m**2), np.float32(0.0))
+        leaked = np.maximum(apart**2 - np.float32(self._shape_error_m**2), np.float32(0.0))
         leaked[shape.hair_region & (apart < 0.0)] = 0.0
         beyond = segmentation.foreground & shape.hair_region & (shape.signed_distance_px > 0.0)
         shell = shell + (solid_hair(beyond, clothed.px_per_m) * np.float32(HAIR_BAND_M)) ** 2
@@ -336,7 +356,7 @@ def _blend(
     shape: _ExpectedShape,
     size_px: tuple[int, int],
 ) -> Float32[np.ndarray, "_ _"]:
-    """The mean of the cut's alpha and what the shell covers, of so much weight, of a size."""
+    """Weighted mean of the shape's coverage and the segmentation's alpha, at any size."""
     covered = shape.coverage
     if alpha.shape[::-1] != size_px:
         smaller = alpha.shape[1] > size_px[0]

@@ -1,6 +1,7 @@
-"""Which side of a mask is the person.
+"""Masks from files: how far each pixel is person, in [0, 1], never thresholded.
 
-Masks from files: how far each pixel is person, in [0, 1], never thresholded.
+Which side of the masks is the person, and whether they hold brightness or object numbers, is
+detected from a few samples.
 """
 
 from collections.abc import Callable
@@ -20,49 +21,50 @@ from preprocess.file_content import read_npz, read_untrusted_file
 from preprocess.masks.encoded_masks import is_phalp_tracks, open_mask_video, open_rle_masks
 
 MAX_PERSON_FRACTION = 0.5
-"""Nobody covers more of the pictures, and of their rims."""
+"""Largest median fraction of the image, and of its rim, that a person covers."""
 MAX_OBJECTS = 32
+"""Largest object number of masks that hold object numbers."""
 MIN_OBJECT_AREA = 0.01
-"""Specks of compression cover less than objects do."""
+"""Least median fraction of the image that objects cover: compression artifacts cover less."""
 SOFT_MIN, SOFT_MAX = 0.1, 0.9
-"""Between them are only the rims of soft masks."""
+"""Range of alpha that only the borders of soft masks have."""
 
 
 def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
-    """Whether masks are 1 where the person is not: on most of the picture and of its rim.
+    """Whether masks are 1 on the background: on most of the image and of its rim.
 
     Raises:
         InputError: If they are empty, or neither side can be the person.
     """
     shares = np.array([_coverage(mask) for mask in samples])
-    told = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
-    if not len(told):
+    usable = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
+    if not len(usable):
         raise InputError(
-            f"The masks in {path} show nothing: all {len(samples)} that were looked at are empty "
-            "or full. Expected the person at 255 and the rest at 0."
+            f"The masks in {path} show nothing: all {len(samples)} that were sampled are empty or "
+            "full. Expected the person at 255 and the rest at 0."
         )
-    area, rim = np.median(told, axis=0)
+    area, rim = np.median(usable, axis=0)
     if (area > MAX_PERSON_FRACTION) != (rim > MAX_PERSON_FRACTION):
         raise InputError(
-            f"It cannot be seen which side of the masks in {path} is the person: they cover "
-            f"{area:.0%} of the pictures and {rim:.0%} of the rims. Say so with --mask-invert (the "
-            "person is 0) or --no-mask-invert (the person is 255)."
+            f"It is unclear which side of the masks in {path} is the person: they cover {area:.0%} "
+            f"of the images and {rim:.0%} of the rims. Use --mask-invert (the person is 0) or "
+            "--no-mask-invert (the person is 255)."
         )
     return bool(area > MAX_PERSON_FRACTION)
 
 
 def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> None:
-    """Raises InputError for pictures, depths and the like: masks are nearly everywhere 0 or 1."""
+    """Raise InputError for photographs, depth maps and the like: masks are mostly 0 or 1."""
     between = [float(((mask > SOFT_MIN) & (mask < SOFT_MAX)).mean()) for mask in samples]
     if np.median(between) > MAX_PERSON_FRACTION:
         raise InputError(
-            f"{path} holds pictures, not masks: {np.median(between):.0%} of their pixels are "
+            f"{path} holds photographs, not masks: {np.median(between):.0%} of their pixels are "
             "neither dark nor bright. Expected 255 where the person is, and 0 elsewhere."
         )
 
 
 def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
-    """Whether masks hold objects' numbers, 1, 2, …, of 255, rather than brightness."""
+    """Whether masks hold object numbers 1, 2, … of 255 rather than brightness."""
     if max(float(mask.max()) for mask in samples) > MAX_OBJECTS / 255.0:
         return False
     found = np.unique(np.concatenate([np.unique(mask) for mask in samples]))
@@ -71,13 +73,13 @@ def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
 
 
 def is_inverted(alpha: Float32[np.ndarray, "height width"]) -> bool:
-    """Whether one mask among others that are in order shows the background."""
+    """Whether one mask shows the background although the others show the person."""
     area, rim = _coverage(alpha)
     return bool(area > MAX_PERSON_FRACTION and rim > MAX_PERSON_FRACTION)
 
 
 def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
-    """How much of the picture, and of its rim, is covered."""
+    """Mean alpha of the image and of its rim."""
     rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     return np.array([alpha.mean(), rim.mean()], dtype=np.float64)
 
@@ -90,27 +92,27 @@ MALFORMED_TRACK_ERRORS = (
     AttributeError,
     OverflowError,
 )
-"""What a file raises that is nearly one of tracks."""
+"""Errors that a malformed file of tracks raises."""
 
 RLE_SUFFIXES = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
-"""Endings of files that may hold run-length codes."""
+"""Suffixes of files that may hold run-length encoded masks."""
 
 POLARITY_SAMPLES = 9
-"""How many masks are looked at to find out which side is the person."""
+"""Number of masks from which polarity and kind are detected."""
 
 MaskReader = Callable[[int], Float32[np.ndarray, "height width"]]
-"""From a row to the mask as it is stored."""
+"""From a row to the mask as stored."""
 
 
 class Masks:
-    """One mask a frame, in order.
+    """One mask per frame, in order.
 
     Attributes:
-        path: Where they lie.
-        count: How many there are.
-        size_px: Width and height of the first.
-        inverted: Whether the files hold the background, and are turned here.
-        names: Of a folder's files, without their endings; None where there is only an order.
+        path: Folder or file of the masks.
+        count: Number of masks.
+        size_px: Width and height of the first mask.
+        inverted: Whether the files hold the background and are inverted on reading.
+        names: Stems of a folder's files; None where there is only an order.
     """
 
     def __init__(
@@ -122,11 +124,11 @@ class Masks:
         invert: bool | None,
         names: tuple[str, ...] | None = None,
     ) -> None:
-        """Looks at a few of the masks that `read` gives as they are stored.
+        """Detect kind and polarity from a few of the masks that `read` returns.
 
         Raises:
-            InputError: If none of them can be read, they are no masks or, with `invert` None, cannot
-                be told from the background.
+            InputError: If none of them can be read, they are not masks or, with `invert` None, it
+                is unclear which side is the person.
         """
         self.path = path
         self.count = count
@@ -143,21 +145,21 @@ class Masks:
         self.inverted = shows_background(samples, path) if invert is None else invert
 
     def _binarize_ids(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
-        """The same as alpha, where the files hold objects' numbers."""
+        """Alpha of a stored mask: any object, if the files hold object numbers."""
         return (stored > 0.0).astype(np.float32) if self._numbers else stored
 
     def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
-        """The mask in one row, scaled to a picture's size.
+        """The mask of one row, scaled to an image's size.
 
         Raises:
-            InputError: If it cannot be read, is not of the picture's shape, or is the other way round
-                than most (nobody having said which way they are).
+            InputError: If it cannot be read, has another aspect ratio than the image, or (where the
+                polarity was detected) is inverted unlike the others.
         """
         stored = self._binarize_ids(self._read(row))
         height, width = stored.shape
         if not same_aspect_ratio((width, height), size_px):
             raise InputError(
-                f"Mask {row} in {self.path} has {width}x{height} px, its picture "
+                f"Mask {row} in {self.path} has {width}x{height} px, its image "
                 f"{size_px[0]}x{size_px[1]}; expected the same shape. Was one of them cropped "
                 "or rotated?"
             )
@@ -169,26 +171,26 @@ class Masks:
         alpha = np.float32(1.0) - stored if self.inverted else stored
         if self._doubts and is_inverted(alpha):
             raise InputError(
-                f"mask {row} in {self.path} covers most of the picture and of its rim, unlike the "
-                "others; is it the wrong way round?"
+                f"mask {row} in {self.path} covers most of the image and of its rim, unlike the "
+                "others; is it inverted?"
             )
         return alpha
 
 
 def open_masks(path: Path, *, invert: bool | None = None, person: str | None = None) -> Masks:
-    """Opens a folder of pictures or .npy files, a video, arrays (N, H, W), or run-length codes.
+    """Open a folder of images or .npy files, a video, arrays (N, H, W), or run-length codes.
 
     Args:
-        path: The folder or the file.
-        invert: Whether the person is dark; None finds out from a few masks.
-        person: Whose masks, in a file of several people's tracks; None for who was seen most.
+        path: The folder or file.
+        invert: Whether the person is dark; None detects it from a few masks.
+        person: Identity in a file of several people's tracks; None for the longest track.
 
     Raises:
-        InputError: If there are none, if they are all empty, or if it cannot be seen which side is
-            the person.
+        InputError: If there are none, if they are all empty, or if it is unclear which side is the
+            person.
     """
     if not path.exists():
-        raise InputError(f"There are no masks {path}; expected a folder of pictures, or an .npz.")
+        raise InputError(f"There are no masks {path}; expected a folder of images, or an .npz.")
     if path.is_dir():
         return _open_folder(path, invert)
     count, read = _open_file(path, person)
@@ -200,7 +202,7 @@ def _open_folder(path: Path, invert: bool | None) -> Masks:
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes]
     files = sorted((file for file in files if not file.name.startswith(".")), key=natural_sort_key)
     if not files:
-        raise InputError(f"{path} holds no masks; expected pictures or .npy files, one a frame.")
+        raise InputError(f"{path} holds no masks; expected images or .npy files, one per frame.")
     names = tuple(file.stem for file in files)
     return Masks(path, len(files), lambda row: read_mask(files[row]), invert=invert, names=names)
 
@@ -208,12 +210,12 @@ def _open_folder(path: Path, invert: bool | None) -> Masks:
 def open_tracker_masks(
     path: Path, source: FrameSource, *, person: str | None = None
 ) -> Masks | None:
-    """The masks that a tracker keeps beside its poses (PHALP), if they fit the video; else None.
+    """The masks in a tracker's pose file (PHALP), if they match the video; else None.
 
     Args:
         path: The pose file.
         source: The video.
-        person: Whose; None for who was seen most.
+        person: Identity of the track; None for the longest track.
     """
     if path.suffix.lower() not in (".pkl", ".pickle"):
         return None
@@ -233,10 +235,10 @@ def open_tracker_masks(
 
 
 def _open_rle(path: Path, person: str | None) -> tuple[int, MaskReader] | None:
-    """What `open_rle_masks` finds in a file.
+    """Open run-length encoded masks; None if a file holds none.
 
     Raises:
-        InputError: If it nearly is such a file.
+        InputError: If the file is malformed.
     """
     try:
         return open_rle_masks(read_untrusted_file(path), path, person)
@@ -253,7 +255,9 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
     ):
         coded = _open_rle(path, person)
         if coded is None:
-            raise InputError(f"{path} holds no masks: no run-length codes, one or more a frame.")
+            raise InputError(
+                f"{path} holds no masks: no run-length encoded masks, one or more per frame."
+            )
         count, decode = coded
         return count, lambda row: _to_alpha(decode(row), path)
     if path.suffix.lower() == ".npy":
@@ -263,7 +267,7 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
         stack = arrays.get("masks", next(iter(arrays.values()), None))
     else:
         raise InputError(
-            f"{path} holds no masks that can be read; expected a folder of pictures, a video, an "
+            f"{path} holds no masks that can be read; expected a folder of images, a video, an "
             ".npz or .npy (N, height, width), or COCO's run-length codes (.json, .npy, .pkl)."
         )
     if stack is None or stack.ndim != 3 or not stack.size:
@@ -272,23 +276,26 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
 
 
 def _is_numeric_npy(path: Path) -> bool:
-    """Whether an .npy holds anything but objects; a damaged one is left to who reads it."""
+    """Whether an .npy holds no objects; a damaged file counts as numeric and fails when read."""
+    header = np.lib.format
     try:
-        _load_npy(path)
-    except InputError as cause:
-        return "bject" not in str(cause)
-    return True
+        with path.open("rb") as file:
+            is_first = header.read_magic(file) == (1, 0)
+            read = header.read_array_header_1_0 if is_first else header.read_array_header_2_0
+            return not read(file)[2].hasobject
+    except Exception:  # numpy parses headers as Python: damaged ones fail in any way
+        return True
 
 
 def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     try:
         return np.load(path, allow_pickle=False, mmap_mode="r")
-    except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
-        raise InputError(f"{path} is no readable .npy of numbers ({cause}).") from cause
+    except Exception as cause:  # numpy parses headers as Python: damaged ones fail in any way
+        raise InputError(f"{path} is not a readable .npy of numbers ({cause}).") from cause
 
 
 def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
-    """One mask as it is stored, in [0, 1].
+    """Read one mask as stored, in [0, 1].
 
     Raises:
         InputError: If it cannot be decoded, or is not complete.
@@ -301,15 +308,15 @@ def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
             ImageOps.exif_transpose(picture, in_place=True)
             channel = _mask_channel(picture)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
-        raise InputError(f"{path} is no mask that can be decoded ({cause}).") from cause
+        raise InputError(f"{path} is not a mask that can be decoded ({cause}).") from cause
     return _to_alpha(channel, path)
 
 
 def _mask_channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
-    """The one channel that holds the mask: objects' numbers, the alpha channel, or brightness."""
+    """The channel that holds the mask: object numbers, the alpha channel, or brightness."""
     if picture.mode == "P":
-        colours = np.array(picture.getpalette()).reshape(-1, 3)
-        if (colours != colours[:, :1]).any():  # coloured: the index is an object's number
+        colors = np.array(picture.getpalette()).reshape(-1, 3)
+        if (colors != colors[:, :1]).any():  # a colored palette: the index is an object number
             return np.asarray(picture) > 0
         picture = picture.convert("L")
     if picture.mode in ("LA", "RGBA"):
@@ -322,7 +329,7 @@ def _mask_channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
 
 
 def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:
-    """Stored numbers as alpha; a mask of nothing but 0 and 1 needs no scaling."""
+    """Stored numbers as alpha; a mask of only 0 and 1 needs no scaling."""
     stored = np.squeeze(np.asarray(stored))
     if stored.ndim != 2 or stored.dtype.kind not in "biuf":
         raise InputError(f"A mask in {path} has the shape {stored.shape}; expected height x width.")
@@ -332,7 +339,7 @@ def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarr
 
 
 def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
-    """The number that means "all person"."""
+    """The stored number that means alpha 1."""
     if stored.dtype.kind == "f":
         return np.float32(1.0 if stored.max() < 1.5 else 255.0)
     if stored.max() <= 1:
@@ -341,7 +348,7 @@ def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
 
 
 def _readable(read: MaskReader, rows: list[int]) -> list[Float32[np.ndarray, "height width"]]:
-    """Those of the masks that can be read, if any can."""
+    """The readable masks; raises the first error if there are none."""
     masks, refused = [], []
     for row in rows:
         try:

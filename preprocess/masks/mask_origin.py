@@ -1,6 +1,6 @@
-"""Where masks come from if no file holds them: the seat for segmenters, ours and others'.
+"""Where a capture's masks come from: files, the alpha channel, or a segmenter.
 
-Which masks a capture is learnt with: one decision for recordings and for live sources.
+The segmenter may be this project's own or one that another package registers as an entry point.
 """
 
 from collections.abc import Callable
@@ -19,24 +19,26 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
 SEGMENTER_PREFIX = "segmenter:"
+"""What precedes a segmenter's name in --masks."""
 DEFAULT_SEGMENTER = "grabcut"
+"""Name of this project's own segmenter."""
 ENTRY_POINT_GROUP = "instant_avatar.segmenters"
-"""Entry points of other packages: NAME = "module:make", where make(shaped) gives a Segmenter."""
+"""Entry points of other packages: NAME = "module:make", where make(shaped) returns a Segmenter."""
 
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Finds the person in a picture, frame by frame, in the order in which they come."""
+    """Segments the person, frame by frame, in the order of the frames."""
 
     def __call__(
         self, frame: Frame, pose: BodyPose, camera: Camera
     ) -> Float32[np.ndarray, "height width"]:
-        """How far each pixel of the picture is person, in [0, 1].
+        """Estimate how far each pixel is person, in [0, 1].
 
         Args:
-            frame: The picture, of any size.
-            pose: Where the tracker found the body.
-            camera: Of the picture's size.
+            frame: The frame, of any size.
+            pose: The tracker's pose of the body.
+            camera: Camera of the frame's size.
         """
         ...
 
@@ -45,32 +47,32 @@ SegmenterFactory = Callable[[ShapedBody], Segmenter]
 
 
 def segmenter_name(masks: object) -> str | None:
-    """What follows `segmenter:` in --masks; None if it names a file or nothing."""
+    """The name after `segmenter:` in --masks; None if it names a file or nothing."""
     text = str(masks)
     return text.removeprefix(SEGMENTER_PREFIX) if text.startswith(SEGMENTER_PREFIX) else None
 
 
 def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
-    """Our own segmenter, or that of an installed package.
+    """Make this project's segmenter, or one of an installed package.
 
     Raises:
-        InputError: If no package brings one of that name, or it cannot be loaded.
+        InputError: If no package registers that name, or its segmenter cannot be loaded.
     """
     if name == DEFAULT_SEGMENTER:
         from preprocess.masks.grabcut import GrabCutSegmenter
 
         return GrabCutSegmenter(shaped)
-    brought = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
-    if name not in brought:
+    registered = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    if name not in registered:
         raise InputError(
             f"--masks {SEGMENTER_PREFIX}{name}: there is no such segmenter; installed are "
-            f"{', '.join([DEFAULT_SEGMENTER, *brought])}. Others come with packages that have an entry point in "
-            f"the group {ENTRY_POINT_GROUP!r} (docs/formats.md)."
+            f"{', '.join([DEFAULT_SEGMENTER, *registered])}. Others come with packages that have "
+            f"an entry point in the group {ENTRY_POINT_GROUP!r} (docs/formats.md)."
         )
     try:
-        make: SegmenterFactory = brought[name].load()
+        make: SegmenterFactory = registered[name].load()
         return make(shaped)
-    except Exception as cause:  # somebody else's code
+    except Exception as cause:  # code of another package
         raise InputError(f"The segmenter {name!r} could not be loaded: {cause}.") from cause
 
 
@@ -81,7 +83,7 @@ class MaskOrigin:
     Attributes:
         path: The file or folder; None if there is none.
         segmenter: Name of the segmenter that estimates them; None if nothing is estimated.
-        named: Whether the user named it.
+        is_explicit: Whether the user named it.
     """
 
     path: Path | None = None
@@ -90,7 +92,7 @@ class MaskOrigin:
 
     @property
     def uses_alpha_channel(self) -> bool:
-        """Whether the pictures' own alpha channel is the mask."""
+        """Whether the images' own alpha channel is the mask."""
         return self.path is None and self.segmenter is None
 
     @property
@@ -102,12 +104,12 @@ class MaskOrigin:
 def choose_mask_origin(
     requested: Path | None, found: Path | None, *, has_alpha: bool
 ) -> MaskOrigin:
-    """Takes what the user named; else a file that was found, the alpha channel, or an estimate.
+    """Choose what the user named; else a file that was found, the alpha channel, or an estimate.
 
     Args:
-        given: What --masks names: a file, a folder, or `segmenter:NAME`.
-        found: Masks that lie in the capture folder or beside the video.
-        has_alpha: Whether the pictures' alpha channel cuts the person out; an opaque one does not.
+        requested: Value of --masks: a file, a folder, or `segmenter:NAME`.
+        found: Masks in the capture folder or beside the video.
+        has_alpha: Whether the images' alpha channel cuts the person out; an opaque one does not.
     """
     segmenter = segmenter_name(requested)
     if segmenter is not None:

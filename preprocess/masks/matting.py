@@ -1,11 +1,10 @@
-"""Soft edges for a hard mask: how much of each border pixel is person, by the colours around it.
+"""Alpha matting of a mask's border, with local mean colors or with a known background.
 
-How much of each border pixel is person, where it is known what lies behind.
-
-A pixel of the border shows I = a F + (1 - a) B (Chuang et al. 2001, a Bayesian approach to digital
-matting, with a background that is known). The border may lie elsewhere than the mask says: each
-displacement gives the pixel an a, and is as likely as the mask's usual error is so large and as
-the colours agree with it. The answer is the mean over all displacements.
+A border pixel shows I = a F + (1 - a) B (Chuang et al. 2001, a Bayesian approach to digital
+matting). `soften_border` takes F and B from the colors beside the border of a hard mask.
+`refine_border` knows the background: the border may be displaced from the mask's, each displacement
+gives a pixel its a, and is weighted by the prior of the mask's error and by the likelihood of the
+color. The result is the mean over all displacements.
 """
 
 import cv2
@@ -15,33 +14,33 @@ from jaxtyping import Bool, Float32, UInt8
 from preprocess.body.silhouette import signed_distance_px
 
 LOCAL_COLOR_PX = 1.0
-"""From how far around a border pixel the colours of person and background come (a Gaussian's σ)."""
+"""Gaussian σ, px, of the mean colors of person and background around a border pixel."""
 
 EDGE_SIGMA_PX = 0.5
-"""How wide the edge of a picture is: the σ of the lens and the pixel."""
+"""Gaussian σ, px, of an image's edge: the blur of lens and pixel."""
 
 COLOR_CONTRAST = 20.0, 45.0
-"""Colors less far apart than the first tell nothing; there the mask is only smoothed. From the
-second on they tell all they can."""
+"""Difference of the two mean colors, in levels, from which color counts, and counts fully; below
+the first the mask is only smoothed."""
 
 MAX_COLOR_WEIGHT = 0.5
-"""How far colours are believed against the smoothed mask: thin stripes and hair deceive them."""
+"""Largest weight of color against the smoothed mask: thin stripes and hair mislead it."""
 
 CROP_MARGIN_PX = 8
-"""So far around the person pixels are looked at."""
+"""Margin around the mask that is processed, px."""
 
 MIXTURE_RESIDUAL = 30.0
-"""A pixel whose colour is this far from all mixtures of both is believed half as much."""
+"""Distance of a pixel's color from all mixtures, in levels, at which its weight is halved."""
 
 
 def soften_border(
     rgb: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]
 ) -> Float32[np.ndarray, "height width"]:
-    """The mask with the pixels along its border split between person and background.
+    """Split the pixels along a hard mask's border between person and background.
 
-    A pixel of the border is a mixture I = a F + (1 - a) B of the mean colours of person and
-    background beside it, so a is the projection of I - B on F - B. It is averaged with the mask
-    seen through a lens, and counts less where F and B are alike or I is no mixture of them.
+    A border pixel is a mixture I = a F + (1 - a) B of the mean colors of person and background
+    beside it, so a is the projection of I - B on F - B. It is averaged with the blurred mask, and
+    counts less where F and B are alike or I is far from every mixture of them.
     """
     hard = mask.astype(np.uint8)
     left, top, width, height = cv2.boundingRect(hard)
@@ -76,7 +75,7 @@ def _soften_crop(
 def _local_mean_color(
     picture: Float32[np.ndarray, "height width 3"], selected: UInt8[np.ndarray, "height width"]
 ) -> tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Mean colour of the chosen pixels around each pixel, and whether there are any."""
+    """Mean color of the selected pixels around each pixel, and whether there are any."""
     chosen = selected.astype(np.float32)
     weight = cv2.GaussianBlur(chosen, (0, 0), LOCAL_COLOR_PX)
     total = cv2.GaussianBlur(picture * chosen[..., None], (0, 0), LOCAL_COLOR_PX)
@@ -84,18 +83,20 @@ def _local_mean_color(
 
 
 BORDER_SIGMA_PX = 0.35
-"""How far borders of masks are off (the standard deviation)."""
+"""Standard deviation of a mask's border error, px."""
 BORDER_SHIFTS_PX = np.arange(-1.6, 1.61, 0.2, dtype=np.float32)
-"""The displacements that are tried."""
+"""Displacements of the border that are averaged, px."""
 BORDER_BAND_PX = 2.2
-"""So far from the mask's border pixels are looked at."""
+"""Largest distance from the mask's border of a pixel that is refined, px."""
 
-OUTLIER_PROBABILITY, OUTLIER_SPREAD = 0.2, 50.0
-"""The person may look otherwise than expected: so likely, and then by so much."""
+OUTLIER_PROBABILITY = 0.2
+"""Probability of a foreground color that the appearance model does not predict."""
+OUTLIER_SPREAD = 50.0
+"""Standard deviation of such a color, in levels."""
 LIKELIHOOD_FLOOR = 1e-4
-"""How likely it is that nothing of all this is true, against a colour that agrees wholly."""
+"""Likelihood of a color that fits neither model, relative to a perfect fit."""
 LIKELIHOOD_EXPONENT = 0.6
-"""The colours' share in the likelihood: beside each other pixels err alike."""
+"""Exponent of the color likelihood: errors of neighboring pixels are correlated."""
 
 
 def refine_border(
@@ -104,14 +105,14 @@ def refine_border(
     background: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
     foreground: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
 ) -> Float32[np.ndarray, "height width"]:
-    """A mask with its border where colours say that it is.
+    """Move a mask's border to where the colors change from person to background.
 
     Args:
-        rgb: The picture.
+        rgb: The image.
         alpha: The mask.
-        behind: What lies behind each pixel, and the standard deviation of that, in levels.
-        person: What the person looks like in each pixel, likewise. Where one of both deviations is
-            infinite the mask stays.
+        background: Expected background color of each pixel and its standard deviation, in levels.
+        foreground: Expected color of the person and its standard deviation, in levels. Where
+            either deviation is infinite the mask stays.
     """
     outside = border_distance_px(alpha)
     spread = background[1] + foreground[1]
@@ -143,7 +144,7 @@ def _color_likelihood(
     alpha: Float32[np.ndarray, "pixels tried"],
     spread: Float32[np.ndarray, "..."] | np.float32,
 ) -> Float32[np.ndarray, "pixels tried"]:
-    """Density of a colour so far from the mixture, up to a factor."""
+    """Density of a color at a squared distance from the mixture, up to a factor."""
     variance = noise + (alpha * spread) ** 2
     return np.exp(-0.5 * squared / variance) * (np.float32(16.0) / variance) ** np.float32(1.5)
 
@@ -151,7 +152,7 @@ def _color_likelihood(
 def border_distance_px(
     alpha: Float32[np.ndarray, "height width"],
 ) -> Float32[np.ndarray, "height width"]:
-    """How far the middle of each pixel is outside the mask's border, to a part of a pixel."""
+    """Sub-pixel distance of each pixel's center from the mask's border, positive outside, px."""
     steps = signed_distance_px(alpha > 0.5)
     mixed = (np.abs(alpha - 0.5) < 0.47) & (np.abs(steps) < 1.2)
     return np.where(mixed, 0.5 - alpha, steps).astype(np.float32)

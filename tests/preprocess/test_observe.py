@@ -161,7 +161,7 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
     assert set(reasons) == {3, 5, 6}
     assert "mask unusable" in reasons[3]
     assert reasons[5] == "mask empty"
-    assert "64x48 px, its picture 48x64" in reasons[6]
+    assert "64x48 px, its image 48x64" in reasons[6]
 
 
 def test_without_masks_and_a_segmenter_there_is_nothing_to_do(parts):
@@ -211,7 +211,7 @@ def test_masks_that_are_turned_among_others_are_left_out_and_obeyed_where_told(p
     source, masks, cameras = parts()
     results = list(observe(source, moving(COUNT), masks, cameras))
     assert [r.index for r in results if isinstance(r, DroppedFrame)] == [4]
-    assert "wrong way round" in results[4].reason
+    assert "is it inverted?" in results[4].reason
     told = open_masks(images / "masks", invert=False)
     assert not any(
         isinstance(r, DroppedFrame) for r in observe(source, moving(COUNT), told, cameras)

@@ -90,7 +90,7 @@ def test_somebody_elses_poses_from_the_middle_on_are_no_offset(capture, diagnose
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
     write_motion(capture / "poses.npz", motion)
     code, said, found = diagnosed()
-    assert "The poses jump once (20). Did the tracker change persons?" in said
+    assert "The poses jump once (20). Did the tracker switch to another person?" in said
     assert found["corrections"] == []
     assert code == 2
 
@@ -110,8 +110,8 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
 def test_masks_that_are_turned_here_and_there_are_named_and_left_out(capture, diagnosed):
     change_masks(capture, lambda row, mask: 255 - mask if 10 <= row < 20 else mask)
     code, said, found = diagnosed()
-    assert "4 of 16 masks that were looked at cannot be used" in said
-    assert "wrong way round" in said
+    assert "4 of 16 sampled masks cannot be used" in said
+    assert "is it inverted?" in said
     assert (code, found["verdict"], found["corrections"]) == (0, "warn", [])
     assert found["iou"]["now"] > 0.8
 

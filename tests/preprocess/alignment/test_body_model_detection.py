@@ -1,4 +1,4 @@
-"""Tests for poses of which nobody says whose: the masks tell SMPL's from the embedded body's."""
+"""Tests for the detection of a pose file's body model by masks or images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ BETAS = np.array([-0.3, -0.5, 1.4, -1.2, -0.2, 2.5, -2.5, -0.9, 1.0, 2.6])
 
 
 def unnamed(model: str) -> Motion:
-    """Somebody of strong betas who turns half round."""
+    """A person of strong betas who turns half around; the file does not name the body model."""
     turns = np.linspace(0.0, np.pi, FRAMES) / 2.0
     return Motion(
         root_rotations=np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)]),
@@ -60,7 +60,7 @@ def filmed(tmp_path):
 
 
 @pytest.mark.parametrize("truth", ["smpl", "body24"])
-def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth):
+def test_masks_determine_an_unstated_body_model(filmed, truth):
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     read = unnamed("body24")
@@ -72,12 +72,12 @@ def test_masks_tell_whose_poses_they_are_where_the_file_is_silent(filmed, truth)
 
 
 @pytest.mark.parametrize("truth", ["smpl", "body24"])
-def test_what_a_file_says_is_never_doubted_and_without_masks_pictures_tell(filmed, truth):
+def test_a_stated_model_stays_and_without_masks_images_decide(filmed, truth):
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
-    said = replace(unnamed("body24"), model_is_stated=True)
+    stated = replace(unnamed("body24"), model_is_stated=True)
     body = load_body_model()
-    assert detect_body_model(said, body, CAMERAS, source, masks, cameras_given=True) is said
+    assert detect_body_model(stated, body, CAMERAS, source, masks, cameras_given=True) is stated
     read = unnamed("body24")
     found = detect_body_model(read, body, CAMERAS, source, None, cameras_given=True)
     assert found.body_model == truth

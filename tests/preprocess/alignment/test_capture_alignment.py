@@ -140,7 +140,7 @@ def betas_of(body: BodyModel, amount: float) -> np.ndarray:
 
 @pytest.mark.parametrize("amount", [-1.5, 1.5])
 def test_an_added_clips_poses_are_for_the_person_that_the_avatar_has(tmp_path, body, amount):
-    """Its tracker took somebody for larger and farther away, or smaller and nearer."""
+    """Its tracker assumed a larger person farther away, or a smaller one nearer."""
     person, other = body.with_shape(), body.with_shape(betas_of(body, amount))
     motion = motion_of("body24")
     source, masks = film(tmp_path, person, motion)

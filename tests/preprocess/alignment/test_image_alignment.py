@@ -1,4 +1,4 @@
-"""Tests for SMPL's poses on another body without masks: pictures say where somebody stands."""
+"""Tests for the alignment of SMPL's poses to images without masks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ CAMERAS = CameraTrack(cameras=(CAMERA,), source="test")
 
 
 def turning(yaw: float = np.pi) -> Motion:
-    """SMPL's poses of somebody who turns half round, 3.5 m in front of the camera, limbs moving."""
+    """SMPL's poses of a person who turns half around 3.5 m in front of the camera, limbs moving."""
     rng = np.random.default_rng(3)
     turns = np.linspace(0.0, yaw, FRAMES) / 2.0
     joints = 0.15 * rng.normal(size=(1, 23, 3)) + 0.1 * rng.normal(size=(FRAMES, 23, 3))
@@ -55,7 +55,7 @@ def scaled(shaped: ShapedBody, factor: float) -> ShapedBody:
 
 
 def filmed(person: ShapedBody, motion: Motion) -> list[np.ndarray]:
-    """A person of two colours before a wall of many: the pictures."""
+    """Images of a person of two colors before a wall of many."""
     rng, outline = np.random.default_rng(5), MeshSilhouette(person)
     wall = cv2.resize(rng.integers(30, 225, (16, 12, 3), dtype=np.uint8), SIZE)
     pictures = []
@@ -73,7 +73,7 @@ def own() -> ShapedBody:
     return shape_for_motion(load_body_model(), turning())
 
 
-def claim_of(motion: Motion) -> CaptureGeometry:
+def geometry_of(motion: Motion) -> CaptureGeometry:
     return CaptureGeometry(
         motion=motion,
         row_frames=np.arange(FRAMES, dtype=np.float64),
@@ -97,14 +97,14 @@ def pixels_off(own: ShapedBody, motion: Motion, person: ShapedBody, true: Motion
     )  # fmt: skip
 
 
-def test_pictures_alone_tell_how_tall_somebody_is_and_where_the_pelvis_is(own):
+def test_images_alone_determine_distance_and_pelvis(own):
     """Of SMPL's mean height, 6 cm too high, as poses have it; distances divided and the pelvis
     moved, as told, make the motion that was found in several rounds."""
     motion, person = turning(), scaled(own, 0.88)
     pictures = seen(filmed(person, motion))
     off = replace(motion, root_translations=motion.root_translations + np.array([0.0, 0.06, 0.0]))
     skin = SkinPoints.of(own)
-    fit = place_body_on_images(claim_of(off), skin, pictures)
+    fit = place_body_on_images(geometry_of(off), skin, pictures)
     before = pixels_off(own, off, person, motion)
     assert fit.is_improvement
     assert fit.distance_divisor == pytest.approx(0.88, rel=0.03)
@@ -116,29 +116,29 @@ def test_pictures_alone_tell_how_tall_somebody_is_and_where_the_pelvis_is(own):
     np.testing.assert_allclose(there - own.joints[0], fit.motion.root_translations, atol=1e-9)
     assert fit.edge_contrast is not None
     assert fit.edge_contrast[1] > 1.5 * fit.edge_contrast[0]
-    assert fit.edge_contrast[1] == edge_contrast(claim_of(fit.motion), skin, pictures)
-    assert "pictures" in fit.describe()
+    assert fit.edge_contrast[1] == edge_contrast(geometry_of(fit.motion), skin, pictures)
+    assert "images" in fit.describe()
     assert fit.as_json()["edges_after"] == round(fit.edge_contrast[1], 2)
 
 
 @pytest.fixture(scope="module")
 def elsewhere(own) -> BodyPlacement:
-    """What is found where somebody else stands half a metre beside the poses."""
+    """The placement found where the person stands half a metre beside the poses."""
     motion = turning()
     beside = replace(motion, root_translations=motion.root_translations + np.array([0.6, 0.0, 0.0]))
     pictures = seen(filmed(own, beside))
-    return place_body_on_images(claim_of(motion), SkinPoints.of(own), pictures)
+    return place_body_on_images(geometry_of(motion), SkinPoints.of(own), pictures)
 
 
-def test_where_nobody_stands_nobody_is_found(elsewhere):
-    """Masks that were found around the body agree with it all the same; edges do not."""
+def test_no_person_is_found_where_none_stands(elsewhere):
+    """Masks estimated around the body agree with it even so; edges do not."""
     assert elsewhere.iou_after > 0.6
     assert not elsewhere.is_reliable
     assert not elsewhere.is_improvement
     assert "no person was found" in elsewhere.describe()
 
 
-def test_a_video_without_masks_is_looked_at(tmp_path: Path, own):
+def test_a_video_without_masks_is_aligned_by_its_images(tmp_path: Path, own):
     motion, person = turning(), scaled(own, 1.12)
     for row, rgb in enumerate(filmed(person, motion)):
         Image.fromarray(rgb).save(tmp_path / f"{row}.png")
@@ -150,7 +150,7 @@ def test_a_video_without_masks_is_looked_at(tmp_path: Path, own):
     assert fit.description == fit.placement.describe()
 
 
-def test_while_pictures_come_poses_are_fitted_before_masks_are_estimated(own):
+def test_live_poses_are_aligned_before_masks_are_estimated(own):
     motion, person = turning(), scaled(own, 1.12)
     fit = LiveAlignment(own, "smpl", masked=False)
     pose_of = fit.align_poses(

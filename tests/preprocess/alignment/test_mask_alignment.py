@@ -1,4 +1,4 @@
-"""Tests for SMPL's poses on a body that is not SMPL's: somebody taller, known by masks alone."""
+"""Tests for the alignment of SMPL's poses to masks of a taller or smaller person."""
 
 from dataclasses import replace
 
@@ -55,11 +55,11 @@ def scaled(shaped: ShapedBody, factor: float) -> ShapedBody:
 def filmed(
     request, turning
 ) -> tuple[ShapedBody, CaptureGeometry, SilhouetteObjective, BodyPlacement]:
-    """Somebody with SMPL's proportions and another height; the claim; masks; what was found."""
+    """A person with SMPL's proportions and another height; geometry; objective; placement."""
     body = load_body_model()
     own = shape_for_motion(body, turning)
     person = scaled(own, request.param)
-    claim = CaptureGeometry(
+    geometry = CaptureGeometry(
         motion=turning,
         row_frames=np.arange(FRAMES, dtype=np.float64),
         intrinsics=np.array([[[190.0, 0.0, 48.0], [0.0, 190.0, 64.0], [0.0, 0.0, 1.0]]]),
@@ -68,14 +68,14 @@ def filmed(
     )
     skin = SkinPoints.of(person)
     masks = [
-        splat_silhouette(skin.posed(turning[i]), claim.camera_at(0, SIZE)) for i in range(FRAMES)
+        splat_silhouette(skin.posed(turning[i]), geometry.camera_at(0, SIZE)) for i in range(FRAMES)
     ]
-    witnesses = tuple(
+    samples = tuple(
         MaskSample(index=i, camera_row=0, alpha=mask.astype(np.float32))
         for i, mask in enumerate(masks)
     )
-    evidence = SilhouetteObjective(samples=witnesses, skin=SkinPoints.of(own))
-    return person, claim, evidence, place_body_on_masks(claim, evidence)
+    objective = SilhouetteObjective(samples=samples, skin=SkinPoints.of(own))
+    return person, geometry, objective, place_body_on_masks(geometry, objective)
 
 
 def test_the_bodys_joints_move_exactly_as_smpls_do(turning):
@@ -100,25 +100,25 @@ def test_poses_of_the_bodys_own_family_change_nothing(turning):
 
 
 def test_the_height_is_found_in_the_masks(filmed):
-    person, _, evidence, refit = filmed
-    factor = np.ptp(person.joints[:, 1]) / np.ptp(evidence.skin.shaped.joints[:, 1])
-    assert refit.is_improvement
-    assert refit.distance_divisor == pytest.approx(factor, rel=0.02)
-    assert refit.iou_after > 0.93 > refit.iou_before + 0.1
+    person, _, objective, placement = filmed
+    factor = np.ptp(person.joints[:, 1]) / np.ptp(objective.skin.shaped.joints[:, 1])
+    assert placement.is_improvement
+    assert placement.distance_divisor == pytest.approx(factor, rel=0.02)
+    assert placement.iou_after > 0.93 > placement.iou_before + 0.1
 
 
 def test_joints_land_where_the_person_has_them(filmed):
-    person, claim, evidence, refit = filmed
-    camera: Camera = claim.camera_at(0, SIZE)
+    person, geometry, objective, placement = filmed
+    camera: Camera = geometry.camera_at(0, SIZE)
     for row in range(FRAMES):
-        pose, fitted = claim.motion[row], refit.motion[row]
+        pose, fitted = geometry.motion[row], placement.motion[row]
         true = camera.project(person.with_pose(pose).joints())
-        found = camera.project(evidence.skin.shaped.with_pose(fitted).joints())
+        found = camera.project(objective.skin.shaped.with_pose(fitted).joints())
         assert np.abs(true - found).max() < 1.2  # pixels of 2.3 cm
         np.testing.assert_array_equal(fitted.joint_rotations, pose.joint_rotations)
 
 
 def test_what_fits_already_is_left_as_it_is(filmed):
-    _, claim, evidence, refit = filmed
-    again = place_body_on_masks(replace(claim, motion=refit.motion), evidence)
+    _, geometry, objective, placement = filmed
+    again = place_body_on_masks(replace(geometry, motion=placement.motion), objective)
     assert not again.is_improvement

@@ -60,7 +60,7 @@ def test_a_silhouette_is_the_meshs_own(skin, shaped, camera):
     assert soft_iou(drawn, (alpha > 0).astype(np.float32)) > 0.95
 
 
-def test_nothing_is_drawn_of_somebody_behind_the_camera(skin, camera):
+def test_nothing_is_drawn_of_a_person_behind_the_camera(skin, camera):
     behind = skin.posed(BodyPose.rest()) + np.array([0.0, 0.0, 10.0], dtype=np.float32)
     assert not splat_silhouette(behind, camera).any()
 

@@ -194,11 +194,11 @@ def test_which_side_is_the_person_is_what_most_masks_show_so_far(tmp_path):
         write_mask(tmp_path, str(number), inverted=inverted)
     growing = masks(tmp_path, patience_s=60.0)
     assert growing.wait_for_mask(frame(0, name="0"), (4, 6))[0, 0] == 0.0
-    with pytest.raises(InputError, match=r"1\.png is the other way round"):  # one against one
+    with pytest.raises(InputError, match=r"1\.png is inverted unlike most"):  # one against one
         growing.wait_for_mask(frame(1, name="1"), (4, 6))
     for number in (2, 3):
         assert growing.wait_for_mask(frame(number, name=str(number)), (4, 6))[0, 0] == 0.0
-    with pytest.raises(InputError, match=r"4\.png is the other way round"):
+    with pytest.raises(InputError, match=r"4\.png is inverted unlike most"):
         growing.wait_for_mask(frame(4, name="4"), (4, 6))
     said = masks(tmp_path, invert=True)
     assert (
@@ -208,5 +208,5 @@ def test_which_side_is_the_person_is_what_most_masks_show_so_far(tmp_path):
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     write_mask(tmp_path, "0", shape=(4, 6))
-    with pytest.raises(InputError, match="6x4 px, its picture 4x6"):
+    with pytest.raises(InputError, match="6x4 px, its image 4x6"):
         masks(tmp_path).wait_for_mask(frame(0, name="0"), (4, 6))

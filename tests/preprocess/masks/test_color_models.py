@@ -1,4 +1,4 @@
-"""The colours of the person's surface."""
+"""Tests for the appearance model of the person's surface."""
 
 import numpy as np
 import pytest
@@ -48,12 +48,10 @@ def test_what_is_seen_faces_the_camera_and_is_not_behind_something(shaped, turne
     assert depth[sight.visible].mean() > depth[~sight.visible].mean()
 
 
-def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
-    shaped, camera, turned
-):
+def test_colors_seen_from_the_front_predict_the_outline_after_a_turn(shaped, camera, turned):
     """One half of the body is red, the other blue: of the rim one side is red, then the other."""
     left = shaped.vertices[:, 0] > 0.0
-    colours = AppearanceModel(len(left))
+    colors = AppearanceModel(len(left))
     inside = np.full(SIZE[::-1], 9.0, np.float32)
     for yaw in (0.0, np.pi) * 3:
         _, sight = turned(yaw)
@@ -61,10 +59,10 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
         columns = np.arange(SIZE[0]) + 0.5 > camera.center_px[0]
         picture = np.where((columns != swapped)[:, None], FRONT, BACK)
         rgb = np.broadcast_to(picture, (*SIZE[::-1], 3)).astype(np.uint8)
-        colours.update(sight, rgb, inside)
+        colors.update(sight, rgb, inside)
     for yaw, expected in ((0.5 * np.pi, BACK), (-0.5 * np.pi, FRONT)):
         _, sight = turned(yaw)
-        told, spread = colours.predict(sight, SIZE)
+        told, spread = colors.predict(sight, SIZE)
         # now the one half is before the other
         rim = sight.visible & (sight.facing > 0.2) & (sight.facing < 0.6) & (left == (yaw < 0))
         column, row = sight.pixels[rim].astype(int).T
@@ -76,8 +74,8 @@ def test_colours_from_the_front_are_known_along_the_outline_of_who_has_turned(
 
 def test_nothing_is_learnt_so_near_to_the_border_that_it_may_be_background(turned, camera):
     _, sight = turned(0.0)
-    colours = AppearanceModel(len(sight.visible))
+    colors = AppearanceModel(len(sight.visible))
     rgb = np.full((*SIZE[::-1], 3), 99, np.uint8)
-    colours.update(sight, rgb, np.full(SIZE[::-1], 1.0, np.float32))
-    _, spread = colours.predict(sight, SIZE)
+    colors.update(sight, rgb, np.full(SIZE[::-1], 1.0, np.float32))
+    _, spread = colors.predict(sight, SIZE)
     assert np.isinf(spread).all()

@@ -1,4 +1,4 @@
-"""Masks that nobody gave, found around the posed body."""
+"""Tests for masks estimated by GrabCut around the posed body."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def standing(shaped, yaw: float = 0.0) -> BodyPose:
 
 @pytest.fixture
 def film(shaped, camera, rng):
-    """A person in a blue suit, wider than the body, before a wall of many colours."""
+    """A person in a blue suit, wider than the body, before a wall of many colors."""
     outline = MeshSilhouette(shaped)
     wall = cv2.resize(rng.integers(40, 220, (25, 20, 3), dtype=np.uint8), SIZE)
     wall[..., 2] //= 2
@@ -103,7 +103,7 @@ def test_clothes_that_are_wider_than_the_body_are_found(shaped, camera, film):
     assert 0.6 < find.agreement < 0.95
 
 
-def test_what_was_seen_behind_the_person_helps_where_poses_are_off(shaped, camera, film):
+def test_the_background_model_helps_where_poses_are_off(shaped, camera, film):
     def shifted(pose: BodyPose) -> BodyPose:
         return replace(pose, root_translation=pose.root_translation + np.array([0.03, 0.0, 0.0]))
 
@@ -116,7 +116,7 @@ def test_what_was_seen_behind_the_person_helps_where_poses_are_off(shaped, camer
     assert last > alone - 0.01
 
 
-def test_a_camera_that_moves_forgets_what_lay_behind(camera, rng):
+def test_a_moving_camera_clears_the_background_model(camera, rng):
     behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
 
@@ -134,10 +134,10 @@ def test_a_camera_that_moves_forgets_what_lay_behind(camera, rng):
     turned = camera.camera_from_world.copy()
     turned[:3] = rotation_matrices(np.array([0.0, 0.02, 0.0])) @ turned[:3]
     assert not remembers(replace(camera, camera_from_world=turned), wall)
-    assert not remembers(camera, np.roll(wall, 4, axis=1))  # it moved, and nobody said so
+    assert not remembers(camera, np.roll(wall, 4, axis=1))  # it moved although its pose did not
 
 
-def test_what_lay_behind_tells_who_stands_before_it(camera, rng):
+def test_the_background_model_finds_the_person(camera, rng):
     behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     wall = rng.integers(0, 255, (*SIZE[::-1], 3), dtype=np.uint8)
     for _ in range(3):
@@ -158,7 +158,7 @@ def test_what_lay_behind_tells_who_stands_before_it(camera, rng):
     assert 0.5 < unlike[person].mean() < 1.0
 
 
-def test_a_shadow_on_what_lay_behind_is_no_person_but_a_red_sole_in_it_is(camera):
+def test_a_shadow_is_not_person_but_a_red_sole_in_it_is(camera):
     behind, free = BackgroundModel(), np.ones(SIZE[::-1], dtype=bool)
     floor = np.broadcast_to(np.uint8([140, 105, 65]), (*SIZE[::-1], 3)).copy()
     for _ in range(3):
@@ -172,8 +172,8 @@ def test_a_shadow_on_what_lay_behind_is_no_person_but_a_red_sole_in_it_is(camera
     np.testing.assert_array_equal(np.flatnonzero(unlike.any(axis=1)), np.arange(120, 124))
 
 
-def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_was(camera, rng):
-    """A wall of which every picture is a little different, seen with a shadow on it."""
+def test_the_predicted_background_has_local_brightness_and_spread(camera, rng):
+    """A noisy wall, seen with a shadow on it."""
     wall = rng.integers(60, 200, (*SIZE[::-1], 3)).astype(float)
     person = np.zeros(SIZE[::-1], dtype=bool)
     person[50:90, 40:60] = True
@@ -201,8 +201,8 @@ def test_what_lies_behind_is_shown_as_bright_as_it_is_beside_and_as_sure_as_it_w
 
 
 @pytest.mark.parametrize("thick_m", [0.0, 0.04])
-def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
-    """Masks of a body that is thicker by so much all over; the person turns once."""
+def test_clothing_offsets_are_learnt_from_masks(shaped, camera, thick_m):
+    """Masks of a body that is thicker by `thick_m` all over; the person turns once."""
     large = camera.resize((480, 600))
     outline, shell = MeshSilhouette(shaped), ClothingOffset(shaped)
     for yaw in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
@@ -228,7 +228,7 @@ def test_the_shell_learns_how_thick_clothes_are(shaped, camera, thick_m):
     assert agreement(drawn, true) > 0.96
 
 
-def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, camera, rng):
+def test_offsets_compensate_for_the_overshooting_outline(shaped, camera, rng):
     """Every other vertex, at random, is 4 mm thicker: the outline is theirs."""
     large, shell = camera.resize((480, 600)), ClothingOffset(shaped)
     around = shell.clothe(standing(shaped), large)
@@ -253,8 +253,8 @@ def test_vertices_know_how_far_the_drawn_outline_stands_beyond_them(shaped, came
     np.testing.assert_allclose(beyond(even + 0.004 * thicker, 0.1), 0.25 * rough)
 
 
-def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
-    """Where the mask goes on to the limit of what was in doubt, nothing was found there."""
+def test_a_border_at_the_bands_limit_hardly_counts(shaped, camera):
+    """A mask that extends to the uncertain band's limit found no border there."""
     pose = standing(shaped)
     thickness = []
     for limit in (0.02, 0.2):
@@ -275,7 +275,7 @@ def test_a_border_that_was_cut_off_is_hardly_a_vote(shaped, camera):
     assert thickness[0] < thickness[1] - 0.005
 
 
-def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
+def test_soles_that_most_masks_miss_belong_to_the_shoe(shaped, camera):
     """Of five masks two reach 3 cm beyond the skin, the others end at it."""
     large, shell, pose = camera.resize((480, 600)), ClothingOffset(shaped), standing(shaped)
     for thick_m in (0.03, 0.0, 0.0, 0.03, 0.0) * 4:
@@ -298,7 +298,7 @@ def test_soles_that_most_cuts_miss_are_still_part_of_the_shoe(shaped, camera):
     assert np.median(thickness[legs & (known == 1.0)]) < 0.01
 
 
-def test_a_knot_of_hair_is_wide_in_all_directions_and_a_leak_is_not():
+def test_a_bun_is_wide_in_all_directions_and_a_leak_is_not():
     beyond = np.zeros((40, 60), dtype=bool)
     beyond[4:10, 30:36] = True  # 6 cm wide and high
     beyond[20:22, 30:50] = True  # a stripe 2 cm high
@@ -318,7 +318,7 @@ def test_masks_get_better_as_clothes_become_known(shaped, camera, film):
 
 
 @pytest.mark.parametrize("off_m", [0.006, 0.02])
-def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m):
+def test_far_from_the_shape_a_segmentation_leaked_if_poses_are_good(shaped, off_m):
     find, shape = GrabCutSegmenter(shaped), np.zeros((40, 60), dtype=bool)
     shape[:, :30] = True
     away = signed_distance_px(shape)
@@ -327,7 +327,7 @@ def test_far_from_the_shell_a_cut_has_leaked_unless_poses_are_bad(shaped, off_m)
         rim_vertices=np.zeros(0, dtype=int), known_fraction=1.0, px_per_m=100.0,
     )  # fmt: skip
     covered = shape.astype(np.float32)
-    find._off_m = off_m
+    find._shape_error_m = off_m
     cut = np.zeros_like(shape)
     cut[:20, :30] = True
     cut[20:, :34] = True  # four centimetres too far
@@ -378,7 +378,7 @@ def test_the_same_frames_give_the_same_masks(shaped, camera, film):
     np.testing.assert_array_equal(*masks)
 
 
-def test_large_pictures_are_cut_small_and_come_back_large(shaped, camera, film):
+def test_large_images_are_segmented_small_and_upsampled(shaped, camera, film):
     frame, pose, true = film(0.3)
     large = replace(frame, rgb=cv2.resize(frame.rgb, (480, 600), interpolation=cv2.INTER_NEAREST))
     mask = GrabCutSegmenter(shaped)(large, pose, camera.resize((480, 600)))
@@ -393,7 +393,7 @@ def test_a_person_who_is_not_there_gives_no_mask(shaped, camera, film):
         GrabCutSegmenter(shaped)(frame, aside, camera)
 
 
-# --- the seat for others -----------------------------------------------------------------------
+# --- segmenters of other packages ----------------------------------------------------------
 
 
 def test_a_segmenter_is_named_by_its_prefix():

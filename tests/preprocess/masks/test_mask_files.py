@@ -150,7 +150,7 @@ def test_numbers_of_objects_in_grey_are_masks_and_dark_noise_is_none(write, rng)
 def test_pictures_are_no_masks(write, rng):
     photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
     for invert in (None, False):
-        with pytest.raises(InputError, match="pictures, not masks: 7"):
+        with pytest.raises(InputError, match="photographs, not masks: 7"):
             open_masks(write(photographs, f"photographs {invert}"), invert=invert)
     soft = cv2.GaussianBlur(person(), (5, 5), 0)
     assert open_masks(write([soft], "soft")).count == 1
@@ -163,7 +163,7 @@ def test_masks_that_show_nothing_are_refused(write):
 
 def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
     masks = open_masks(write([person()]))
-    with pytest.raises(InputError, match=r"30x40 px, its picture 40x30"):
+    with pytest.raises(InputError, match=r"30x40 px, its image 40x30"):
         masks.alpha(0, (40, 30))
     half = masks.alpha(0, (15, 20))
     by_hand = (person() / np.float32(255)).reshape(20, 2, 15, 2).mean(axis=(1, 3))

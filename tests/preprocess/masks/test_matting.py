@@ -1,7 +1,4 @@
-"""Soft edges from hard masks.
-
-Border pixels, where it is known what lies behind them.
-"""
+"""Tests for alpha matting: soft borders of hard masks, and borders before a known background."""
 
 import cv2
 import numpy as np
@@ -11,7 +8,7 @@ from preprocess.masks.matting import EDGE_SIGMA_PX, border_distance_px, refine_b
 
 
 def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """A disc of two colours before a wall, drawn finely and reduced; and its true alpha."""
+    """A disc of two colors before a wall, drawn finely and reduced; and its true alpha."""
     y, x = np.mgrid[0 : size * fine, 0 : size * fine] / fine
     disc = np.hypot(x - 31.3, y - 33.7) < 20.2
     alpha = cv2.resize(disc.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
@@ -21,7 +18,7 @@ def drawn(rng, *, fine: int = 8, size: int = 64) -> tuple[np.ndarray, np.ndarray
     return np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8), alpha
 
 
-def test_edges_come_nearer_to_the_true_ones_than_hard_and_than_smooth_ones(rng):
+def test_soft_borders_beat_hard_and_blurred_ones(rng):
     rgb, alpha = drawn(rng)
     hard = alpha > 0.5
     smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
@@ -42,7 +39,7 @@ def test_only_the_border_changes(rng):
     assert soft.max() == 1.0
 
 
-def test_where_colours_are_alike_the_mask_is_smoothed(rng):
+def test_where_colors_are_alike_the_mask_is_blurred(rng):
     _, alpha = drawn(rng)
     grey = np.full((64, 64, 3), 128, np.uint8)
     hard = alpha > 0.5
@@ -69,9 +66,9 @@ def disc(radius: float, size: int = 64, fine: int = 8) -> np.ndarray:
     return cv2.resize(inside, (size, size), interpolation=cv2.INTER_AREA)
 
 
-def told(colour: np.ndarray, spread: float, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
+def constant(color: np.ndarray, spread: float, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
     return (
-        np.broadcast_to(colour, (size, size, 3)).astype(np.float32),
+        np.broadcast_to(color, (size, size, 3)).astype(np.float32),
         np.full((size, size), spread, np.float32),
     )
 
@@ -82,38 +79,38 @@ def pictured(alpha: np.ndarray, wall: np.ndarray) -> np.ndarray:
 
 
 def test_a_border_half_a_pixel_off_comes_back(rng):
-    """Whichever way it is off; the wall may be of any colours, if they are known."""
+    """Whichever way it is off; the wall may be of any colors, if they are known."""
     true = disc(20.2)
     wall = rng.integers(120, 250, (64, 64, 3)).astype(np.float32)
     picture = pictured(true, wall)
     for radius in (19.7, 20.7):
         given = disc(radius)
-        found = refine_border(picture, given, (wall, told(WALL, 5.0)[1]), told(SUIT, 8.0))
+        found = refine_border(picture, given, (wall, constant(WALL, 5.0)[1]), constant(SUIT, 8.0))
         assert np.abs(found - true).sum() < 0.33 * np.abs(given - true).sum()
         far = np.abs(border_distance_px(given)) > 4.0
         np.testing.assert_array_equal(found[far], given[far])
 
 
-def test_nothing_changes_where_one_of_both_colours_is_unknown():
+def test_nothing_changes_where_either_color_is_unknown():
     picture, given = pictured(disc(20.2), WALL), disc(19.7)
-    known, unknown = told(WALL, 5.0), told(SUIT, np.inf)
+    known, unknown = constant(WALL, 5.0), constant(SUIT, np.inf)
     np.testing.assert_array_equal(refine_border(picture, given, known, unknown), given)
     np.testing.assert_array_equal(refine_border(picture, given, unknown, known), given)
 
 
-def test_the_mask_is_believed_where_person_and_wall_look_alike():
+def test_the_mask_stays_where_person_and_wall_look_alike():
     """No displacement is likelier than another, so what is found is as much as was given."""
     given = disc(20.2)
-    found = refine_border(pictured(given, SUIT), given, told(SUIT, 5.0), told(SUIT, 5.0))
+    found = refine_border(pictured(given, SUIT), given, constant(SUIT, 5.0), constant(SUIT, 5.0))
     assert abs(found.sum() - given.sum()) < 0.02 * given.sum()
     assert np.abs(found - given).max() < 0.5
 
 
-def test_a_person_of_another_colour_than_expected_is_still_no_wall():
-    """The expected colour lies beyond the person's, so by both colours alone half is wall."""
+def test_an_unexpected_foreground_color_is_still_person():
+    """The expected color lies beyond the person's, so by both colors alone half is wall."""
     true, given = disc(20.2), disc(19.7)
     expected = WALL + 2.0 * (SUIT - WALL)
-    found = refine_border(pictured(true, WALL), given, told(WALL, 5.0), told(expected, 8.0))
+    found = refine_border(pictured(true, WALL), given, constant(WALL, 5.0), constant(expected, 8.0))
     assert found[true == 1.0].mean() > 0.97
 
 
