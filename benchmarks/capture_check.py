@@ -1,10 +1,10 @@
-"""Whether the doctor names what is wrong: 44 spoilt copies of samples, and 10 good ones.
+"""Check whether ia-check names what is wrong in 44 corrupted captures and 10 intact ones.
 
     python -m benchmarks.capture_check [--keep DIR]
 
-A mistake is found if the doctor's first cause is one that was made; of two that were made at once,
-whether it names both is counted, too. A good capture must be called good, with no cause. Seconds
-are core time (one thread), beside them wall time, which a busy machine makes longer.
+A corruption counts as found if the first named cause is one that was made; of two made at once,
+naming both is counted, too. An intact capture must be called good, with no cause. Seconds are core
+time (one thread); wall time, in parentheses, is longer on a busy machine.
 """
 
 import argparse
@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 from apps.checks.capture_validation import check_capture
-from benchmarks import capture_corruptions
-from benchmarks.capture_corruptions import CorruptedCapture
+from benchmarks import capture_corruptions as corrupt
+from benchmarks.capture_corruptions import CorruptedCapture, Corruption
 from benchmarks.hardware import Hardware
 from preprocess.capture_session import CaptureInputs
 from studio.shoot import ShootConfig, film_capture
@@ -28,190 +28,78 @@ CAPTURES = {
     "small": ShootConfig(frames=48, size=128, motion="dance", seed=5),
 }
 
+
+def _case(capture: str, **corruptions: Corruption) -> CorruptedCapture:
+    """A capture with corruptions, by their causes."""
+    return CorruptedCapture(capture=capture, corruptions=tuple(corruptions.items()))
+
+
 CORRUPTED = (
-    CorruptedCapture(
-        capture="turn", corruptions=(("frame_offset", capture_corruptions.delay_poses(3)),)
+    _case("turn", frame_offset=corrupt.delay_poses(3)),
+    _case("dance", frame_offset=corrupt.delay_poses(-7)),
+    _case("noisy", frame_offset=corrupt.delay_poses(20)),
+    _case("rough", frame_offset=corrupt.drop_first_poses(6)),
+    _case("turn", frame_rate=corrupt.resample_poses(0.5)),
+    _case("dance", frame_rate=corrupt.scale_timestamps(30.0 / 25.0)),
+    _case("noisy", frame_rate=corrupt.resample_poses(25.0 / 30.0)),
+    _case("turn", opengl_axes=corrupt.use_opengl_poses),
+    _case("noisy", opengl_axes=corrupt.use_opengl_cameras),
+    _case("dance", opengl_axes=corrupt.flip_translation_y),
+    _case("turn", root_rotation=corrupt.rotate_tracker_input(90)),
+    _case("dance", root_rotation=corrupt.rotate_tracker_input(180)),
+    _case("noisy", root_rotation=corrupt.rotate_tracker_input(270)),
+    _case("rough", root_rotation=corrupt.use_z_up_poses),
+    _case("turn", world_frame=corrupt.apply_extrinsics_twice),
+    _case("noisy", world_frame=corrupt.invert_extrinsics),
+    _case("dance", world_frame=corrupt.reset_extrinsics),
+    _case("dance", focal=corrupt.scale_focal(0.6)),
+    _case("small", focal=corrupt.scale_focal(1.35)),
+    _case("turn", left_right=corrupt.swap_left_right),
+    _case("dance", left_right=corrupt.mirror_tracker_input),
+    _case("noisy", root_origin=corrupt.root_about_origin),
+    _case("dance", body_scale=corrupt.scale_translations(0.75)),
+    _case("rough", body_scale=corrupt.change_units(1000.0)),
+    _case("noisy", mask_polarity=corrupt.invert_masks),
+    _case("turn", frame_offset=corrupt.delay_poses(10), focal=corrupt.scale_focal(1.4)),
+    _case("dance", opengl_axes=corrupt.use_opengl_poses, frame_offset=corrupt.delay_poses(5)),
+    _case(
+        "noisy", root_rotation=corrupt.rotate_tracker_input(90), left_right=corrupt.swap_left_right
     ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("frame_offset", capture_corruptions.delay_poses(-7)),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("frame_offset", capture_corruptions.delay_poses(20)),)
-    ),
-    CorruptedCapture(
-        capture="rough", corruptions=(("frame_offset", capture_corruptions.drop_first_poses(6)),)
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("frame_rate", capture_corruptions.resample_poses(0.5)),)
-    ),
-    CorruptedCapture(
-        capture="dance",
-        corruptions=(("frame_rate", capture_corruptions.scale_timestamps(30.0 / 25.0)),),
-    ),
-    CorruptedCapture(
-        capture="noisy",
-        corruptions=(("frame_rate", capture_corruptions.resample_poses(25.0 / 30.0)),),
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("opengl_axes", capture_corruptions.use_opengl_poses),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("opengl_axes", capture_corruptions.use_opengl_cameras),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("opengl_axes", capture_corruptions.flip_translation_y),)
-    ),
-    CorruptedCapture(
-        capture="turn",
-        corruptions=(("root_rotation", capture_corruptions.rotate_tracker_input(90)),),
-    ),
-    CorruptedCapture(
-        capture="dance",
-        corruptions=(("root_rotation", capture_corruptions.rotate_tracker_input(180)),),
-    ),
-    CorruptedCapture(
-        capture="noisy",
-        corruptions=(("root_rotation", capture_corruptions.rotate_tracker_input(270)),),
-    ),
-    CorruptedCapture(
-        capture="rough", corruptions=(("root_rotation", capture_corruptions.use_z_up_poses),)
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("world_frame", capture_corruptions.apply_extrinsics_twice),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("world_frame", capture_corruptions.invert_extrinsics),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("world_frame", capture_corruptions.reset_extrinsics),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("focal", capture_corruptions.scale_focal(0.6)),)
-    ),
-    CorruptedCapture(
-        capture="small", corruptions=(("focal", capture_corruptions.scale_focal(1.35)),)
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("left_right", capture_corruptions.swap_left_right),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("left_right", capture_corruptions.mirror_tracker_input),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("root_origin", capture_corruptions.root_about_origin),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("body_scale", capture_corruptions.scale_translations(0.75)),)
-    ),
-    CorruptedCapture(
-        capture="rough", corruptions=(("body_scale", capture_corruptions.change_units(1000.0)),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("mask_polarity", capture_corruptions.invert_masks),)
-    ),
-    CorruptedCapture(
-        capture="turn",
-        corruptions=(
-            ("frame_offset", capture_corruptions.delay_poses(10)),
-            ("focal", capture_corruptions.scale_focal(1.4)),
-        ),
-    ),
-    CorruptedCapture(
-        capture="dance",
-        corruptions=(
-            ("opengl_axes", capture_corruptions.use_opengl_poses),
-            ("frame_offset", capture_corruptions.delay_poses(5)),
-        ),
-    ),
-    CorruptedCapture(
-        capture="noisy",
-        corruptions=(
-            ("root_rotation", capture_corruptions.rotate_tracker_input(90)),
-            ("left_right", capture_corruptions.swap_left_right),
-        ),
-    ),
-    CorruptedCapture(
-        capture="rough",
-        corruptions=(
-            ("mask_polarity", capture_corruptions.invert_masks),
-            ("root_origin", capture_corruptions.root_about_origin),
-        ),
-    ),
-    CorruptedCapture(
-        capture="turn",
-        corruptions=(
-            ("body_scale", capture_corruptions.change_units(100.0)),
-            ("frame_rate", capture_corruptions.resample_poses(0.5)),
-        ),
-    ),
-    CorruptedCapture(
-        capture="turn",
-        corruptions=(("root_rotation", capture_corruptions.use_z_up_poses_without_pelvis),),
-    ),
-    CorruptedCapture(
-        capture="small", corruptions=(("frame_offset", capture_corruptions.keep_last_poses(30)),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("second_person", capture_corruptions.add_second_person),)
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("video_rotation", capture_corruptions.rotate_video(1)),)
-    ),
-    CorruptedCapture(
-        capture="rough", corruptions=(("video_rotation", capture_corruptions.rotate_video(2)),)
-    ),
-    CorruptedCapture(
-        capture="dance", corruptions=(("video_rotation", capture_corruptions.rotate_video(3)),)
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("video_mirrored", capture_corruptions.mirror_video),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("video_mirrored", capture_corruptions.mirror_video),)
-    ),
-    CorruptedCapture(
-        capture="dance",
-        corruptions=(("video_crop", capture_corruptions.crop_video(0.05, 0.08, 0.87)),),
-    ),
-    CorruptedCapture(
-        capture="rough",
-        corruptions=(("video_crop", capture_corruptions.crop_video(-0.15, -0.15, 1.3)),),
-    ),
-    CorruptedCapture(
-        capture="turn", corruptions=(("video_offset", capture_corruptions.trim_video(12)),)
-    ),
-    CorruptedCapture(
-        capture="noisy", corruptions=(("video_offset", capture_corruptions.delay_video(4)),)
-    ),
-    CorruptedCapture(
-        capture="small", corruptions=(("video_offset", capture_corruptions.reverse_video),)
-    ),
-    CorruptedCapture(
-        capture="dance",
-        corruptions=(
-            ("frame_offset", capture_corruptions.delay_poses(5)),
-            ("video_mirrored", capture_corruptions.mirror_video),
-        ),
-    ),
+    _case("rough", mask_polarity=corrupt.invert_masks, root_origin=corrupt.root_about_origin),
+    _case("turn", body_scale=corrupt.change_units(100.0), frame_rate=corrupt.resample_poses(0.5)),
+    _case("turn", root_rotation=corrupt.use_z_up_poses_without_pelvis),
+    _case("small", frame_offset=corrupt.keep_last_poses(30)),
+    _case("dance", second_person=corrupt.add_second_person),
+    _case("turn", video_rotation=corrupt.rotate_video(1)),
+    _case("rough", video_rotation=corrupt.rotate_video(2)),
+    _case("dance", video_rotation=corrupt.rotate_video(3)),
+    _case("turn", video_mirrored=corrupt.mirror_video),
+    _case("noisy", video_mirrored=corrupt.mirror_video),
+    _case("dance", video_crop=corrupt.crop_video(0.05, 0.08, 0.87)),
+    _case("rough", video_crop=corrupt.crop_video(-0.15, -0.15, 1.3)),
+    _case("turn", video_offset=corrupt.trim_video(12)),
+    _case("noisy", video_offset=corrupt.delay_video(4)),
+    _case("small", video_offset=corrupt.reverse_video),
+    _case("dance", frame_offset=corrupt.delay_poses(5), video_mirrored=corrupt.mirror_video),
 )
 
 INTACT = (
     *(CorruptedCapture(capture=name, corruptions=()) for name in CAPTURES),
     *(
-        CorruptedCapture(
-            capture=name, corruptions=(("", capture_corruptions.convert_to_camera_space),)
-        )
+        CorruptedCapture(capture=name, corruptions=(("", corrupt.convert_to_camera_space),))
         for name in CAPTURES
     ),
 )
-"""As filmed, and told in the camera's own frame."""
+"""Captures as filmed, and converted to the camera's own frame."""
 
-REQUIRED_FIRST, MAX_CORE_SECONDS = 40, 10.0
-"""Right first causes, and core seconds of the slowest."""
+REQUIRED_FIRST = 40
+"""Corruptions whose cause must be named first."""
+MAX_CORE_SECONDS = 10.0
+"""Core seconds of the slowest check."""
 
 
 def shoot_captures(folder: Path) -> Path:
-    """Films the samples that are not there yet."""
+    """Film the sample captures that are not there yet."""
     for name, config in CAPTURES.items():
         if not (folder / name).exists():
             film_capture(folder / name, config)
@@ -219,7 +107,7 @@ def shoot_captures(folder: Path) -> Path:
 
 
 def check_case(case: CorruptedCapture, folder: Path) -> tuple[bool, bool, float, str]:
-    """Whether the first cause is right, whether all are, core seconds, and a line of words."""
+    """Whether the first cause is right, whether all are, core seconds, and a line of text."""
     began, core = time.perf_counter(), time.process_time()
     examined = check_capture(CaptureInputs(video=folder))
     seconds, wall = time.process_time() - core, time.perf_counter() - began
@@ -234,29 +122,33 @@ def check_case(case: CorruptedCapture, folder: Path) -> tuple[bool, bool, float,
 
 
 def main() -> None:
+    """Check every capture and print a line each."""
     arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--keep", type=Path, help="folder for the samples, kept and used again")
+    arguments.add_argument(
+        "--keep", type=Path, help="folder in which the sample captures are kept for later runs"
+    )
     keep = arguments.parse_args().keep
     print("\n".join(Hardware.here().lines()))
     with tempfile.TemporaryDirectory(dir=keep and _make_folder(keep)) as scratch:
-        samples = shoot_captures(keep or Path(scratch) / "films")
+        samples = shoot_captures(keep or Path(scratch) / "captures")
         found = whole = quiet = 0
         slowest = 0.0
         for number, case in enumerate((*CORRUPTED, *INTACT)):
             folder = case.write(samples, Path(scratch) / f"case{number}")
             right, all_named, seconds, said = check_case(case, folder)
             slowest = max(slowest, seconds)
-            spoilt = number < len(CORRUPTED)
-            found, quiet = found + (right and spoilt), quiet + (right and not spoilt)
-            whole += all_named and spoilt
+            corrupted = number < len(CORRUPTED)
+            found, quiet = found + (right and corrupted), quiet + (right and not corrupted)
+            whole += all_named and corrupted
             wanted = " + ".join(cause for cause, _ in case.corruptions if cause) or "good"
             mark = " " if right else "✗"
             print(f"{mark} {case.capture:<6} {wanted:<30} {seconds:4.1f} s  {said}", flush=True)
     print(
-        f"right cause first: {found} of {len(CORRUPTED)} (asked: {REQUIRED_FIRST}); all causes: {whole}"
+        f"right cause first: {found} of {len(CORRUPTED)} (target: {REQUIRED_FIRST}); "
+        f"all causes: {whole}"
     )
-    print(f"good ones called good: {quiet} of {len(INTACT)} (asked: all)")
-    print(f"slowest: {slowest:.1f} core-s (asked: {MAX_CORE_SECONDS:.0f})")
+    print(f"intact ones called good: {quiet} of {len(INTACT)} (target: all)")
+    print(f"slowest: {slowest:.1f} core-s (target: {MAX_CORE_SECONDS:.0f})")
     sys.exit(
         0 if found >= REQUIRED_FIRST and quiet == len(INTACT) and slowest <= MAX_CORE_SECONDS else 1
     )

@@ -1,6 +1,6 @@
 """The usual mistakes, made on purpose in a copy of a capture folder.
 
-They are written forwards, in files, and share no code with the doctor, which undoes them.
+They are written forwards, in files, and share no code with the corrections that undo them.
 """
 
 import shutil
@@ -21,24 +21,26 @@ from preprocess.poses.pose_file import read_motion, write_motion
 Corruption = Callable[[Path], None]
 """Makes one mistake in a capture folder."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
+"""Rotation between OpenGL's camera axes and OpenCV's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CorruptedCapture:
-    """A capture folder to be spoilt, and what the doctor should say of it."""
+    """A capture to be corrupted, and the causes that ia-check should name."""
 
     capture: str
     corruptions: tuple[tuple[str, Corruption], ...]
 
     @property
     def causes(self) -> frozenset[str]:
+        """The causes that were made."""
         return frozenset(cause for cause, _ in self.corruptions)
 
     def write(self, captures: Path, folder: Path) -> Path:
-        """A spoilt copy; pictures and masks are linked where they stay as they are."""
+        """Write a corrupted copy; unchanged images and masks are linked."""
         shutil.copytree(captures / self.capture, folder, copy_function=_link)
-        for _, spoil in self.corruptions:
-            spoil(folder)
+        for _, corrupt in self.corruptions:
+            corrupt(folder)
         return folder
 
 
@@ -75,77 +77,79 @@ def _change_world(motion: Motion, rotation: np.ndarray, shift: np.ndarray) -> Mo
     """The motion in another world, x' = R x + b."""
     pelvis = _pelvis(motion)
     roots = Rotation.from_matrix(rotation) * Rotation.from_rotvec(motion.root_rotations)
-    places = (pelvis + motion.root_translations) @ rotation.T + shift - pelvis
-    return replace(motion, root_rotations=roots.as_rotvec(), root_translations=places)
+    translations = (pelvis + motion.root_translations) @ rotation.T + shift - pelvis
+    return replace(motion, root_rotations=roots.as_rotvec(), root_translations=translations)
 
 
 def convert_to_camera_space(folder: Path) -> None:
-    """No mistake yet: the same capture, told in the camera's own frame, as trackers do."""
+    """Convert to the camera's own frame, as trackers do: no mistake yet."""
     extrinsic = _extrinsic(folder)
     _change_poses(folder, lambda m: _change_world(m, extrinsic[:3, :3], extrinsic[:3, 3]))
     _change_cameras(folder, extrinsic=np.eye(4))
 
 
 def delay_poses(frames: int) -> Corruption:
-    def spoil(folder: Path) -> None:
+    """Poses whose frame numbers are too large by this many frames."""
+
+    def corrupt(folder: Path) -> None:
         def change(motion: Motion) -> Motion:
             numbers = np.arange(len(motion)) + frames
             return replace(motion, frames=numbers, times_s=None)
 
         _change_poses(folder, change)
 
-    return spoil
+    return corrupt
 
 
 def drop_first_poses(frames: int) -> Corruption:
-    """The first rows are missing, and nothing tells the frames' numbers."""
+    """Poses without the first rows and without frame numbers."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         _change_poses(folder, lambda m: m.select_rows(np.arange(frames, len(m))))
 
-    return spoil
+    return corrupt
 
 
 def resample_poses(rate: float) -> Corruption:
     """Poses of a copy of the video at a multiple of its frame rate, without frame numbers."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         _change_poses(
             folder,
             lambda m: m.select_rows(np.arange(0.0, len(m) - 0.5, 1.0 / rate).round().astype(int)),
         )
 
-    return spoil
+    return corrupt
 
 
 def scale_timestamps(factor: float) -> Corruption:
-    """Times reckoned with a wrong frame rate."""
+    """Times computed with a wrong frame rate."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         def change(motion: Motion) -> Motion:
             assert motion.times_s is not None
             return replace(motion, frames=None, times_s=motion.times_s * factor)
 
         _change_poses(folder, change)
 
-    return spoil
+    return corrupt
 
 
 def use_opengl_poses(folder: Path) -> None:
-    """Poses in the space of an OpenGL camera, and no word of it."""
+    """Poses in the space of an OpenGL camera, labelled OpenCV."""
     convert_to_camera_space(folder)
     _change_poses(folder, lambda m: _change_world(m, OPENGL, np.zeros(3)))
 
 
 def use_opengl_cameras(folder: Path) -> None:
-    """nerfstudio's matrix as it stands there: world-from-camera, y up, z back."""
+    """nerfstudio's matrix unchanged: world-from-camera, y up, z back."""
     pose = np.linalg.inv(_extrinsic(folder))
     pose[:3, :3] = pose[:3, :3] @ OPENGL
     _change_cameras(folder, extrinsic=pose)
 
 
 def use_opengl_roots(folder: Path) -> None:
-    """Root rotations of an OpenGL camera beside places of an OpenCV one."""
+    """Root rotations of an OpenGL camera with translations of an OpenCV one."""
     convert_to_camera_space(folder)
     turned = Rotation.from_matrix(OPENGL)
 
@@ -157,7 +161,7 @@ def use_opengl_roots(folder: Path) -> None:
 
 
 def flip_translation_y(folder: Path) -> None:
-    """The places' y with the wrong sign, the rotations as they should be."""
+    """Translations with the wrong sign of y, rotations unchanged."""
     convert_to_camera_space(folder)
     _change_poses(
         folder,
@@ -166,14 +170,14 @@ def flip_translation_y(folder: Path) -> None:
 
 
 def rotate_tracker_input(degrees: float) -> Corruption:
-    """The tracker saw the pictures turned."""
+    """Poses of a tracker that saw the images rotated."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         convert_to_camera_space(folder)
         turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
         _change_poses(folder, lambda m: _change_world(m, turn, np.zeros(3)))
 
-    return spoil
+    return corrupt
 
 
 def use_z_up_poses(folder: Path) -> None:
@@ -183,52 +187,56 @@ def use_z_up_poses(folder: Path) -> None:
 
 
 def apply_extrinsics_twice(folder: Path) -> None:
-    """Poses in the camera's frame beside a camera that stands somewhere."""
+    """Poses in the camera's frame with a camera that is not at the origin."""
     extrinsic = _extrinsic(folder)
     _change_poses(folder, lambda m: _change_world(m, extrinsic[:3, :3], extrinsic[:3, 3]))
 
 
 def invert_extrinsics(folder: Path) -> None:
+    """World-from-camera in place of camera-from-world."""
     _change_cameras(folder, extrinsic=np.linalg.inv(_extrinsic(folder)))
 
 
 def reset_extrinsics(folder: Path) -> None:
-    """Poses in the world, and nothing says where the camera stood."""
+    """Poses in the world without the camera's position."""
     _change_cameras(folder, extrinsic=np.eye(4))
 
 
 def scale_focal(factor: float) -> Corruption:
-    def spoil(folder: Path) -> None:
+    """Focal lengths multiplied by a factor."""
+
+    def corrupt(folder: Path) -> None:
         with np.load(folder / "cameras.npz") as archive:
             intrinsic = archive["intrinsic"].copy()
         intrinsic[[0, 1], [0, 1]] *= factor
         _change_cameras(folder, intrinsic=intrinsic)
 
-    return spoil
+    return corrupt
 
 
 def swap_left_right(folder: Path) -> None:
-    """Left joints' rotations under the right ones' numbers."""
+    """Rotations of left and right joints exchanged."""
     _change_poses(
         folder, lambda m: replace(m, joint_rotations=m.joint_rotations[:, SWAPPED_JOINTS])
     )
 
 
 def mirror_limbs(folder: Path) -> None:
+    """Limbs mirrored, the root unchanged."""
     _change_poses(folder, _mirror_motion)
 
 
 def mirror_tracker_input(folder: Path) -> None:
-    """The tracker saw a selfie camera's preview."""
+    """Poses of a tracker that saw a selfie camera's mirrored preview."""
     convert_to_camera_space(folder)
 
     def change(motion: Motion) -> Motion:
         rotations, signs = motion.root_rotations, np.array([1.0, -1.0, -1.0])
-        places = (_pelvis(motion) + motion.root_translations) * np.array([-1.0, 1.0, 1.0])
+        translations = (_pelvis(motion) + motion.root_translations) * np.array([-1.0, 1.0, 1.0])
         return replace(
             _mirror_motion(motion),
             root_rotations=rotations * signs,
-            root_translations=places - _pelvis(motion),
+            root_translations=translations - _pelvis(motion),
         )
 
     _change_poses(folder, change)
@@ -244,7 +252,7 @@ def _mirror_motion(motion: Motion) -> Motion:
 
 
 def root_about_origin(folder: Path) -> None:
-    """EasyMocap's convention: x -> R x + Th."""
+    """Translations in EasyMocap's convention: x -> R x + Th."""
     convert_to_camera_space(folder)
 
     def change(motion: Motion) -> Motion:
@@ -256,9 +264,9 @@ def root_about_origin(folder: Path) -> None:
 
 
 def scale_translations(factor: float) -> Corruption:
-    """Places that a tracker reckoned for a body of another size."""
+    """Translations computed for a body of another size."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         convert_to_camera_space(folder)
 
         def change(m: Motion) -> Motion:
@@ -267,27 +275,27 @@ def scale_translations(factor: float) -> Corruption:
 
         _change_poses(folder, change)
 
-    return spoil
+    return corrupt
 
 
 def change_units(factor: float) -> Corruption:
-    """Places in millimetres (1000) or centimetres (100)."""
+    """Translations in millimetres (1000) or centimetres (100)."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         convert_to_camera_space(folder)
         _change_poses(folder, lambda m: replace(m, root_translations=m.root_translations * factor))
 
-    return spoil
+    return corrupt
 
 
 def use_z_up_poses_without_pelvis(folder: Path) -> None:
-    """As `use_z_up_poses`, converted without the pelvis's offset: translations are rotated by themselves."""
+    """Poses in a world with z up, converted without the pelvis's offset."""
     turn = Rotation.from_euler("x", 90, degrees=True)
 
     def change(m: Motion) -> Motion:
         roots = turn * Rotation.from_rotvec(m.root_rotations)
-        places = turn.apply(m.root_translations)
-        return replace(m, root_rotations=roots.as_rotvec(), root_translations=places)
+        translations = turn.apply(m.root_translations)
+        return replace(m, root_rotations=roots.as_rotvec(), root_translations=translations)
 
     _change_poses(folder, change)
 
@@ -295,14 +303,14 @@ def use_z_up_poses_without_pelvis(folder: Path) -> None:
 def keep_last_poses(frames: int) -> Corruption:
     """The last frames' poses only, with no frame numbers and no times."""
 
-    def spoil(folder: Path) -> None:
+    def corrupt(folder: Path) -> None:
         def change(m: Motion) -> Motion:
             last = m.select_rows(np.arange(len(m) - frames, len(m)))
             return replace(last, frames=None, times_s=None)
 
         _change_poses(folder, change)
 
-    return spoil
+    return corrupt
 
 
 def add_second_person(folder: Path) -> None:
@@ -320,56 +328,61 @@ def rewrite_video(folder: Path, change: Callable[[list[np.ndarray]], list[np.nda
     """Rewrite the video's images losslessly; masks and poses stay."""
     path = folder / "video.mp4"
     reader = cv2.VideoCapture(str(path))
-    fps, pictures = reader.get(cv2.CAP_PROP_FPS), []
+    fps, images = reader.get(cv2.CAP_PROP_FPS), []
     while (read := reader.read())[0]:
-        pictures.append(read[1])
+        images.append(read[1])
     reader.release()
     path.unlink()
-    pictures = change(pictures)
+    images = change(images)
     code = cv2.VideoWriter.fourcc(*"FFV1")
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, pictures[0].shape[1::-1])
-    for picture in pictures:
-        writer.write(np.ascontiguousarray(picture))
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, images[0].shape[1::-1])
+    for image in images:
+        writer.write(np.ascontiguousarray(image))
     writer.release()
 
 
 def rotate_video(quarter_turns: int) -> Corruption:
-    """The film alone rotated counter-clockwise; its pictures must be square."""
+    """The video alone rotated counter-clockwise; its images must be square."""
     return lambda folder: rewrite_video(
-        folder, lambda film: [np.rot90(p, quarter_turns) for p in film]
+        folder, lambda images: [np.rot90(p, quarter_turns) for p in images]
     )
 
 
 def mirror_video(folder: Path) -> None:
-    rewrite_video(folder, lambda pictures: [picture[:, ::-1] for picture in pictures])
+    """The video alone mirrored."""
+    rewrite_video(folder, lambda images: [image[:, ::-1] for image in images])
 
 
 def crop_video(left: float, top: float, size: float) -> Corruption:
-    """A part of the film alone, scaled up to the old size; a size above 1 adds black borders."""
+    """The video alone cropped and scaled to its old size; a size above 1 adds black borders."""
 
-    def crop(picture: np.ndarray) -> np.ndarray:
-        height, width = picture.shape[:2]
+    def crop(image: np.ndarray) -> np.ndarray:
+        height, width = image.shape[:2]
         affine = np.array([[1.0, 0.0, -left * width], [0.0, 1.0, -top * height]]) / size
-        return np.asarray(cv2.warpAffine(picture, affine, (width, height)))
+        return np.asarray(cv2.warpAffine(image, affine, (width, height)))
 
-    return lambda folder: rewrite_video(folder, lambda pictures: [crop(p) for p in pictures])
+    return lambda folder: rewrite_video(folder, lambda images: [crop(p) for p in images])
 
 
 def trim_video(frames: int) -> Corruption:
-    """The film's beginning is cut off; masks and poses are still those of all frames."""
-    return lambda folder: rewrite_video(folder, lambda pictures: pictures[frames:])
+    """The video without its first frames; masks and poses are those of all frames."""
+    return lambda folder: rewrite_video(folder, lambda images: images[frames:])
 
 
 def delay_video(frames: int) -> Corruption:
-    """The film's first picture stands still at first, and the end is cut off."""
-    return lambda folder: rewrite_video(folder, lambda film: [film[0]] * frames + film[:-frames])
+    """The video with its first frame repeated and its end cut off."""
+    return lambda folder: rewrite_video(
+        folder, lambda images: [images[0]] * frames + images[:-frames]
+    )
 
 
 def reverse_video(folder: Path) -> None:
-    rewrite_video(folder, lambda pictures: pictures[::-1])
+    """The video alone backwards."""
+    rewrite_video(folder, lambda images: images[::-1])
 
 
 def invert_masks(folder: Path) -> None:
+    """Masks that are 0 where the person is."""
     for path in sorted((folder / "masks").iterdir()):
         mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert mask is not None
