@@ -225,7 +225,7 @@ def _accept(
 
 
 def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
-    """Describe how the poses' body differs from the avatar's; empty if it hardly does."""
+    """Describe how the poses' body differs from the avatar's; empty if they are alike."""
     theirs, ours = body_height_m(shaped), body_height_m(person)
     off = (shaped.joints - shaped.joints[0]) - (person.joints - person.joints[0])
     apart = float(np.linalg.norm(off, axis=1).max())

@@ -57,9 +57,9 @@ class VideoTransform:
         """The video's frame of a frame number in masks and poses."""
         return self.first_frame - number if self.backwards else number - self.first_frame
 
-    def reorient(self, picture: np.ndarray) -> np.ndarray:
+    def reorient(self, image: np.ndarray) -> np.ndarray:
         """Rotate and mirror one of the video's images, or a map of that size."""
-        turned = np.rot90(picture, self.quarter_turns)
+        turned = np.rot90(image, self.quarter_turns)
         return np.ascontiguousarray(turned[:, ::-1] if self.mirrored else turned)
 
     def warp_to_mask(

@@ -35,6 +35,7 @@ from preprocess.body.silhouette import (
     splat_silhouette,
 )
 from preprocess.cameras.camera_file import CameraTrack
+from preprocess.masks.graph_cut import cut_foreground
 from preprocess.observe import associate_cameras
 
 IMAGE_PERSON_PX = 130
@@ -278,20 +279,6 @@ def grabcut_near_outline(
     inwards = min(band_m, MAX_INNER_BAND * float(-away.min()))
     labels = np.where(away < 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[away >= band_m], labels[away <= -inwards] = cv2.GC_BGD, cv2.GC_FGD
-    rows, columns = np.nonzero(away < band_m)
-    if not len(rows):
-        return None
     margin = int(BACKGROUND_BORDER_M * outline.px_per_m) + 1
-    box = (
-        slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
-        slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
-    )
-    part = np.ascontiguousarray(labels[box])
-    if not (part & 1).any() or (part & 1).all():
-        return None
-    cv2.setRNGSeed(0)
-    models, bgr = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(rgb[box][..., ::-1])
-    cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    person = np.zeros(away.shape, dtype=bool)
-    person[box] = (part & 1) > 0
-    return person if person.any() else None
+    person = cut_foreground(rgb, labels, away < band_m, margin, GRABCUT_ITERATIONS)
+    return person if person is not None and person.any() else None

@@ -229,10 +229,10 @@ def _sample_mask_files(
 def _sample_alpha_channels(
     source: FrameSource, frames: Sequence[int], size_px: tuple[int, int]
 ) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
-    found, pictures = [], list_images(source.path)  # only images have alpha channels
+    found, paths = [], list_images(source.path)  # only images have alpha channels
     for index in frames:
         try:
-            rgb, alpha = read_image(pictures[index])
+            rgb, alpha = read_image(paths[index])
             if rgb.shape[1::-1] == source.size_px:
                 frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
                 found.append((index, alpha_channel_mask(frame, size_px)))

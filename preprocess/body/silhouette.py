@@ -144,10 +144,10 @@ class MeshSilhouette:
             camera: Camera of the image; if a vertex is too near or behind it, nothing is drawn.
         """
         width, height = camera.size_px
-        picture = np.zeros((height, width), dtype=np.uint8)
+        image = np.zeros((height, width), dtype=np.uint8)
         depth = vertices @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
         if depth.min() < NEAR_PLANE_M:
-            return picture
+            return image
         pixels = (camera.project(vertices) - 0.5) * (1 << SUBPIXEL_BITS)
         corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
         for faces, used in self._limbs:
@@ -157,7 +157,7 @@ class MeshSilhouette:
             points = corners[used]
             low = np.clip((points.min(axis=0) >> SUBPIXEL_BITS) - 1, 0, (width, height))
             high = np.clip((points.max(axis=0) >> SUBPIXEL_BITS) + 3, 0, (width, height))
-            part = picture[low[1] : high[1], low[0] : high[0]]
+            part = image[low[1] : high[1], low[0] : high[0]]
             triangles -= low << SUBPIXEL_BITS
             for side in (towards, ~towards):
                 filled = np.zeros(part.shape, dtype=np.uint8)
@@ -165,7 +165,7 @@ class MeshSilhouette:
                 if polygons and part.size:
                     cv2.fillPoly(filled, polygons, 1, cv2.LINE_8, SUBPIXEL_BITS)
                 part |= filled
-        closed = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         return np.asarray(closed, dtype=np.uint8)
 
 

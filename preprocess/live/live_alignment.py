@@ -140,7 +140,7 @@ class LiveAlignment:
             betas=np.zeros(10),
             body_model=self._model,
         )
-        claim = CaptureGeometry(
+        geometry = CaptureGeometry(
             motion=motion,
             row_frames=np.arange(count, dtype=np.float64),
             intrinsics=camera.intrinsic[None],
@@ -149,16 +149,16 @@ class LiveAlignment:
             distortion=camera.distortion,
         )
         if not self.uses_masks:
-            pictures = [
+            images = [
                 ImageSample(index=index, camera_row=0, rgb=seen.thumbnail)
                 for index, seen in enumerate(self._seen)
             ]
-            return place_body_on_images(claim, self._skin, pictures)
-        witnesses = tuple(
+            return place_body_on_images(geometry, self._skin, images)
+        samples = tuple(
             MaskSample(index=index, camera_row=0, alpha=seen.thumbnail.astype(np.float32))
             for index, seen in enumerate(self._seen)
         )
-        return place_body_on_masks(claim, SilhouetteObjective(samples=witnesses, skin=self._skin))
+        return place_body_on_masks(geometry, SilhouetteObjective(samples=samples, skin=self._skin))
 
     def _place(self, pose: BodyPose, camera: Camera, placement: BodyPlacement) -> BodyPose:
         rest = self._skin.shaped.joints[0]

@@ -105,7 +105,7 @@ class LiveInputs:
             fit: What fits the poses to another body than their tracker's, if that is needed.
 
         Raises:
-            InputError: If there are many cameras: nobody knows yet whose they are.
+            InputError: If there are several cameras: their frames are not known yet.
         """
         if cameras.is_moving:
             raise InputError(

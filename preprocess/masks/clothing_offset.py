@@ -208,8 +208,8 @@ class ClothingOffset:
         over = OFFSET_LAYERS_M - clothed.offset_m[rim, None]
         should = over * clothed.px_per_m
         # Elsewhere another limb is nearer, or this one is seen in front of or behind the point.
-        told = (np.abs(away - should) < 0.35 * np.abs(should) + 1.0) & (mask >= 0.0)
-        inside = np.minimum.accumulate(np.where(told, mask, 1.0) > 0.5, axis=1).sum(axis=1)
+        is_valid = (np.abs(away - should) < 0.35 * np.abs(should) + 1.0) & (mask >= 0.0)
+        inside = np.minimum.accumulate(np.where(is_valid, mask, 1.0) > 0.5, axis=1).sum(axis=1)
         rows = np.arange(len(rim))
         border = over[rows, np.clip(inside - 1, 0, count - 1)]
         weight = np.ones(len(rim))
@@ -221,8 +221,8 @@ class ClothingOffset:
         before = colors[rows, np.clip(inside - 2, 0, count - 1)]
         behind = colors[rows, np.clip(inside + 1, 0, count - 1)]
         weight *= np.clip(np.abs(before - behind).max(axis=1) / CLEAR_CONTRAST, 0.0, 1.0) ** 2
-        self._votes[rim, :count] += np.where(told, mask, 0.0) * weight[:, None]
-        self._votes[rim, count:] += told * weight[:, None]
+        self._votes[rim, :count] += np.where(is_valid, mask, 0.0) * weight[:, None]
+        self._votes[rim, count:] += is_valid * weight[:, None]
 
     def _overshoot_m(
         self,

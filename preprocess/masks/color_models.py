@@ -283,8 +283,8 @@ class AppearanceModel:
         seen = self._seen[rim]
         known = np.minimum(seen / KNOWN_VIEW_WEIGHT, 1.0)
         mean = self._sums[rim] / np.maximum(seen, 1e-9)[:, None]
-        told = [*(known * mean.T), known, np.ones(len(known))]
-        planes = [np.bincount(pixels, each, minlength=count) for each in told]
+        sums = [*(known * mean.T), known, np.ones(len(known))]
+        planes = [np.bincount(pixels, each, minlength=count) for each in sums]
         return np.stack(planes, axis=-1).astype(np.float32)
 
 
@@ -293,8 +293,8 @@ def _interpolate_colors(
 ) -> tuple[Float32[np.ndarray, "rows columns 3"], Float32[np.ndarray, "rows columns"]]:
     """Blurred color and spread of splatted vertex colors."""
     splatted = cv2.GaussianBlur(splatted, (0, 0), COLOR_BLUR_PX)
-    told = np.maximum(splatted[..., 4], np.float32(MIN_COLOR_WEIGHT))
-    mean = splatted[..., :4] / told[..., None]
+    weight = np.maximum(splatted[..., 4], np.float32(MIN_COLOR_WEIGHT))
+    mean = splatted[..., :4] / weight[..., None]
     variance = np.maximum(mean[..., 3] - (mean[..., :3] ** 2).mean(axis=-1), np.float32(0.0))
     share = splatted[..., 4] / np.maximum(splatted[..., 5], np.float32(MIN_COLOR_WEIGHT))
     spread = np.sqrt(variance + np.float32(MIN_COLOR_SPREAD**2))

@@ -34,8 +34,7 @@ def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
         InputError: If it cannot be opened.
     """
     source = VideoFile(path, FrameSelection())
-    film = _MaskVideo(path)
-    return source.frames_in_file, film.read
+    return source.frames_in_file, _MaskVideo(path).read
 
 
 class _MaskVideo:
@@ -62,10 +61,10 @@ class _MaskVideo:
             if not self._capture.grab():
                 raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
             self._at += 1
-        ok, picture = self._capture.retrieve()
+        ok, image = self._capture.retrieve()
         if not ok:
             raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
-        gray = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
         self._last = np.clip(
             (gray - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
         )

@@ -33,6 +33,7 @@ from preprocess.masks.clothing_offset import (
     solid_hair,
 )
 from preprocess.masks.color_models import AppearanceModel, BackgroundModel, VertexVisibility
+from preprocess.masks.graph_cut import cut_foreground
 from preprocess.masks.matting import border_distance_px, refine_border, soften_border
 
 WORKING_PERSON_PX = 220
@@ -235,7 +236,7 @@ class GrabCutSegmenter:
     def _expected_shape(self, pose: BodyPose, camera: Camera) -> tuple[ClothedBody, _ExpectedShape]:
         around = self._clothing.clothe(pose, camera)
         if around is None:
-            raise InputError("the posed body is not in the picture")
+            raise InputError("the posed body is not in the image")
         fine = self._clothing.draw(around, camera)
         covered = cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA)
         hair = head_region(around.skin[self._head], camera, around.px_per_m)
@@ -246,7 +247,7 @@ class GrabCutSegmenter:
             hair_region=hair,
         )
         if (shape.signed_distance_px < 0.0).sum() < 16:
-            raise InputError("the posed body is not in the picture")
+            raise InputError("the posed body is not in the image")
         return around, shape
 
     def _segment(
@@ -272,19 +273,9 @@ class GrabCutSegmenter:
         )
         rounds = FEWER_ITERATIONS if settled else ITERATIONS
         margin = int(BACKGROUND_MARGIN_M * clothed.px_per_m) + 1
-        rows, columns = np.nonzero(near)
-        box = (
-            slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
-            slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
-        )
-        part = np.ascontiguousarray(labels[box])
-        models = np.zeros((1, 65)), np.zeros((1, 65))
-        if (part & 1).any() and not (part & 1).all():
-            cv2.setRNGSeed(0)
-            bgr = np.ascontiguousarray(rgb[box][..., ::-1])
-            cv2.grabCut(bgr, part, (0, 0, 1, 1), *models, rounds, cv2.GC_INIT_WITH_MASK)
-        person = np.zeros(away.shape, dtype=bool)
-        person[box] = (part & 1) > 0
+        person = cut_foreground(rgb, labels, near, margin, rounds)
+        if person is None:
+            person = (labels & 1) > 0
         person = (person & ~like) | unlike
         return _Segmentation(
             foreground=person,

@@ -303,29 +303,29 @@ def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
     if path.suffix.lower() == ".npy":
         return _to_alpha(np.asarray(_load_npy(path)), path)
     try:
-        with Image.open(path) as picture:
-            picture.load()
-            ImageOps.exif_transpose(picture, in_place=True)
-            channel = _mask_channel(picture)
+        with Image.open(path) as image:
+            image.load()
+            ImageOps.exif_transpose(image, in_place=True)
+            channel = _mask_channel(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
         raise InputError(f"{path} is not a mask that can be decoded ({cause}).") from cause
     return _to_alpha(channel, path)
 
 
-def _mask_channel(picture: Image.Image) -> Shaped[np.ndarray, "height width"]:
+def _mask_channel(image: Image.Image) -> Shaped[np.ndarray, "height width"]:
     """The channel that holds the mask: object numbers, the alpha channel, or brightness."""
-    if picture.mode == "P":
-        colors = np.array(picture.getpalette()).reshape(-1, 3)
+    if image.mode == "P":
+        colors = np.array(image.getpalette()).reshape(-1, 3)
         if (colors != colors[:, :1]).any():  # a colored palette: the index is an object number
-            return np.asarray(picture) > 0
-        picture = picture.convert("L")
-    if picture.mode in ("LA", "RGBA"):
-        alpha = np.asarray(picture)[..., -1]
+            return np.asarray(image) > 0
+        image = image.convert("L")
+    if image.mode in ("LA", "RGBA"):
+        alpha = np.asarray(image)[..., -1]
         if has_cutout_alpha(alpha):
             return alpha
-    if picture.mode in ("LA", "RGBA", "RGB", "CMYK", "YCbCr"):
-        picture = picture.convert("L")
-    return np.asarray(picture)
+    if image.mode in ("LA", "RGBA", "RGB", "CMYK", "YCbCr"):
+        image = image.convert("L")
+    return np.asarray(image)
 
 
 def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:

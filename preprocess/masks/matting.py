@@ -58,13 +58,13 @@ def _soften_crop(
     inside, touched = cv2.erode(hard, square), cv2.dilate(hard, square)
     border = (touched > 0) & (inside == 0)
     smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
-    picture = rgb.astype(np.float32)
-    front, has_front = _local_mean_color(picture, inside)
-    back, has_back = _local_mean_color(picture, 1 - touched)
+    image = rgb.astype(np.float32)
+    front, has_front = _local_mean_color(image, inside)
+    back, has_back = _local_mean_color(image, 1 - touched)
     apart = front - back
     squared = (apart**2).sum(axis=-1)
-    share = ((picture - back) * apart).sum(axis=-1) / np.maximum(squared, np.float32(1.0))
-    beside = np.abs(picture - back - share[..., None] * apart).max(axis=-1)
+    share = ((image - back) * apart).sum(axis=-1) / np.maximum(squared, np.float32(1.0))
+    beside = np.abs(image - back - share[..., None] * apart).max(axis=-1)
     low, high = COLOR_CONTRAST[0] ** 2, COLOR_CONTRAST[1] ** 2
     trust = MAX_COLOR_WEIGHT * np.clip((squared - low) / (high - low), 0.0, 1.0)
     trust *= np.clip(1.5 - beside / MIXTURE_RESIDUAL, 0.0, 1.0) * (has_front & has_back)
@@ -73,12 +73,12 @@ def _soften_crop(
 
 
 def _local_mean_color(
-    picture: Float32[np.ndarray, "height width 3"], selected: UInt8[np.ndarray, "height width"]
+    image: Float32[np.ndarray, "height width 3"], selected: UInt8[np.ndarray, "height width"]
 ) -> tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
     """Mean color of the selected pixels around each pixel, and whether there are any."""
     chosen = selected.astype(np.float32)
     weight = cv2.GaussianBlur(chosen, (0, 0), LOCAL_COLOR_PX)
-    total = cv2.GaussianBlur(picture * chosen[..., None], (0, 0), LOCAL_COLOR_PX)
+    total = cv2.GaussianBlur(image * chosen[..., None], (0, 0), LOCAL_COLOR_PX)
     return total / np.maximum(weight, np.float32(1e-6))[..., None], weight > 1e-4
 
 

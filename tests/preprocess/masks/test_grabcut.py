@@ -389,7 +389,7 @@ def test_large_images_are_segmented_small_and_upsampled(shaped, camera, film):
 def test_a_person_who_is_not_there_gives_no_mask(shaped, camera, film):
     frame, pose, _ = film(0.0)
     aside = replace(pose, root_translation=pose.root_translation + np.array([9.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match="not in the picture"):
+    with pytest.raises(InputError, match="not in the image"):
         GrabCutSegmenter(shaped)(frame, aside, camera)
 
 
