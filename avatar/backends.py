@@ -151,7 +151,8 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
         canonical_rotations=np.zeros((23, 3)),
         box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
         skin_distance=np.abs(off_axis - 0.05).astype(np.float32), inside_skin=off_axis < 0.05,
-        seeds=seeds.astype(np.float32), seed_weights=np.eye(24, dtype=np.float32)[[0] * TEST_POINTS],
+        seeds=seeds.astype(np.float32),
+        seed_weights=np.eye(24, dtype=np.float32)[[0] * TEST_POINTS],
         seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
     )  # fmt: skip
     bones = np.tile(np.eye(4)[:3], (24, 1, 1))
@@ -187,7 +188,8 @@ def _march_to_seeds(
         canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
     )
     grid = DensityGrid(
-        torch.ones(rig.skin_distance.shape, dtype=torch.uint8), torch.ones(rig.skin_distance.shape), low,
+        torch.ones(rig.skin_distance.shape, dtype=torch.uint8),
+        torch.ones(rig.skin_distance.shape), low,
         torch.from_numpy(shape / extent),
     )  # fmt: skip
     rays = RayBatch(

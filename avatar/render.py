@@ -7,6 +7,7 @@ density ends a ray, never a cached one: cached densities lie in front of the sur
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,7 +24,6 @@ from avatar.kernels.backend_protocol import (
     MarchSettings,
     RayBatch,
 )
-from avatar.training.training_frame import BodyFrameRays
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
@@ -39,6 +39,33 @@ MIN_TRANSMITTANCE = 5e-6
 """Transmittance at which a ray ends; it bounds the error of a pixel."""
 EMPTY_LOG_DENSITY = -30.0
 """Log density (log 1/m) of a sample that counts as empty."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyFrameRays:
+    """Rays of one camera in the body frame of one pose.
+
+    Attributes:
+        origin: Common origin, metres.
+        directions: Unit directions.
+    """
+
+    origin: Float32[np.ndarray, "3"]
+    directions: Float32[np.ndarray, "rays 3"]
+
+    @classmethod
+    def through(
+        cls,
+        pixels: Float[np.ndarray, "rays 2"],
+        camera: Camera,
+        world_from_body: Float[np.ndarray, "4 4"],
+    ) -> "BodyFrameRays":
+        """Rays through image points, px, with the camera moved into the body frame."""
+        rotation, translation = world_from_body[:3, :3], world_from_body[:3, 3]
+        return cls(
+            origin=((camera.center_world - translation) @ rotation).astype(np.float32),
+            directions=(camera.ray_directions(pixels) @ rotation).astype(np.float32),
+        )
 
 
 @torch.no_grad()

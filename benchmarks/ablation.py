@@ -113,7 +113,7 @@ class Ablation:
     json: Path | None = None
     """File for the figures."""
     write: Path | None = None
-    """Markdown file whose tables are written anew; what stands outside its marks is kept."""
+    """Markdown file whose tables are replaced; text outside its marks is kept."""
     keep: Path | None = None
     """Folder for what is filmed; what lies there is used again."""
 
@@ -144,7 +144,7 @@ def main() -> None:
 
 
 def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:
-    """Everything, table after table; each row is told on standard error as it comes."""
+    """Measures all tables, and prints each row on standard error when it is ready."""
     began, device = time.process_time(), torch.device(job.device)
     scene = load_data(film_sample(folder / f"sample{job.size}", job.size), device)
     runs = train_on_scene(

@@ -157,7 +157,7 @@ class AblationPage:
 
 
 def written(page: AblationPage, path: Path) -> str:
-    """The file's text with its tables written anew; what is said around them stays."""
+    """The file's text with its tables replaced and the text around them kept."""
     before, after = "# The paper's ablations, repeated\n\n", "\n"
     if path.exists():
         text = path.read_text()

@@ -2,7 +2,7 @@
 
 Fast-SNARF's own way, compiled for the CPU: Broyden's method for every sample.
 
-Nine starts a sample, one for each of InstantAvatar's bones; each ends as soon as it is within
+Nine starts per sample, one for each of InstantAvatar's bones; each ends as soon as it is within
 1e-4 m, after twelve iterations, or when it has left the body (the solver that builds warp cells).
 """
 
@@ -33,7 +33,7 @@ from benchmarks.stopwatch import time_interleaved
 
 POINTS = 65_536
 ONE_SAMPLE_STEP_M = 1e3
-"""A step that leaves the body's box at once: each ray is asked at its origin alone."""
+"""Step that leaves the body's box at once, metres: each ray is sampled at its origin only."""
 WRONG_ROOT_M = 0.01
 """A point warped farther off than this was warped with another root."""
 

@@ -76,7 +76,7 @@ class DenseSampler(NamedTuple):
 
 
 def dense_in_box(cells: CorrespondenceTables, inside: Float32[Tensor, "3"]) -> DenseSampler:
-    """Between the walls of each frame's box; without a root a sample is asked at one point."""
+    """Between the walls of each frame's box; a sample without a root is queried at one point."""
     slots, row, _ = cells.roots.shape
     stand_in = torch.zeros(slots, 1, 12, device=cells.roots.device)
     stand_in[:, 0, :3] = inside

@@ -1,4 +1,4 @@
-"""Variants of the recipe, trained in turns in one process, so that all meet the same machine."""
+"""Trains variants of the configuration in turns in one process, on the same machine state."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -12,9 +12,9 @@ from avatar.config import TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
-from avatar.training.training_step import cosine_decay
 from avatar.training.warmup import warm_up
 from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 from benchmarks.sample_training import training_config
@@ -37,7 +37,7 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingBudget:
-    """How long each trains: so many seconds of one core, or so many steps."""
+    """Budget of each variant: seconds of one core, or a number of steps."""
 
     seconds: float = 0.0
     steps: int = 0

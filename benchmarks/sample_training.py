@@ -11,9 +11,9 @@ from avatar.config import TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.training.frame_stream import prepare_stream
+from avatar.training.optimizer import cosine_decay
 from avatar.training.train import Trainer
 from avatar.training.training_frame import TrainingFrame
-from avatar.training.training_step import cosine_decay
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
 from studio.shoot import ShootConfig, film_capture
@@ -72,7 +72,7 @@ def load_trainer(
 
 
 def train_for_core_seconds(trainer: Trainer, seconds: float) -> None:
-    """Trains for so much CPU time, with the rate falling over all of it."""
+    """Trains for a CPU time, seconds, over all of which the learning rate falls."""
     began = time.process_time()
     while (share := (time.process_time() - began) / seconds) < 1.0:
         trainer.step(rate=cosine_decay(share), hard_surface_share=min(1.0, 4.0 * share))

@@ -87,7 +87,7 @@ def _step_marks(
             name="one step vs the paper's algorithm in plain torch, times",
             value=ms["paper"] / ms["ours"], required="100", stretch_goal="400",
             context=f"same rays: {ms['paper']:,.0f} ms; {kept:.1f} of 128 samples/ray survive the "
-            f"union grid, the field is asked at {roots:.1f} roots/ray",
+            f"union grid, the field is queried at {roots:.1f} roots/ray",
         ),
     ]  # fmt: skip
 

@@ -13,9 +13,9 @@ from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.field.avatar_model import Avatar
 from avatar.training.frame_stream import is_held_out, prepare_stream
+from avatar.training.optimizer import cosine_decay
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
-from avatar.training.training_step import cosine_decay
 from avatar.training.warmup import warm_up
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement
@@ -126,7 +126,7 @@ def measure_streaming_quality(capture: Path) -> Iterator[Measurement]:
 
 
 def train_for_wall_seconds(trainer: Trainer, seconds: float) -> None:
-    """Trains for so much time, with the rate falling over all of it."""
+    """Trains for a wall time, seconds, over all of which the learning rate falls."""
     began = time.perf_counter()
     while (share := (time.perf_counter() - began) / seconds) < 1.0:
         trainer.step(rate=cosine_decay(share), hard_surface_share=min(1.0, 4.0 * share))

@@ -1,4 +1,4 @@
-"""How good an avatar is after so much time, on the studio's sample."""
+"""Quality of an avatar over training time, on the studio's sample."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence

@@ -14,8 +14,8 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.kernels.hash_levels import HashLevels
 from avatar.training.frame_stream import prepare_stream
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
-from avatar.training.training_step import cosine_decay
 from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.body.body_pose import BodyPose
@@ -58,7 +58,7 @@ def bent_pose() -> np.ndarray:
 
 
 def lowered_arms(angle: float) -> np.ndarray:
-    """Joint rotations with both arms lowered by so many radians from the T-pose."""
+    """Joint rotations with both arms lowered from the T-pose by `angle` radians."""
     rotations = np.zeros((23, 3))
     rotations[15, 2], rotations[16, 2] = -angle, angle
     return rotations
@@ -68,7 +68,7 @@ def lowered_arms(angle: float) -> np.ndarray:
 def observed(shaped) -> Callable[..., Observation]:
     """The body before a level camera of 200 px; what the picture shows plays no part.
 
-    Turned by so many radians about its axis, at 0 it faces the camera, which stands `distance_m`
+    At `turned` = 0 radians the body faces the camera, which stands `distance_m`
     away and `up_m` above the pelvis. The mask is white unless it is given.
     """
 
@@ -134,7 +134,7 @@ class Learnt:
         trainer: After its last step.
         held: Frames that it has never seen.
         novel: A pose that was never filmed.
-        marks: Scores of the held-out frames and the novel pose, every so many steps.
+        marks: Scores of the held-out frames and the novel pose, every `MARK_EVERY` steps.
     """
 
     trainer: Trainer

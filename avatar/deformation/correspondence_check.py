@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CLOTHING_BAND_M, CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.deformation.rig import CLOTHING_BAND_M, Rig
 from avatar.kernels.backend_protocol import RayBatch, RaySamples
 from avatar.numba_kernels.numba_correspondence import SEARCH_MARGIN_M, blended_transform_volume
 from avatar.numba_kernels.numba_culling import find_off_ray_points, find_unreliable_roots

@@ -19,15 +19,13 @@ from jaxtyping import Float, Float32, Int32
 from scipy.ndimage import distance_transform_cdt
 
 from avatar.backends import backend_for
-from avatar.deformation.rig import Rig
+from avatar.deformation.rig import CLOTHING_BAND_M, Rig
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.numba_kernels.numba_culling import cull_cells as cull_cells_numba
 from capture.camera import Camera
 
 CORRESPONDENCE_CELL_M = 0.03
 """Edge of a cell, metres."""
-CLOTHING_BAND_M = 0.08
-"""Distance from the skin within which clothes and hair lie, metres."""
 CPU = torch.device("cpu")
 
 

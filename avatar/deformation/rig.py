@@ -17,10 +17,15 @@ from preprocess.body.parametric_body import ShapedBody
 PART_OF_JOINT = np.array(
     [0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13]
 )
-"""Which of 14 body parts each joint moves: root finding starts once in every near part."""
+"""Body part, of 14, that each joint moves; root finding starts once in every near part."""
 SEED_SPACING_M = 0.02
+"""Edge of the voxels that hold one seed each, metres."""
 SKINNING_CELL_M = 0.023
+"""Spacing of the nodes of the skinning volume, metres."""
+CLOTHING_BAND_M = 0.08
+"""Distance from the skin within which clothes and hair lie, metres."""
 DISTANCE_CELL_M = 0.015
+"""Cell size of the skin distance and the occupancy, metres."""
 
 
 def canonical_rotations() -> Float[np.ndarray, "23 3"]:
@@ -34,36 +39,36 @@ def canonical_rotations() -> Float[np.ndarray, "23 3"]:
 
 
 class SparseSkinningNodes(NamedTuple):
-    """Nodes of the weight volume, and the joints that move them.
+    """Nodes of the skinning volume with their nonzero weights, packed node by node.
 
     Attributes:
-        nodes: Their flat numbers.
-        first: Where each node's joints begin, and the end.
-        joints: Node after node.
-        shares: Weights of these joints, in (0, 1].
+        node_indices: Flat indices of the nodes.
+        offsets: Index of each node's first joint, and the number of all joints.
+        joints: Joints that move the nodes.
+        weights: Weights of these joints, in (0, 1].
     """
 
-    node_indices: Int64[np.ndarray, "node_indices"]
-    offsets: Int64[np.ndarray, "node_indices+1"]
+    node_indices: Int64[np.ndarray, "nodes"]
+    offsets: Int64[np.ndarray, "nodes+1"]
     joints: Int32[np.ndarray, "moving"]
     weights: Float32[np.ndarray, "moving"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rig:
-    """One person's articulation between the canonical and the body frame. It never changes.
+    """Articulation of one person between the canonical and the body frame; immutable.
 
     Attributes:
-        rest_joints: Rest joints, metres.
+        rest_joints: Joints in the rest pose, metres.
         parents: Parent of each joint, -1 for the root.
-        canonical_rotations: Axis-angle of joints 1 … 23 in the canonical pose.
+        canonical_rotations: Axis-angle rotations of joints 1 to 23 in the canonical pose.
         box_low, box_high: Corners of the canonical box, metres.
-        weights: Skinning weights on nodes `low + (i, j, k) / (count - 1) * (high - low)`.
-        distance: Distance from each occupancy cell's centre to the body's skin, metres.
-        inside: Whether that centre lies under the skin.
-        seeds: Canonical points of the skin, one per 2-cm voxel and body part: where root finding
-            starts.
-        seed_weights: Their skinning weights.
+        weights: Skinning weights at nodes `low + (i, j, k) / (count - 1) * (high - low)`.
+        skin_distance: Distance from each occupancy cell's center to the body's skin, metres.
+        inside_skin: Whether that center lies under the skin.
+        seeds: Canonical points of the skin at which root finding starts, metres; one per voxel of
+            `SEED_SPACING_M` and body part.
+        seed_weights: Skinning weights of the seeds.
         seed_parts: The body part of each seed.
     """
 
@@ -84,8 +89,8 @@ class Rig:
         """The rig of a shaped body.
 
         Args:
-            shaped: The body; its pose blend shapes play no part (as in the paper's code).
-            margin_m: How far the box reaches beyond the canonical skin. Clothes must fit into it.
+            shaped: Shaped body; its pose blend shapes are ignored, as in the paper's code.
+            margin_m: Margin of the box about the canonical skin, metres; clothes must fit into it.
         """
         rotations, body = canonical_rotations(), shaped.body
         transforms = body_from_rest(shaped.joints, body.parents, rotations)

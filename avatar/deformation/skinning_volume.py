@@ -1,4 +1,4 @@
-"""Skinning weights and body distance as volumes around the canonical body."""
+"""Volumes of skinning weights and skin distance around the canonical body."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -6,18 +6,19 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 BLENDED_VERTICES = 10
-"""Vertices blended at each node; 1 would be the paper's variant (nearest vertex)."""
+"""Vertices whose weights are blended at each node; 1 is the paper's variant."""
 MIN_VERTEX_DISTANCE_M = 2e-3
-"""Distances below this count as this, so that a node on a vertex does not take it alone."""
+"""Smallest vertex distance in the blend, metres, so that one vertex cannot dominate a node."""
 SMOOTHED_BEYOND_M = 0.03
-"""Nodes farther from the skin than this are smoothed; nearer ones, where clothes hang, are not."""
+"""Distance from the skin beyond which weights are smoothed, metres; clothes hang nearer."""
 SMOOTHING_PASSES = 2
+"""Passes of the smoothing filter."""
 
 
 def volume_shape(
     low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell_m: float
 ) -> tuple[int, int, int]:
-    """How many cells of about `cell_m` metres a box needs along each axis."""
+    """Number of cells of about `cell_m` metres that a box needs along each axis."""
     x, y, z = np.ceil((high - low) / cell_m).astype(int)
     return int(x), int(y), int(z)
 
@@ -35,7 +36,7 @@ def skinning_weight_volume(
     Fast-SNARF (Chen et al. 2022) reads weights from voxels; InstantAvatar takes those of the
     nearest vertex. Blending the 10 nearest by inverse squared distance, smoothed far off, keeps
     the warp invertible near creases. More of either pulls clothes off the body that they move
-    with: 30 neighbours and smoothing everywhere cost 0.65 dB in poses never filmed.
+    with: 30 neighbors and smoothing everywhere cost 0.65 dB in poses never filmed.
 
     Args:
         vertices: Canonical vertices, metres.

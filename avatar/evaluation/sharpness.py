@@ -8,9 +8,9 @@ rendering would be (PSNR where alpha > 0.5, on white), and the rendering is give
 copy that scores as it does: its **equivalent blur**, the standard deviation σ as a share of the
 person's height in the picture. A shift of the person counts as blur, too.
 
-The verdict on an image, or on several (`overall_verdict`), comes from the equivalent blur and from the
-**overlap** of the rendered alpha with the mask (`avatar.evaluation.image_metrics.soft_iou`: 1 where
-they agree, low for fog and for a body that does not cover its mask):
+The verdict on an image, or on several (`overall_verdict`), comes from the equivalent blur and from
+the **overlap** of the rendered alpha with the mask (`image_metrics.soft_iou`: 1 where they agree,
+low for fog and for a body that does not cover its mask):
 
 | verdict | equivalent blur at most | on a person of 1.75 m | what is seen |
 |---|---|---|---|
@@ -22,10 +22,10 @@ they agree, low for fog and for a body that does not cover its mask):
 Where the bounds come from: the sample's actor (96 px, poses exact) has 0.74 % at 37 dB and 1.2 %
 at 27 dB after 45 steps; with poses 6° and 4 cm off, 4 and 8 % with overlaps of 0.68 and 0.59 in two
 frames, at 19 dB. The real person of eight photographs has 1.2 and 1.6 % at 22.8 dB in the given
-poses. Fog has an overlap of 0.38 (26 steps, 13 dB) to 0.47 (24 steps, 18 dB). A run that reconstructed
-the room instead of the person (masks that cover everything) has 0.15 to 0.27 at 7.8 dB, beyond the
-widest blur. 14 cm is thicker than an arm or a leg: what is blurred by more shows no person any
-longer.
+poses. Fog has an overlap of 0.38 (26 steps, 13 dB) to 0.47 (24 steps, 18 dB). A run that
+reconstructed the room instead of the person (masks that cover everything) has 0.15 to 0.27 at
+7.8 dB, beyond the widest blur. 14 cm is thicker than an arm or a leg: an image that is blurred by
+more shows no person any longer.
 """
 
 from collections.abc import Iterable

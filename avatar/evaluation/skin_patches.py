@@ -25,7 +25,7 @@ ADJACENT_M = 0.045
 """Patches whose centres are this close, and that look the same way, touch."""
 OCCLUSION_TOLERANCE_M = 0.01
 MAX_SOLE_NORMAL_Y = -0.5
-"""Upward component of a foot's normal below which it is a sole, which no one is asked to show."""
+"""Upward component of a foot's normal below which it is a sole and left out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

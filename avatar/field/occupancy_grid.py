@@ -16,8 +16,7 @@ from scipy.ndimage import label
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CLOTHING_BAND_M
-from avatar.deformation.rig import Rig
+from avatar.deformation.rig import CLOTHING_BAND_M, Rig
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 
@@ -58,7 +57,7 @@ class OccupancyGrid:
             low=torch.from_numpy(rig.box_low).to(device),
             cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
         )
-        self.band_cells: Int64[Tensor, cells] = band.flatten().nonzero()[:, 0]
+        self.band_cells: Int64[Tensor, "band"] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
         self._interior_cells = torch.from_numpy(
             rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)

@@ -35,17 +35,17 @@ def solve_correspondences(
     band_m: float,
     cell_m: float,
 ) -> tuple[Float[Tensor, "3"], Int32[Tensor, "gx gy gz"], Float[Tensor, "rows 12"]]:
-    """The warp of one frame, as `avatar.deformation.correspondence_grid.WarpCells` holds it: its corner, index and roots.
+    """Corner, packed cells and roots of one pose's `CorrespondenceGrid`.
 
     A cell's roots are those that Broyden's method finds from the nearest seed of each of the four
     nearest body parts, if they are no farther from the canonical skin than the band.
 
     Args:
-        volume: What skinning is.
-        seeds, parts: Canonical points of the skin, and the body part of each.
-        distance, cells_per_m: Distance from the canonical skin in cells of the volume's box.
-        band_m: How far from the skin there may be anything.
-        cell_m: Edge of a cell.
+        volume: Skinning volume and bone transforms.
+        seeds, parts: Canonical points of the skin, metres, and the body part of each.
+        distance, cells_per_m: Distance from the canonical skin, metres, in cells of the box.
+        band_m: Distance from the skin that is covered, metres.
+        cell_m: Edge of a cell, metres.
     """
     posed = skin_points(seeds, *volume)
     low = posed.amin(dim=0) - band_m
@@ -199,7 +199,7 @@ def _limited_step(step: Float[Tensor, "roots 3"]) -> Float[Tensor, "roots 3"]:
 def _pack_cells(
     cell: Tensor, warp: Float[Tensor, "roots 30"], bent: Bool[Tensor, "roots"], cells: int
 ) -> tuple[Int32[Tensor, "cells"], Float[Tensor, "rows 12"]]:
-    """`CorrespondenceGrid.index`, flat, and `CorrespondenceGrid.roots` of roots that stand in the order of cells."""
+    """Flat `CorrespondenceGrid.packed_cells`, and `.roots`, of roots in the cells' order."""
     count = torch.bincount(cell, minlength=cells)
     bends = torch.zeros(cells, dtype=torch.bool, device=cell.device)
     bends[cell[bent]] = True

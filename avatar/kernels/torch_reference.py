@@ -74,7 +74,7 @@ def composite(
     counts: Int32[Tensor, "rays"],
     sample_step_m: float,
 ) -> Float[Tensor, "rays 4"]:
-    """Premultiplied colour Σ T_i α_i c_i and alpha 1 - Π (1 - α_i) (InstantAvatar, eq. 4)."""
+    """Premultiplied color Σ T_i α_i c_i and alpha 1 - Π (1 - α_i) (InstantAvatar, eq. 4)."""
     most = max(int(counts.max()) if len(counts) else 0, 1)
     order = torch.arange(most, device=raw.device)
     held = order < counts[:, None]
@@ -97,16 +97,16 @@ def loss_per_ray(
     alpha_weight: float,
     hard_weight: float,
 ) -> Float[Tensor, "rays"]:
-    """InstantAvatar's losses (§3.4): Huber on colour, L1 on alpha, hard surface.
+    """InstantAvatar's losses (§3.4): Huber on color, L1 on alpha, hard surface.
 
     Both pictures are composited over the same random background, which makes half-transparency
     costly. Huber (δ = 0.1) is divided by δ and summed over channels; L1 has a dead zone of 1e-3;
     hard surface is -log(exp(-α) + exp(α - 1)).
 
     Args:
-        rendered: Premultiplied colour and alpha.
+        rendered: Premultiplied color and alpha.
         target: The same of the video.
-        background: One colour a ray.
+        background: Background color of each ray.
         alpha_weight, hard_weight: Weights of the last two.
     """
     alpha, truth = rendered[:, 3:], target[:, 3:]
@@ -196,7 +196,7 @@ def march(
 
 
 def root_row(packed: Int32[Tensor, "*cells"], candidate: int) -> Int32[Tensor, "*cells"]:
-    """Row of a cell's candidate root; 0, which nobody uses, where the cell has no such root."""
+    """Row of a cell's candidate root; the unused row 0 where the cell has no such root."""
     row = (packed >> 3) + candidate * torch.where(packed & 4 > 0, 3, 1)
     return torch.where((packed & 3) > candidate, row, 0).int()
 
@@ -208,9 +208,9 @@ def canonical_points(
     bent: Bool[Tensor, "*points"],
     offset: Float32[Tensor, "*points 3"],
 ) -> Float32[Tensor, "*points 3"]:
-    """The canonical points of what lies `offset` from the centres of cells.
+    """Canonical points at an offset from the centers of cells.
 
-    x* + A d, and Σ c_ij d_i d_j where the warp is bent (`avatar.deformation.correspondence_grid.WarpCells.roots`).
+    x* + A d, plus Σ c_ij d_i d_j in bent cells (`CorrespondenceGrid.roots`).
     """
     root = roots[slot, row.long()]
     straight = root[..., :3] + (root[..., 3:].unflatten(-1, (3, 3)) @ offset[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""The compiled CPU twins behind the common seam."""
+"""The backend of compiled kernels for the CPU."""
 
 import threading
 from typing import final
@@ -71,9 +71,9 @@ def _scratch_samples(
 
 @final
 class NumbaBackend:
-    """Numba kernels on torch's CPU memory.
+    """Calls numba kernels on torch's CPU memory.
 
-    Only the trainer's thread may call them; `solve_correspondences` alone, which is serial, any thread may.
+    Only the trainer's thread may call them, except for the serial `solve_correspondences`.
     """
 
     name = "numba"
@@ -118,8 +118,8 @@ class NumbaBackend:
         numba_rendering.march(
             *(part.numpy() for part in rays), np.float32(how.sample_step_m),
             *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
-            *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows, count.numpy(),
-            reached.numpy(),
+            *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows,
+            count.numpy(), reached.numpy(),
         )  # fmt: skip
         total = numba_rendering.prefix_sum(count.numpy(), first.numpy())
         points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)

@@ -97,7 +97,7 @@ def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_in
         x[0] += dx
         x[1] += dy
         x[2] += dz
-        if rests:  # the last step costs nothing: nobody asks where it led
+        if rests:  # the residual after the last step is not needed
             return True
         _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
         sx, sy, sz = transform_point(blend, x[0], x[1], x[2])

@@ -45,7 +45,7 @@ MAX_PREDICTED_OVERSHOOT_M = 0.015
 def solve_correspondences(
     rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
 ) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
-    """The corner, index and roots of one frame's `avatar.deformation.correspondence_grid.WarpCells`."""
+    """Corner, packed cells and roots of one pose's `CorrespondenceGrid`."""
     volume = blended_transform_volume(rig, bones, band_m + SEARCH_MARGIN_M)
     extent = rig.box_high - rig.box_low
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
@@ -57,7 +57,7 @@ def solve_correspondences(
     cells_per_m = np.array(rig.skin_distance.shape, dtype=np.float32) / extent
     capacity = index.size
     while True:
-        found = (  # memory that nobody writes to costs nothing
+        found = (  # untouched memory costs nothing
             np.empty(index.size, np.int32), np.empty(capacity, np.int32),
             np.empty((capacity, 3), np.int32), np.empty((capacity, 30), np.float32),
             np.empty(capacity, np.bool_),

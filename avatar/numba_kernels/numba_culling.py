@@ -1,7 +1,4 @@
-"""Which of a frame's warp cells lead to anything occupied, compiled for the CPU.
-
-Which samples of a frame's warp cells skinning carries elsewhere, compiled for the CPU.
-"""
+"""Culls correspondence cells and finds spurious correspondences, compiled for the CPU."""
 
 import numpy as np
 
@@ -9,14 +6,14 @@ from avatar.numba_kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compi
 from avatar.numba_kernels.numba_rendering import canonical_point
 from avatar.numba_kernels.numba_skinning import MATRIX_LANES, interpolate_at, transform_point
 
-F32, I32 = np.float32, np.int32
+F32, I32, U32 = np.float32, np.int32, np.uint32
 CELL_SCALE_MARGIN = 1.001
-"""A cell is taken to be this much larger than it is: a sample on its wall counts, too."""
+"""Factor by which a cell is enlarged, so that samples on its walls are inside."""
 
 
 @compile_kernel(inline="always")
 def _cell_span(root, across, low, per_m, cells):
-    """First and last canonical cell, on one axis, that a warp cell reaches."""
+    """First and last canonical cell, on one axis, that a cell's image reaches."""
     first = I32(np.floor((root - across - low) * per_m))
     last = I32(np.floor((root + across - low) * per_m))
     return max(first, I32(0)), min(last, I32(cells - 1))
@@ -24,7 +21,7 @@ def _cell_span(root, across, low, per_m, cells):
 
 @compile_kernel(inline="always")
 def _image_extent(roots, row, bent, half):
-    """How far from its root, at most, a cell's warp reaches along each canonical axis."""
+    """Bound of the extent of a cell's image about its root, along each canonical axis."""
     r = roots[row]
     x = half * (abs(r[3]) + abs(r[4]) + abs(r[5]))
     y = half * (abs(r[6]) + abs(r[7]) + abs(r[8]))
@@ -50,10 +47,10 @@ def _any_occupied(occupied, a0, a1, b0, b1, c0, c1):
 
 @compile_kernel(**FAST_MATH)
 def cull_cells(packed_cells, roots, cell_m, occupied, low, cells_per_m, culled_cells):
-    """The index without those cells of which no sample can lie in an occupied canonical cell.
+    """Empties the cells whose samples cannot lie in an occupied canonical cell.
 
-    A cell's warp is affine, or of second order where it is bent, so that a box about its image
-    holds every sample in it: none is lost.
+    A cell's warp is affine, or of second order in bent cells, so that a box bounds the image of all
+    its samples; none is lost.
     """
     half = F32(0.5 * CELL_SCALE_MARGIN) * cell_m
     nx, ny, nz = occupied.shape
@@ -72,9 +69,6 @@ def cull_cells(packed_cells, roots, cell_m, occupied, low, cells_per_m, culled_c
                 break
 
 
-F32, U32 = np.float32, np.uint32
-
-
 @compile_kernel(**NO_ALLOCATION)
 def find_unreliable_roots(
     packed_cells, roots, grid_low, cell_m, transforms, low, nodes_per_m, far_m, unreliable, room
@@ -82,11 +76,12 @@ def find_unreliable_roots(
     """Marks the roots whose warp is wrong at a corner of their cell.
 
     Args:
-        index, roots, grid_low, cell_m: As in `CorrespondenceGrid`; `roots` with one more axis before it.
-        transforms, low, nodes_per_m: Blended transforms as for `cpu_cells.flood`.
-        far_m: How far from its corner a canonical point may be carried.
-        doubtful: Of each row of the roots; written where true.
-        room: For `LANES` floats.
+        packed_cells, roots, grid_low, cell_m: As in `CorrespondenceGrid`, with a leading axis of
+            `roots`.
+        transforms, low, nodes_per_m: Blended transforms as for `flood_fill_roots`.
+        far_m: Largest distance between a corner and its skinned canonical point, metres.
+        unreliable: Flag of each root row; written where true.
+        room: Scratch for `MATRIX_LANES` floats.
     """
     half = F32(0.5) * cell_m
     for i in range(packed_cells.shape[0]):
@@ -117,7 +112,7 @@ def find_unreliable_roots(
 def find_off_ray_points(
     points, origins, directions, transforms, low, nodes_per_m, far_m, spurious, room
 ):
-    """Which canonical points are carried farther than so much from the ray that they are for."""
+    """Flags canonical points that skinning carries farther than `far_m` from their rays."""
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, room)

@@ -1,7 +1,4 @@
-"""Ray marching through warp cells and canonical occupancy, compiled for the CPU.
-
-Volume rendering of packed samples, its losses and their gradient, compiled for the CPU.
-"""
+"""Ray marching, volume rendering, its losses and their gradient, compiled for the CPU."""
 
 import numpy as np
 from numba import prange
@@ -16,7 +13,7 @@ from avatar.numba_kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compi
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
 UNLIMITED_STEPS = 10**9
-"""A grace of so many samples never ends: `MarchSettings.grace_steps` of exact rendering."""
+"""Opaque margin, in samples, from which a ray does not end at a surface (exact rendering)."""
 
 
 @compile_kernel(inline="always")
@@ -27,13 +24,13 @@ def nonzero(x):
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _cell_index(g, count):
-    """The cell along one axis of a place in cells that is inside, but for rounding."""
+    """Cell along one axis of a position, in cells, that is inside except for rounding."""
     return U32(min(max(I32(g), I32(0)), count - I32(1)))
 
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _second_order_term(roots, slot, row, x, y, z):
-    """What a bent warp adds at (x, y, z) from its cell's centre: Σ c_ij d_i d_j."""
+    """Second-order term Σ c_ij d_i d_j of a bent cell at (x, y, z) from its center."""
     a, b = row + U32(1), row + U32(2)
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     return (
@@ -66,11 +63,11 @@ def canonical_point(roots, slot, row, bent, x, y, z):
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density):
-    """Cached density of the canonical cell that holds a point; -1 where nothing may be.
+    """Cached density of the canonical cell of a point, 1/m; -1 in empty cells.
 
-    Where nobody asks for the density it is 0: the occupancy alone fits a core's cache.
+    Unless `needs_density`, 0 stands for it: the occupancy alone fits a core's cache.
     """
-    a = U32(I32(np.floor((x - low[0]) * cells_per_m[0])))  # below 0 it wraps round: too far
+    a = U32(I32(np.floor((x - low[0]) * cells_per_m[0])))  # negative indices wrap to large ones
     b = U32(I32(np.floor((y - low[1]) * cells_per_m[1])))
     c = U32(I32(np.floor((z - low[2]) * cells_per_m[2])))
     if a >= U32(occupied.shape[0]) or b >= U32(occupied.shape[1]) or c >= U32(occupied.shape[2]):
@@ -86,12 +83,12 @@ def march(
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
     occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
 ):  # fmt: skip
-    """Canonical sample points along rays of the body frame, and the root each was warped with.
+    """Canonical samples along body-frame rays, and the root row that each was warped with.
 
-    Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
-    has a root whose canonical cell is occupied; of several roots the one of highest cached density
-    counts. A ray ends `grace_steps` samples after its cached optical depth has passed
-    `OPAQUE_DEPTH`, or when `points` holds no more; `reached` is where it would go on.
+    Samples lie on the lattice `t = entry + (k + jitter) sample_step_m`. A sample is kept if its
+    cell has a root whose canonical cell is occupied; of several roots the one of highest cached
+    density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
+    `OPAQUE_DEPTH`, or when `points` is full; `next_steps` is the lattice step that continues it.
     """
     most = U32(points.shape[1])
     ends = opaque_margin_steps < UNLIMITED_STEPS
@@ -99,7 +96,7 @@ def march(
     for ray in prange(origins.shape[0]):
         slot = U32(slots[ray])
         nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
-        # the place on the ray is told in cells, t in metres; g + t d; ix = dt / dg
+        # positions on the ray are in cells, t is in metres: g = o + t d, and ix = dt / dg_x
         ox = (origins[ray, 0] - cell_low[slot, 0]) * cells_a_m
         oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
         oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
@@ -124,7 +121,7 @@ def march(
             if packed <= 0:
                 way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
                 way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
-                if packed < -1:  # so many cells more, whichever way the ray goes
+                if packed < -1:  # empty within -packed - 1 more cells in every direction
                     more = F32(-packed - 1)
                     way = min(way_x + more * abs(ix), way_y + more * abs(iy))
                     way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
@@ -182,7 +179,7 @@ def pack_samples(padded, padded_rows, first, counts, points, rows):
 
 @compile_kernel(nogil=True, fastmath=True)
 def scatter_max_density(points, log_density, low, cells_per_m, density):
-    """Raises the cached density of each sample's cell to the sample's own."""
+    """Raises the cached density of each sample's cell to the sample's own density."""
     nx, ny, nz = density.shape
     for i in range(points.shape[0]):
         a = I32((points[i, 0] - low[0]) * cells_per_m[0])
@@ -194,9 +191,6 @@ def scatter_max_density(points, log_density, low, cells_per_m, density):
                 density[a, b, c] = here
 
 
-F32 = np.float32
-
-
 @compile_kernel(inline="always")
 def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
@@ -204,7 +198,7 @@ def _sigmoid(x):
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def composite(raw, offsets, counts, sample_step_m, rendered):
-    """Premultiplied colour and alpha of each ray from its samples, front to back."""
+    """Premultiplied color and alpha of each ray from its samples, front to back."""
     for ray in prange(offsets.shape[0]):
         through = F32(1)
         red, green, blue = F32(0), F32(0), F32(0)
@@ -244,7 +238,7 @@ def composite_loss(
     A density's gradient needs the sum over the samples behind it, so a second pass runs from back
     to front. (Totals less the sum of what is in front would need no such order, but behind an
     opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
-    Meanwhile `grad_raw` holds each sample's colour and the light that passes it.
+    In between, `grad_raw` holds each sample's color and the transmittance behind it.
     """
     share = F32(1) / F32(offsets.shape[0])
     for ray in prange(offsets.shape[0]):

@@ -26,7 +26,7 @@ def interpolate_at(volume, low, nodes_per_m, x, y, z, channels, out):
     a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(volume.shape[0] - 1.001))
     b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(volume.shape[1] - 1.001))
     c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(volume.shape[2] - 1.001))
-    i, j, k = U32(a), U32(b), U32(c)  # unsigned: no index is asked whether it counts from the end
+    i, j, k = U32(a), U32(b), U32(c)  # unsigned: spares the check for negative indices
     i1, j1, k1 = i + U32(1), j + U32(1), k + U32(1)
     a, b, c = a - F32(i), b - F32(j), c - F32(k)
     u, v, w = F32(1) - a, F32(1) - b, F32(1) - c

@@ -9,7 +9,7 @@ frame, so the mean correction is removed continually.
 """
 
 import math
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import SkinningVolume
 from avatar.pose.gauss_newton import MIN_EVIDENCE, OVERRELAXATION, gauss_newton_step
 from avatar.pose.temporal_prior import TemporalPosePrior
-from avatar.training.replay_buffer import RootCorrection
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, rotation_matrices
 
@@ -57,6 +56,22 @@ FREEZE_AFTER_STEPS = 3000
 """Training steps on a frame after which its pose is frozen; by then the field has memorised it."""
 MAX_CORRECTION = 0.35
 """Largest correction of a parameter, radians or metres; a pose farther off cannot be recovered."""
+
+
+class RootCorrection(NamedTuple):
+    """Correction of a frame's root relative to the tracker's pose.
+
+    A point of the given body frame is at `pivot + rotationᵀ (x - pivot - shift)` in the corrected.
+
+    Attributes:
+        rotation: Rotation about the pivot.
+        shift: Shift in the given body frame, metres.
+        pivot: Pelvis in the rest pose, metres.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+    pivot: Float[np.ndarray, "3"]
 
 
 @final
@@ -239,7 +254,7 @@ class PoseOptimizer:
         return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
 
     def needs_resolve(self, slot: int) -> bool:
-        """Whether the slot's pose has moved too far from the one its correspondences were solved for.
+        """Whether the slot's pose is too far from the one its correspondences were solved for.
 
         The caller is expected to solve them when the answer is True.
         """
@@ -260,7 +275,7 @@ class PoseOptimizer:
         """Gradient of each accumulated ray's loss with respect to the slot's correction.
 
         By virtual work: a joint at c that rotates by ω moves every bone below it, so that
-        dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in the axes of the body frame. It is
+        dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is
         expressed in the axes of the joint, in which the corrections are.
         """
         wrench = self._wrenches[slot, : int(self._ray_counts[slot])].cpu().numpy()

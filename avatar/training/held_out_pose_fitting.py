@@ -12,10 +12,11 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction
+from avatar.training.optimizer import cosine_decay
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import Trainer, correct_one_pose, resolve_correspondences
 from avatar.training.training_frame import prepare_frame
-from avatar.training.training_step import OccupancySampler, compute_gradients, cosine_decay
+from avatar.training.training_step import OccupancySampler, compute_gradients
 
 CORRECTIONS_PER_FRAME = 32
 """Corrections that each frame's pose gets."""

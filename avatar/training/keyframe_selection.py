@@ -1,4 +1,4 @@
-"""How alike two frames are to who learns from them, and which frames of a video are needed."""
+"""Similarity of frames as training views, and the selection of keyframes from a video."""
 
 from typing import final
 
@@ -11,24 +11,24 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 
 JOINT_ANGLE_WEIGHT = 0.5
-"""How much a radian of a joint counts beside a radian of the view when frames are compared."""
+"""Weight of a radian of joint rotation relative to a radian of view direction."""
 MIN_KEYFRAME_DISTANCE = 0.05
-"""Frames nearer to each other than this, about 3° of view, show a person from the same side."""
+"""Descriptor distance below which two frames show the same view, about 3°."""
 INITIAL_KEYFRAMES = TrainConfig.replay_capacity
-"""So many frames are taken whatever they show, as many as stay for replay."""
+"""Number of frames that are accepted whatever they show: the default replay capacity."""
 MAX_KEYFRAME_INTERVAL_S = 0.5
-"""A person who stands still is looked at this often all the same."""
+"""Longest time between keyframes of a person who stands still, seconds."""
 
 
 def view_descriptor(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, " 72"]:
-    """What frames are compared by: the distance between two such vectors is like an angle.
+    """Descriptor of a view; the distance between two descriptors resembles an angle, radians.
 
     Args:
-        origin: Where the camera is in the body frame.
-        pose: Of the body.
+        origin: Camera center in the body frame, metres.
+        pose: Pose of the body.
 
     Returns:
-        The direction from which the body is seen, and its joints' rotations.
+        View direction and weighted joint rotations.
     """
     facing = origin / np.linalg.norm(origin)
     return np.concatenate([facing, pose.joint_rotations.ravel() * JOINT_ANGLE_WEIGHT])

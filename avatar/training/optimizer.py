@@ -1,13 +1,12 @@
-"""The running mean of what is learnt: it is what is shown, scored and packed.
+"""Adam without torch's compiler, the learning rate's decay, and the rendered mean.
 
-While the learning rate is high the parameters swing about what they have found, and their mean does
-not (Polyak and Juditsky 1992). On the sample it is worth 1.0 to 1.5 dB at any time before the rate
-falls, which is always while a video streams, and takes nothing away after.
-
-torch's fused Adam without torch's compiler: the same steps, and the first a second sooner.
+At a high learning rate the parameters oscillate about an optimum that their mean stays close to
+(Polyak and Juditsky 1992). On the sample the mean gains 1.0 to 1.5 dB at any time before the rate
+falls, which is the whole time while a video streams, and costs nothing afterwards.
 """
 
 import inspect
+import math
 from typing import final
 
 import torch
@@ -15,21 +14,26 @@ import torch
 from avatar.field.radiance_field import RadianceField
 
 EMA_HORIZON_STEPS = 250
-"""Steps over which the mean reaches back: the longer, the later it shows what is new."""
+"""Steps that the mean averages over; a longer horizon shows new content later."""
 MAX_HORIZON_SHARE = 1 / 5
-"""Share of all steps so far that it reaches back at most: the first ones were fog."""
+"""Largest horizon as a share of all steps so far, since the first steps were fog."""
 EMA_INTERVAL = 16
-"""Steps between updates."""
+"""Steps between updates of the mean."""
+
+
+def cosine_decay(progress: float) -> float:
+    """The learning rate's factor: 1 at progress 0, 0.05 at 1."""
+    return max(0.05, 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))
 
 
 @torch.no_grad()
 def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None:
-    """Moves an exponential mean on, if it is time.
+    """Updates the exponential mean of a field's parameters, every `EMA_INTERVAL` steps.
 
     Args:
-        mean: Changed in place.
-        field: As it is after so many steps.
-        steps: How many, 1 or more.
+        average: Mean, changed in place.
+        field: Field after `steps` steps.
+        steps: Number of steps, at least 1.
     """
     if steps % EMA_INTERVAL and steps > EMA_INTERVAL:
         return
@@ -42,8 +46,8 @@ def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None
 class UncompiledAdam(torch.optim.Adam):
     """`torch.optim.Adam` that does not load `torch._dynamo` (0.7 to 1 s) at its first use.
 
-    torch wraps these two methods so that its compiler leaves them alone, and loads the compiler to
-    say so. Nothing is compiled here, and the wrapped methods are used as they are.
+    torch wraps these two methods to exclude them from compilation, and loads the compiler to do so.
+    Nothing is compiled here, and the unwrapped methods are used.
     """
 
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)

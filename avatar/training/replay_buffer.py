@@ -1,8 +1,8 @@
-"""Replay: the key frames that stay, and the rays drawn from them.
+"""Replay buffer: the keyframes that are kept, and the rays sampled from them.
 
-Training on the newest frames alone loses 5-9 dB on the oldest. Half of the rays are drawn from
-all kept frames alike, half in proportion to each frame's running error; a new frame enters with
-the largest error.
+Training on the newest frames alone loses 5-9 dB on the oldest. Half of the rays are drawn uniformly
+from all kept frames, half in proportion to each frame's running error; a new frame starts with the
+largest error.
 """
 
 from typing import NamedTuple, final
@@ -14,39 +14,25 @@ from torch import Tensor
 
 from avatar.deformation.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
+from avatar.pose.pose_optimizer import RootCorrection
 from avatar.training.keyframe_selection import view_descriptor
 from avatar.training.training_frame import RayView, TrainingFrame
 from preprocess.body.body_pose import BodyPose
 
 NEAR_PERSON_RAY_SHARE = 0.9
-"""Of the rays, how many go through pixels near the person."""
+"""Share of the rays that pass through pixels near the person."""
 ERROR_EMA_DECAY = 0.9
-
-
-class RootCorrection(NamedTuple):
-    """How far a frame's body stands from where its given pose puts it.
-
-    A point of the given body frame is at `pivot + rotationᵀ (x - pivot - shift)` in the corrected.
-
-    Attributes:
-        rotation: About the pivot.
-        shift: Metres, in the given body frame.
-        pivot: The rest pelvis.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
-    pivot: Float[np.ndarray, "3"]
+"""Decay of each frame's running error."""
 
 
 class ReplayFrame(NamedTuple):
-    """What must be kept of a frame to learn from it again.
+    """The part of a frame that has to be saved to train on it again.
 
     Attributes:
-        index: Its number.
-        pose: As it was given.
-        sight: From where, and through which pixels, it was seen.
-        colors: Premultiplied RGBA of those pixels.
+        index: Index of the frame in its source.
+        pose: The tracker's pose.
+        view: Camera and pixels.
+        colors: Premultiplied RGBA of these pixels.
     """
 
     index: int
@@ -56,11 +42,11 @@ class ReplayFrame(NamedTuple):
 
 
 class TrainingBatch(NamedTuple):
-    """Rays and what the video shows along them.
+    """Rays and their ground truth.
 
     Attributes:
-        rays: In the body frames of their frames.
-        target: Premultiplied colour and alpha, in [0, 1].
+        rays: Rays in the body frames of their slots.
+        target: Premultiplied color and alpha, in [0, 1].
     """
 
     rays: RayBatch

@@ -1,7 +1,7 @@
-"""Frames beside a checkpoint: what a finished avatar still needs when another video is added.
+"""Frames saved beside a checkpoint, to train a finished avatar further with another video.
 
-Key frames are kept as replay has them: colours in 8 bits, and from where they were seen; rays and
-warps are found again. A few held-out frames come along, so that it can be said what they lost.
+Keyframes are saved as the replay buffer holds them, with 8-bit colors and their view; rays and
+correspondences are recomputed. A few held-out frames are saved to measure forgetting.
 """
 
 import pickle
@@ -26,13 +26,15 @@ from preprocess.observation import Observation
 
 REPLAY_FILE_FORMAT = 2
 """Version of the saved frames' layout; another version is refused."""
-LAST_RUN_FILE, EARLIER_VIDEOS_FILE = "frames.tensors", "earlier.tensors"
-"""Of the run that ended last; of the runs before the video that is being learnt now."""
+LAST_RUN_FILE = "frames.tensors"
+"""File of the frames of the last finished run."""
+EARLIER_VIDEOS_FILE = "earlier.tensors"
+"""File of the frames of all videos before the current one."""
 INDEX_SHIFT_PER_VIDEO = 1 << 32
-"""Among the frames of a trainer's memory, those of an earlier video have numbers so much smaller:
-no two share one. Whoever shows a number shows `number_in_video`."""
+"""Offset by which the indices of each earlier video's frames are lowered, which keeps them unique;
+`number_in_video` removes it for display."""
 MAX_HELD_OUT_KEPT = 12
-"""Held-out frames that are kept."""
+"""Held-out frames that are saved."""
 
 
 def number_in_video(index: int) -> int:
@@ -41,16 +43,16 @@ def number_in_video(index: int) -> int:
 
 
 def video_age(index: int) -> int:
-    """How many videos were added since a frame's own: 0 for the one that is learnt now."""
+    """Number of videos added since a frame's own; 0 for the current video."""
     return -(index // INDEX_SHIFT_PER_VIDEO)
 
 
 class SavedFrames(NamedTuple):
-    """What is kept.
+    """The frames that are saved.
 
     Attributes:
-        key_frames: To learn from.
-        held: To score; never trained on.
+        replay_frames: Frames to train on.
+        held_out: Frames to score, never trained on.
     """
 
     replay_frames: list[ReplayFrame]
@@ -58,11 +60,11 @@ class SavedFrames(NamedTuple):
 
     @classmethod
     def of(cls, replay: ReplayBuffer, held_out: Sequence[HeldOutFrame]) -> "SavedFrames":
-        """Everything in replay, and a few of the held-out frames, evenly."""
+        """All frames of the replay buffer, and a few of the held-out frames, evenly spaced."""
         return cls(replay.replay_frames(), subsample_evenly(list(held_out), MAX_HELD_OUT_KEPT))
 
     def as_earlier_video(self) -> "SavedFrames":
-        """The same with the numbers of an earlier video's frames."""
+        """The frames with their indices shifted to those of an earlier video."""
         held = [
             replace(
                 kept,

@@ -23,8 +23,8 @@ from avatar.events import (
     Warned,
 )
 from avatar.training.frame_stream import RedundantFrame, StreamItem
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
-from avatar.training.training_step import cosine_decay
 from capture.inbox import Inbox
 from preprocess.observe import DroppedFrame
 

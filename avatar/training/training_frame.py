@@ -1,4 +1,4 @@
-"""A frame made ready for training: its warp cells, and its pixels as rays of the body frame."""
+"""A frame prepared for training: its correspondence grid, and its pixels as body-frame rays."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
@@ -15,44 +15,17 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 
 NEAR_MASK_SHARE = 0.035
-"""Pixels this close to the mask, as a share of the picture's height, are trained on most."""
+"""Distance from the mask within which pixels are near the person, in image heights."""
 BOX_MARGIN_SHARE = 0.04
-"""How far beyond them, as a share of the picture's height, the rest of the pixels reach."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BodyFrameRays:
-    """Rays of one camera in the body frame of one pose.
-
-    Attributes:
-        origin: Where all of them start, metres.
-        directions: Unit vectors.
-    """
-
-    origin: Float32[np.ndarray, "3"]
-    directions: Float32[np.ndarray, "rays 3"]
-
-    @classmethod
-    def through(
-        cls,
-        pixels: Float[np.ndarray, "rays 2"],
-        camera: Camera,
-        world_from_body: Float[np.ndarray, "4 4"],
-    ) -> "BodyFrameRays":
-        """Rays through points of the picture; the root's motion is taken out of the camera."""
-        rotation, translation = world_from_body[:3, :3], world_from_body[:3, 3]
-        return cls(
-            origin=((camera.center_world - translation) @ rotation).astype(np.float32),
-            directions=(camera.ray_directions(pixels) @ rotation).astype(np.float32),
-        )
+"""Margin of the training pixels around the near ones, in image heights."""
 
 
 class RayView(NamedTuple):
-    """From where, and through which pixels, a frame is learnt from.
+    """Camera and pixels of a training frame.
 
     Attributes:
-        camera: Of the picture's size.
-        near: Which pixels are near the person, row by row, eight to a byte.
+        camera: Camera of the image.
+        near_person_bits: Mask of the pixels near the person, row by row, eight to a byte.
     """
 
     camera: Camera
@@ -61,18 +34,18 @@ class RayView(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingFrame:
-    """What replay keeps of an observation.
+    """An observation as the replay buffer takes it.
 
     Attributes:
-        index: The frame's index in its source.
-        pose: The body's pose.
-        cells: The frame's warp.
-        origin: Where its rays start, body frame, metres.
-        directions: Of its trainable pixels, those near the person first.
+        index: Index of the frame in its source.
+        pose: Pose of the body.
+        correspondences: Correspondence grid of the pose.
+        origin: Origin of the rays, body frame, metres.
+        directions: Unit directions of the training pixels, those near the person first.
         colors: Premultiplied RGBA of the same pixels.
-        near: How many of them are near the person.
-        sight: By which the frame can be made ready again from its colours alone; None where nobody
-            will ask for that.
+        near_count: Number of pixels near the person.
+        view: View from which the frame can be rebuilt with its colors alone; None if it need not
+            be saved.
     """
 
     index: int
@@ -86,7 +59,7 @@ class TrainingFrame:
 
 
 def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
-    """Solves the frame's warp and picks the pixels worth training on."""
+    """Solves the frame's correspondences and selects its training pixels."""
     mask = _near_person_mask(observation.alpha)
     chosen = np.concatenate(_split_pixels(mask))
     sight = RayView(camera=observation.camera, near_person_bits=np.packbits(mask))

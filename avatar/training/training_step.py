@@ -1,6 +1,5 @@
 """One training step: sample, query the field, composite, and propagate gradients by hand."""
 
-import math
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
@@ -198,8 +197,3 @@ def _accumulate_pose_gradients(
         samples, grad_points, slots, cells, poses.skinning, poses.bones
     )
     poses.accumulate(slots.long(), wrenches, loss)
-
-
-def cosine_decay(progress: float) -> float:
-    """The learning rate's factor: 1 at progress 0, 0.05 at 1."""
-    return max(0.05, 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))

@@ -9,9 +9,9 @@ from jaxtyping import UInt8
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
-from avatar.render import render
+from avatar.render import BodyFrameRays, render
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import BodyFrameRays, TrainingFrame
+from avatar.training.training_frame import TrainingFrame
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 

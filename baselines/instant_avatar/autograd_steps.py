@@ -38,10 +38,12 @@ class AutogradField:
     """A field's parameters, and its forward pass as autograd sees it."""
 
     def __init__(self, field: RadianceField) -> None:
+        """Copies the parameters of `field`."""
         self.levels: HashLevels = field.levels
         self.parameters = [p.detach().clone().requires_grad_() for p in field.parameters()]
 
     def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
+        """Raw outputs at canonical points."""
         table, first, first_bias, second, second_bias = self.parameters
         features = torch_reference.encode(points, table, self.levels)
         return torch.relu(features @ first + first_bias) @ second + second_bias

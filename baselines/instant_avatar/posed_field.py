@@ -28,7 +28,7 @@ from baselines.instant_avatar.broyden_kernels import (
 )
 
 ONE_SAMPLE_STEP_M = 1e3
-"""A step that leaves every box at once: a ray is asked at its origin alone."""
+"""Step that leaves every box at once, metres: a ray is sampled at its origin only."""
 
 
 class CanonicalPoints(NamedTuple):
@@ -104,9 +104,9 @@ class BroydenWarp:
         """A warp without poses.
 
         Args:
-            field: Who is asked.
-            rig: Whose body.
-            slots: How many poses it may hold.
+            field: Field that ranks the roots.
+            rig: Rig of the person.
+            slots: Number of poses that it holds.
             kept_in: Only roots in its occupied cells count; None for those in the rig's box.
         """
         device = field.table.device
@@ -138,7 +138,7 @@ class BroydenWarp:
         slots: Int32[Tensor, "samples"],
         cells: CorrespondenceTables,
     ) -> CanonicalPoints:
-        """The densest root of each sample; the field is asked only where there are several."""
+        """The densest root of each sample; the field is queried only where there are several."""
         roots, valid = find_all_roots(self._field.backend, points, slots, self.poses)
         valid &= self._is_accepted(roots)
         several = (valid.sum(dim=1) > 1).nonzero()[:, 0]

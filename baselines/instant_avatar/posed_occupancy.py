@@ -1,12 +1,9 @@
-"""What a sampler of the body frame may know of empty space, from nothing to the band of the cells.
+"""Occupancy in the body frame: none, that of the correspondence grid, and the paper's two grids.
 
-The paper's two grids are in `baselines.instant_avatar.posed_occupancy`.
-
-The paper's occupancy grids (§3.3): one for the whole sequence, and one for each pose.
-
-Both are 64³, in the body frame (the paper's root-normalised space), filled by one jittered probe
-per cell of the posed field, thresholded at an opacity of 0.01 per centimetre, and dilated by one
-cell. Decay, threshold and passes are those of the released code.
+The paper (§3.3) has one grid for the whole sequence and one for each pose. Both are 64³, in the
+body frame (the paper's root-normalised space), filled by one jittered probe per cell of the posed
+field, thresholded at an opacity of 0.01 per centimetre, and dilated by one cell. Decay, threshold
+and passes are those of the released code.
 """
 
 from typing import Protocol, final, runtime_checkable
@@ -94,7 +91,7 @@ class CorrespondenceBand:
         """Nothing to learn: the cells say it."""
 
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
-        """Nothing to renew: whoever owns the occupancy does."""
+        """Nothing to renew; the owner of the occupancy updates it."""
 
 
 GRID_CELLS = 64
@@ -207,7 +204,7 @@ class SequenceGrid:
             self._slots.append(slot)
 
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
-        """Probes a random frame, every so many steps."""
+        """Probes a random frame, at the grid's interval."""
         if steps % self._every == 0 and self._slots:
             drawn = torch.randint(
                 len(self._slots), (1,), generator=generator, device=generator.device
@@ -278,7 +275,7 @@ class PerFrameGrids:
         self.occupied[slot] = 1
 
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
-        """Renews one slot's grid, every so many steps."""
+        """Renews one slot's grid, every `FRAME_GRID_INTERVAL` steps."""
         if steps % FRAME_GRID_INTERVAL == 0 and self._turn:
             slot = self._turn.pop(0)
             self._turn.append(slot)

@@ -17,11 +17,11 @@ from avatar.render import (
     EMPTY_LOG_DENSITY,
     MAX_SAMPLES_PER_PASS,
     MIN_TRANSMITTANCE,
+    BodyFrameRays,
     correspondence_tables,
     pixel_chunks,
     ray_batch,
 )
-from avatar.training.training_frame import BodyFrameRays
 from baselines.instant_avatar.posed_field import PosedField
 from baselines.instant_avatar.posed_occupancy import (
     CorrespondenceBand,

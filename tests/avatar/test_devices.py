@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from fake_device import FAKE_DEVICE, DeviceMixUpError, FakeDeviceTensor, fake_device
 
 CONFIG = TrainConfig(
-    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10, empty_space_points=16,
-    replay_capacity=3, max_samples=64, occupancy_interval=4,
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 10,
+    empty_space_points=16, replay_capacity=3, max_samples=64, occupancy_interval=4,
 )  # fmt: skip
 
 

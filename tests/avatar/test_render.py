@@ -12,9 +12,8 @@ from avatar import render as render_module
 from avatar.config import TrainConfig
 from avatar.deformation.correspondence_check import CorrespondenceCheck
 from avatar.kernels.backend_protocol import MarchSettings, RayBatch
-from avatar.render import MIN_TRANSMITTANCE, correspondence_tables, render
+from avatar.render import MIN_TRANSMITTANCE, BodyFrameRays, correspondence_tables, render
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import BodyFrameRays
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
@@ -60,7 +59,7 @@ def decibels(a, b):
 
 
 def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
-    """Constant density σ and colour c: alpha = 1 - exp(-σ · step · samples), colour = c · alpha.
+    """Constant density σ and color c: alpha = 1 - exp(-σ · step · samples), color = c · alpha.
 
     Of samples that skinning carries to the ray: the others hold nothing.
     """
@@ -104,7 +103,7 @@ def test_pictures_are_premultiplied_and_within_range(picture):
     assert (picture[0] == 0.0).all()
 
 
-def test_nobody_is_to_be_seen_where_the_camera_does_not_look(rig, avatar, shot):
+def test_the_image_is_empty_where_the_camera_looks_past_the_person(rig, avatar, shot):
     pose, camera = shot
     turned_round = rigid([0.0, np.pi, 0.0], np.zeros(3)) @ camera.camera_from_world
     away = dataclasses.replace(camera, camera_from_world=turned_round)

@@ -17,8 +17,8 @@ CPU = torch.device("cpu")
 
 
 SMALL = TrainConfig(
-    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=64,
-    occupancy_interval=8, refine_poses=False, replay_capacity=4,
+    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4,
+    empty_space_points=64, occupancy_interval=8, refine_poses=False, replay_capacity=4,
 )  # fmt: skip
 SCHEMES = {
     "union": {"skipping": "union"},

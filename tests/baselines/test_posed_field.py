@@ -40,8 +40,8 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
     broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.density_grid)
     broyden.set_pose(0, bones_of(rig, seen.pose))
     tables = correspondence_tables(cells, CPU)
-    exact, ours = (warp(points, slots, tables)
-                   for warp in (broyden, CorrespondenceWarp(avatar.field, avatar.occupancy)))  # fmt: skip
+    cells_warp = CorrespondenceWarp(avatar.field, avatar.occupancy)
+    exact, ours = (warp(points, slots, tables) for warp in (broyden, cells_warp))
     both = exact.has_root & ours.has_root
     assert float(both.float().mean()) > 0.99
     places = [torch.zeros_like(points) for _ in range(2)]

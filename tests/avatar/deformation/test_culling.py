@@ -14,8 +14,7 @@ from avatar.field.avatar_model import Avatar
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RayBatch
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
-from avatar.render import EMPTY_LOG_DENSITY, correspondence_tables, render
-from avatar.training.training_frame import BodyFrameRays
+from avatar.render import EMPTY_LOG_DENSITY, BodyFrameRays, correspondence_tables, render
 from capture.camera import Camera
 
 CPU = torch.device("cpu")
@@ -147,15 +146,15 @@ def test_an_avatar_that_occupies_nothing_is_not_to_be_seen(avatar, shot):
     empty.__dict__.update(
         occupancy.__dict__, density_grid=occupancy.density_grid._replace(occupied=nothing)
     )
-    nobody = dataclasses.replace(avatar, occupancy=empty)
-    assert (render(nobody, pose, camera, cells=cells) == 0.0).all()
+    invisible = dataclasses.replace(avatar, occupancy=empty)
+    assert (render(invisible, pose, camera, cells=cells) == 0.0).all()
 
 
 # --- what is skipped --------------------------------------------------------------------------
 
 
 def scattered(avatar, share: float):
-    """The avatar's grid with so many cells occupied, anywhere."""
+    """The avatar's grid with `count` random cells occupied."""
     grid = avatar.occupancy.density_grid
     chance = torch.rand(grid.occupied.shape, generator=torch.Generator().manual_seed(2))
     return grid._replace(occupied=(chance < share).to(torch.uint8))

@@ -61,7 +61,7 @@ def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverag
         assert parts[name].sides["back"] == 0.0
     assert 0.3 < coverage.seen_share < 0.5
     _, normals = pose_patches(coverage.patches, shaped.with_pose(observed().pose).world_from_rest())
-    # nobody is seen more than 72° aslant, and the body spans 15° of the camera's view to each side
+    # no skin is seen at more than 72°, and the body spans 15° of the camera's view to each side
     assert not (coverage.cosines[normals[:, 2] < np.cos(np.radians(72 + 15))] > 0.0).any()
 
 
@@ -130,7 +130,7 @@ def test_what_the_mask_leaves_out_is_not_seen(observed, coverage):
     }
 
 
-def test_somebody_behind_the_camera_is_not_seen(observed, coverage):
+def test_a_person_behind_the_camera_is_not_seen(observed, coverage):
     coverage.add(observed(distance_m=-4.0))
     assert coverage.seen_share == 0.0
 

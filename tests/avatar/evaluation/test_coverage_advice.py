@@ -40,7 +40,7 @@ def coverage(shaped) -> Coverage:
     return Coverage(shaped)
 
 
-def test_before_the_first_frame_nobody_has_been_seen(coverage):
+def test_before_the_first_frame_no_person_has_been_seen(coverage):
     assert coverage_advice(coverage) == NOT_SEEN_YET
 
 

@@ -60,7 +60,7 @@ def test_a_stream_of_unknown_length_is_held_out_like_a_long_one(position):
 
 
 @given(st.integers(1, 500))
-def test_nothing_is_held_out_if_nobody_wants_it(total):
+def test_a_stride_of_zero_holds_nothing_out(total):
     assert held_of(total, every=0) == []
 
 
@@ -72,7 +72,8 @@ def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip)
     ]
     ready = list(prepare_stream(iter(items), rig, stride=3, total=None))
     assert [type(item) for item in ready] == [
-        TrainingFrame, TrainingFrame, HeldOutFrame, TrainingFrame, TrainingFrame, DroppedFrame, TrainingFrame
+        TrainingFrame, TrainingFrame, HeldOutFrame, TrainingFrame, TrainingFrame, DroppedFrame,
+        TrainingFrame,
     ]  # fmt: skip
     assert ready[5] is items[5]
     assert ready[2].observation is items[2]

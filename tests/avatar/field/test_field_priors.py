@@ -1,4 +1,4 @@
-"""What a field is asked to be where no ray tells: where following each prior alone ends."""
+"""Each prior of the field: its gradient, and where following it alone ends."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_variation_draws_a_pair_together_and_leaves_an_even_one_alone():
         field_priors.double_well_gradient,
     ],
 )
-def test_no_prior_asks_anything_of_colours_or_of_no_points(prior):
+def test_priors_of_density_leave_colors_alone_and_accept_no_points(prior):
     raw = torch.randn(10, 4, generator=torch.Generator().manual_seed(0))
     assert not prior(raw, 1.0)[:, :3].any()
     assert prior(raw[:0], 1.0).shape == (0, 4)
@@ -89,7 +89,7 @@ def test_a_steep_edge_becomes_as_gentle_as_is_asked_and_a_gentle_one_stays():
     assert not field_priors.density_slope_gradient(raw, points, 600.0, 0.01).any()
 
 
-def test_nobody_asks_how_steep_emptiness_is():
+def test_the_slope_of_empty_space_is_not_penalised():
     raw, points = along_a_line(-1.0, -20.0)
     assert not field_priors.density_slope_gradient(raw, points, 600.0, 1.0).any()
 
@@ -101,7 +101,7 @@ def test_needless_density_is_asked_to_fall():
     assert raw[:, 3].tolist() == pytest.approx([field_priors.MAX_USEFUL_LOG_DENSITY] * 2, abs=0.01)
 
 
-def test_colours_of_a_visible_pair_become_even_and_nobody_sees_others():
+def test_only_the_colors_of_visible_pairs_become_even():
     raw = torch.tensor([[1.0, 0.0, -1.0, 5.0], [-1.0, 0.0, 1.0, -9.0]])
     for _ in range(2000):
         raw -= field_priors.color_tv_gradient(raw, 0.01)

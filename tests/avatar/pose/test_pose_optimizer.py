@@ -26,8 +26,8 @@ from avatar.render import correspondence_tables
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.held_out_pose_fitting import score_with_fitted_poses
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
-from avatar.training.training_step import cosine_decay
 from preprocess.body.body_pose import BodyPose
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()

@@ -75,7 +75,7 @@ def test_a_slot_is_asked_of_by_its_neighbours_and_does_not_tell_of_itself(rng):
     assert neighbours.prior_for(20, errors) is UNINFORMATIVE_PRIOR
 
 
-def test_neighbours_say_nothing_where_errors_flicker_or_nobody_is_near(rng):
+def test_neighbors_are_ignored_where_errors_flicker_or_none_is_near(rng):
     flickering, wandering = (errors_of(rng, 40, alike=alike) for alike in (0.0, 0.95))
     assert not interpolate_correction(20, dict(enumerate(flickering))).any()
     assert not interpolate_correction(60, dict(enumerate(wandering))).any()

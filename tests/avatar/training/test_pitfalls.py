@@ -1,7 +1,7 @@
 """The traps that once cost decibels, and that each of them would still bite.
 
 Cached densities are the highest that a cell has shown: they rise before the surface. What ends a
-ray by them must let it go on for so many metres, not samples; no picture may end by them at all;
+ray by them must continue it by metres, not samples; no picture may end by them at all;
 and a cell must not forget a thin surface because one probe has missed it.
 """
 
@@ -31,9 +31,9 @@ from avatar.kernels.torch_reference import OPAQUE_DEPTH
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.render import render
 from avatar.training.frame_stream import prepare_stream
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
-from avatar.training.training_step import cosine_decay
 from baselines.instant_avatar.scheme_rendering import render_samples
 from capture.frame import Frame
 from preprocess.observation import Observation
@@ -77,7 +77,7 @@ def ground(density: float) -> DensityGrid:
 
 
 def descending(slope: float) -> RayBatch:
-    """A ray that sinks by so much for each metre that it goes forward."""
+    """A ray that sinks by `slope` metres per metre."""
     direction = torch.tensor([[1.0, 0.0, -slope]])
     return RayBatch(
         torch.tensor([[-0.5, 0.6, 8 * CANONICAL_M + slope * 0.9]]),
@@ -127,7 +127,7 @@ SHEET = 0.15
 
 
 def forgotten(rig, *, decay: float, updates: int) -> float:
-    """Share of a thin sheet's cells that are held for empty after so many probes of each."""
+    """Share of a thin sheet's cells that count as empty after repeated probes."""
     occupancy, generator = OccupancyGrid(rig, CPU), torch.Generator().manual_seed(0)
     grid = occupancy.density_grid
     layer = int((float(rig.rest_joints[6, 2]) + 0.05 - rig.box_low[2]) * grid.cells_per_m[2])
@@ -195,7 +195,7 @@ def filmed(size: int) -> Filmed:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Taught:
-    """An avatar after so many steps, and the held-out frames' PSNR at some marks on the way."""
+    """An avatar after training, and the held-out frames' PSNR during it, dB."""
 
     avatar: Avatar
     held: list[HeldOutFrame]
@@ -212,7 +212,7 @@ class Taught:
 
 
 def taught(clip: Filmed, steps: int, *, grace_steps: int | None = None, marks: int = 5) -> Taught:
-    """So many steps of the recipe for a clip; a grace in samples is the old rule."""
+    """Trains a clip for a number of steps, optionally with an opaque margin in samples."""
     config = TrainConfig.for_budget(30.0, footprint_m=clip.footprint_m)
     config = dataclasses.replace(config, refine_poses=False)
     if grace_steps is not None:

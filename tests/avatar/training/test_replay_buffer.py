@@ -37,7 +37,7 @@ def cut(frame, near, far):
 
 
 def posed(frame, index, *, knee):
-    """The same frame, said to be another one, with a knee bent by so many radians."""
+    """The frame under another index, with a knee bent by `knee` radians."""
     rotations = np.zeros((23, 3))
     rotations[3, 0] = knee
     pose = BodyPose(
@@ -59,7 +59,7 @@ def drawn_from(replay, generator, count=40_000):
     return torch.bincount(slots, minlength=len(replay)).numpy() / count
 
 
-def test_targets_are_the_videos_colours_along_exactly_those_rays(rig, clip, frames, generator):
+def test_targets_are_the_videos_colors_along_exactly_those_rays(rig, clip, frames, generator):
     """From the ray back through the root's motion and the camera to a pixel of the picture."""
     batch = store(frames).sample_rays(4000, generator)
     for slot, index in enumerate((0, 5, 11, 18)):
@@ -185,6 +185,6 @@ def test_distances_that_are_kept_are_those_that_would_be_found_anew(frames, rng)
         turned = dataclasses.replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
         replay.add(dataclasses.replace(frames[index % 4], index=index, pose=turned))
     likeness = replay._descriptors
-    anew = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
-    np.fill_diagonal(anew, np.inf)
-    np.testing.assert_allclose(replay._descriptor_distances, anew)
+    expected = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
+    np.fill_diagonal(expected, np.inf)
+    np.testing.assert_allclose(replay._descriptor_distances, expected)

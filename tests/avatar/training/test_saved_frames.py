@@ -34,7 +34,7 @@ def kept(frames, clip):
     return SavedFrames.of(replay, [HeldOutFrame(observation=o) for o in clip.observations[3:5]])
 
 
-def test_a_frame_is_made_ready_again_from_its_colours_alone(frames, rig):
+def test_a_frame_is_rebuilt_from_its_colors_alone(frames, rig):
     for frame in frames:
         again = rebuild_frame(frame.index, frame.pose, frame.view, frame.colors, rig)
         assert again.near_count == frame.near_count
@@ -45,7 +45,7 @@ def test_a_frame_is_made_ready_again_from_its_colours_alone(frames, rig):
         )
 
 
-def test_replay_gives_back_the_colours_that_it_was_given(frames):
+def test_replay_returns_the_colors_it_was_given(frames):
     replay = ReplayBuffer(3, CPU)
     for frame in frames:
         replay.add(frame)
@@ -96,7 +96,7 @@ def test_few_held_out_frames_are_kept_of_many(clip):
     assert kept.held_out[-1] is held[-1]
 
 
-def test_a_frame_that_nobody_can_make_ready_again_is_not_kept(frames):
+def test_a_frame_that_cannot_be_rebuilt_is_not_saved(frames):
     replay = ReplayBuffer(2, CPU)
     replay.add(dataclasses.replace(frames[0], view=None))
     assert replay.replay_frames() == []

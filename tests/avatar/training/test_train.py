@@ -24,8 +24,8 @@ from preprocess.observe import DroppedFrame
 
 CPU = torch.device("cpu")
 QUICK = TrainConfig(
-    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12, empty_space_points=32,
-    seconds=60.0,
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12,
+    empty_space_points=32, seconds=60.0,
 )  # fmt: skip
 
 

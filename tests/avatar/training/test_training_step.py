@@ -11,17 +11,20 @@ from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RaySamples
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame
-from avatar.training.training_step import OccupancySampler, compute_gradients, cosine_decay
+from avatar.training.training_step import OccupancySampler, compute_gradients
 
 FIRM_SHARE = 0.25
 """Far from 0 and 1, so that no term may be left out."""
 CONFIG = TrainConfig(
-    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4, empty_space_points=32,
-    empty_space_weight=0.3, hard_surface_weight=0.1, density_tv_weight=0.2, density_tv_pairs=16,
-    initial_density_tv_factor=3.0, double_well_weight=0.4, interior_weight=0.1, interior_points=24, max_samples=256,
-    density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40, inner_leg_weight=0.5, inner_leg_points=20,
+    rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4,
+    empty_space_points=32, empty_space_weight=0.3, hard_surface_weight=0.1, density_tv_weight=0.2,
+    density_tv_pairs=16, initial_density_tv_factor=3.0, double_well_weight=0.4,
+    interior_weight=0.1, interior_points=24, max_samples=256,
+    density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40,
+    inner_leg_weight=0.5, inner_leg_points=20,
 )  # fmt: skip
 
 
@@ -67,7 +70,7 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
 
 
 def of_close_pairs(raw, points):
-    """What is asked of pairs of close points: gentle edges, no needless density, even colours."""
+    """Loss of close pairs: gentle edges, no excess density, even colors."""
     (one, other), (here, there) = raw.chunk(2), points.to(raw.dtype).chunk(2)
     steep = (one[:, 3] - other[:, 3]).abs() - (here - there).norm(dim=1) * 4.0 / CONFIG.finest_m
     densest = torch.maximum(one[:, 3], other[:, 3])
