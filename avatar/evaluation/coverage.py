@@ -1,4 +1,4 @@
-"""Which of the skin the camera has seen, and how squarely: kept up to date frame by frame."""
+"""Coverage: which skin the camera has seen and at what angle, updated frame by frame."""
 
 import base64
 from dataclasses import dataclass
@@ -14,17 +14,19 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
 MIN_SEEN_COSINE = 0.3
-"""A patch that is turned further from the camera than this (72°) shows nothing of itself."""
+"""Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
-"""From this cosine on (53°) it was seen well."""
-DEPTH_CELL_M, DEPTH_TOLERANCE_M = 0.03, 0.03
-"""Of the depth buffer in which the body hides itself."""
+"""Cosine from which a patch is well seen (53°)."""
+DEPTH_CELL_M = 0.03
+"""Cell size of the depth buffer for self-occlusion, metres."""
+DEPTH_TOLERANCE_M = 0.03
+"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
 MIN_PERSON_ALPHA = 0.5
 """Alpha above which a pixel shows the person."""
 
 
 class VisibilityStage(IntEnum):
-    """How far towards being seen a patch has ever come."""
+    """Closest that a patch has ever come to being seen."""
 
     FACING_AWAY = 0
     """It never faced the camera."""
@@ -39,11 +41,11 @@ class VisibilityStage(IntEnum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PartCoverage:
-    """How much of a body part's surface was seen, all around and side by side.
+    """Seen share of a body part's surface, in total and by side.
 
     Attributes:
-        seen: Share of its surface, in [0, 1].
-        sides: The same by side, in the order of `SIDE_NAMES`; only sides that the part has.
+        seen_share: Seen share of the surface, in [0, 1].
+        sides: Seen share of each side that the part has, in the order of `SIDE_NAMES`.
     """
 
     seen_share: float
@@ -52,14 +54,14 @@ class PartCoverage:
 
 @final
 class Coverage:
-    """What has been seen of one person. Costs about a millisecond a frame.
+    """Coverage of one person's skin; costs about a millisecond per frame.
 
     Frames may be added on one thread while others read: nothing that was seen is ever unseen.
 
     Attributes:
-        patches: The person's skin.
-        cosines: How squarely each patch was seen at best, in [0, 1]; 0 if it never was.
-        stages: How far each has come (`Stage`).
+        patches: Patches of the person's skin.
+        cosines: Largest cosine at which each patch was seen, in [0, 1]; 0 if it never was.
+        stages: `VisibilityStage` of each patch.
     """
 
     cosines: Float32[np.ndarray, "patches"]

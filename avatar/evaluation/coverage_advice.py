@@ -69,13 +69,13 @@ class UnseenRegion:
     """A connected piece of skin that no frame shows.
 
     Attributes:
-        share: Of the whole skin, in [0, 1].
+        share: Share of the whole skin, in [0, 1].
         limb: "arm", "hand", "leg", "foot", "head" or "torso"; the last also stands for pieces
             that reach over several limbs.
-        whose: "left", "right", "both", or "" for head and torso.
+        laterality: "left", "right", "both", or "" for head and torso.
         side: Of the limb: "front", "back", "top", "left" or "right" of head and torso, "under" of
             arms, "inner side" or "outer side" of legs; "all around" if it has none.
-        stage: Why most of it was not seen.
+        stage: Stage at which most of it stopped being seen.
     """
 
     share: float

@@ -57,7 +57,7 @@ class OccupancyGrid:
             low=torch.from_numpy(rig.box_low).to(device),
             cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
         )
-        self.band_cells: Int64[Tensor, "band"] = band.flatten().nonzero()[:, 0]
+        self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
         self._interior_cells = torch.from_numpy(
             rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)

@@ -1,4 +1,4 @@
-"""The levels of the hash grid: how fine each is, and where its entries lie in the table."""
+"""Levels of the hash grid: their resolution and the layout of their entries in the table."""
 
 from dataclasses import dataclass, replace
 
@@ -20,8 +20,8 @@ class HashLevels:
     Attributes:
         low: Corner of the box, metres: vertex (0, 0, 0) of every level.
         cells_per_m: Resolution of each level, coarse to fine, 1/m.
-        counts: Vertices along each axis.
-        dense: 1 where entry (i, j, k) is `i + nx (j + ny k)`, 0 where it is hashed.
+        vertex_counts: Vertices along each axis.
+        is_dense: 1 where entry (i, j, k) is `i + nx (j + ny k)`, 0 where it is hashed.
         offsets: First entry of each level in the common table; the last is the table's length.
     """
 
@@ -45,9 +45,9 @@ class HashLevels:
         """Levels in geometric progression between two cell sizes.
 
         Args:
-            low, high: The box, metres.
+            low, high: Corners of the box, metres.
             coarsest_m, finest_m: Cell sizes of the first and last level, metres.
-            levels: How many.
+            levels: Number of levels.
             table_size: Entries of a hashed level, a power of two.
         """
         if table_size & (table_size - 1):

@@ -73,10 +73,10 @@ def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_in
         transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or `LANES`).
         low, nodes_per_m: Place and scale of those nodes.
         p: The posed point.
-        x: Where to start; the root.
-        blend: Room for `LANES` floats.
-        inverse: Inverse Jacobian to start with, row by row; what has been learnt of it.
-        cold: Whether nothing is known of it, so that the blended rotation's inverse is taken.
+        x: Initial point, replaced by the root.
+        blend: Scratch for `MATRIX_LANES` floats.
+        inverse: Initial inverse Jacobian, row by row, replaced by the updated one.
+        initialize_inverse: Whether to start from the blended rotation's inverse instead.
     """
     _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
     if initialize_inverse:

@@ -135,12 +135,12 @@ def _skin_point(weights, low, nodes_per_m, bones, x, y, z, share, blend):
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def update_roots(packed_cells, shape, grid_low, cell_m, roots, weights, low, nodes_per_m, bones):
-    """Moves a frame's roots after its pose: one chord step each, towards the cell's centre.
+    """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
 
     Args:
-        index: The frame's cells, flat.
-        shape, grid_low, cell_m: Their grid.
-        roots: Roots, updated in place; inverse Jacobians and bends, which stay.
+        packed_cells: Packed cells of the frame, flat.
+        shape, grid_low, cell_m: Shape, corner and cell size of their grid.
+        roots: Roots, updated in place; inverse Jacobians and second-order terms stay.
         weights, low, nodes_per_m: The skinning volume.
         bones: The new pose's matrices (24, 12).
     """

@@ -78,8 +78,8 @@ def neighbor_correlation(
     """How alike the errors of neighbouring frames are, in [-1, 1]; 0 if too few tell.
 
     Args:
-        frames: Their numbers, in any order.
-        alone: The correction that each one's rays alone ask for, or that was found, in any units.
+        frames: Indices of the frames, in any order.
+        unregularized: Correction of each frame by its rays alone, in any unit.
     """
     order = np.argsort(frames, kind="stable")
     apart = np.diff(frames[order])
@@ -100,10 +100,10 @@ def prior_from_neighbors(
     """What frames around a frame say of its correction: their mean, the nearest counting most.
 
     Args:
-        frame: Its number.
-        frames: The others'; its own tells nothing.
-        corrections: Of the others' poses.
-        alike: Correlation of neighbouring frames' errors.
+        frame: Index of the frame.
+        frames: Indices of its neighbors; its own is ignored.
+        corrections: Corrections of the neighbors.
+        error_correlation: Correlation of neighboring frames' errors.
     """
     share = min(
         max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0

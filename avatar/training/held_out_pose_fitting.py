@@ -1,4 +1,4 @@
-"""Poses fitted to held-out frames with the avatar frozen: how much of an error is the pose's."""
+"""Fits poses to held-out frames with the avatar frozen, to separate the poses' errors."""
 
 import dataclasses
 import math
@@ -19,12 +19,11 @@ from avatar.training.training_frame import prepare_frame
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
 CORRECTIONS_PER_FRAME = 32
-"""Corrections that each frame's pose gets."""
+"""Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 512
-
-
+"""Rays per correction of a pose."""
 FITTING_SHARE = 0.8
-"""Of the time that fitting and scoring take."""
+"""Share of fitting in the time that fitting and scoring take, for the progress."""
 
 
 def score_with_fitted_poses(
@@ -33,7 +32,7 @@ def score_with_fitted_poses(
     *,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[HeldOutScore, ...]:
-    """Scores of held-out frames after their poses have been fitted to them (see `fitted`)."""
+    """Scores of held-out frames in poses fitted to them (`fit_test_poses`)."""
     return tuple(found for _, found in fit_test_poses(trainer, frames, progress=progress))
 
 
@@ -45,15 +44,14 @@ def fit_test_poses(
 ) -> Iterator[tuple[HeldOutFrame, HeldOutScore]]:
     """Held-out frames in poses that have been fitted to them, each with its score.
 
-    The avatar stays as it is: nothing of these frames is learnt but where the body was, from where
-    the frames around were found to be. A few
-    hundred rays at a time say where to go, so an exact pose comes out a millimetre off; where the
-    given pose shows the frame better, it stays.
+    The avatar is frozen; only the poses are optimized, starting from the corrections of neighboring
+    frames. Each correction uses a few hundred rays, so an exact pose ends about a millimetre off;
+    the given pose is kept where it scores higher.
 
     Args:
-        trainer: Whose avatar; its field's gradients are overwritten.
-        held: Frames that were never trained on.
-        progress: Gets the share that is done, from 0 to 1.
+        trainer: Trainer of the avatar; the gradients of its field are overwritten.
+        frames: Frames that were never trained on.
+        progress: Receives the completed share, from 0 to 1.
     """
     if not frames:
         return

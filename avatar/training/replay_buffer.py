@@ -55,14 +55,14 @@ class TrainingBatch(NamedTuple):
 
 @final
 class ReplayBuffer:
-    """A bounded store of prepared frames, one slot each, kept for distinct views and poses.
+    """Bounded buffer of prepared frames with distinct views and poses, one slot each.
 
     Attributes:
-        indices: Which frame of the source each slot holds.
+        frame_indices: Index in its source of the frame that each slot holds.
     """
 
     def __init__(self, capacity: int, device: torch.device) -> None:
-        """An empty store for at most `capacity` frames."""
+        """Starts empty, for at most `capacity` frames."""
         self.capacity = capacity
         self.device = device
         self.frame_indices: list[int] = []
@@ -83,21 +83,21 @@ class ReplayBuffer:
         self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8, device=device)
 
     def __len__(self) -> int:
-        """How many frames are kept."""
+        """Number of frames that are held."""
         return len(self.frame_indices)
 
     @property
     def correspondences(self) -> CorrespondenceTables:
-        """The warp cells of all slots."""
+        """Correspondence grids of all slots."""
         return CorrespondenceTables(
             self._index, self._roots, self._low, self._shape, CORRESPONDENCE_CELL_M
         )
 
     def add(self, frame: TrainingFrame) -> int:
-        """Takes a frame in; when full, the more replaceable of the two most alike goes.
+        """Adds a frame; a full buffer drops the more redundant of its two most similar frames.
 
         Returns:
-            The slot that it took.
+            The slot of the frame.
         """
         if len(self) < self.capacity:
             slot = len(self)

@@ -1,4 +1,4 @@
-"""Compiling before the clock runs: a throw-away step on a throw-away frame."""
+"""Compiles the kernels before the clock starts, in a trainer that is thrown away."""
 
 import dataclasses
 import time
@@ -16,12 +16,13 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
 WARMUP_IMAGE_PX = 16
+"""Width and height of the warm-up's image, pixels."""
 
 
 def warm_up(trainer: Trainer) -> float:
     """Compiles, or loads from disk, every kernel that training and rendering use.
 
-    Must run on the thread that will train. The trainer itself is not touched.
+    Must run on the thread that will train. The trainer itself is not changed.
 
     Returns:
         How many seconds it took: tens on a machine's first run, about one later.

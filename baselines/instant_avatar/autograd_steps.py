@@ -95,9 +95,9 @@ class PaperStepInputs:
         volume: Blended transforms of the frame, as grid_sample wants them.
         low, high: Corners of the canonical box, metres.
         bones: From body to canonical frame, of the nine bones.
-        person: Corners of the box about the posed person, metres.
-        union: Where anybody is in any frame.
-        union_box: Its corners, body frame, metres.
+        person_box: Corners of the box about the posed person, metres.
+        union: Cells that are occupied in any frame.
+        union_box: Corners of the union grid, body frame, metres.
     """
 
     volume: Float32[Tensor, "1 12 z y x"]

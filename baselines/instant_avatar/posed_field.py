@@ -35,9 +35,9 @@ class CanonicalPoints(NamedTuple):
     """Canonical points of those posed samples that have one.
 
     Attributes:
-        points: Of the samples that are `found`, in their order.
-        rows: Root of its frame's cells that each was warped with; 0 where no cells were.
-        found: Which samples have a canonical point.
+        points: Canonical points of the samples that have one, in their order.
+        root_rows: Root row that each was warped with; 0 without a correspondence grid.
+        has_root: Which samples have a canonical point.
     """
 
     points: Float32[Tensor, "found 3"]
@@ -165,9 +165,9 @@ class PosedDensities(NamedTuple):
     """Density at points of a body frame.
 
     Attributes:
-        density: 1/m; 0 where a point has no canonical one.
-        canonical: The canonical points of those that have one, in their order.
-        found: Which have one.
+        density: Density, 1/m; 0 where a point has no canonical one.
+        canonical: Canonical points of the points that have one, in their order.
+        has_root: Which points have one.
     """
 
     density: Float32[Tensor, "points"]

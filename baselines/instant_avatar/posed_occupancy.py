@@ -167,10 +167,10 @@ class SequenceGrid:
         """A grid that knows nothing.
 
         Args:
-            rig: Whose body: the grid is a cube about its pelvis that no pose leaves.
-            field: What is probed.
-            every: Steps between updates.
-            device: Where it lives.
+            rig: Rig of the person; the grid is a cube about the pelvis that no pose leaves.
+            field: Field that is probed.
+            interval: Steps between updates.
+            device: Device of the grid.
         """
         reach = _reach(rig) + GRID_MARGIN_M
         pelvis = torch.from_numpy(rig.rest_joints[0]).float().to(device)
