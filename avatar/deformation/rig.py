@@ -1,4 +1,4 @@
-"""What moves the avatar: one person's joints, canonical pose, box and skinning volume."""
+"""Rig: joints, canonical pose, canonical box and skinning volume of one person."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -120,7 +120,7 @@ class Rig:
         )
 
     def skinning_nodes_within(self, reach_m: float) -> SparseSkinningNodes:
-        """What moves the weight volume's nodes about all that is nearer to the skin than this."""
+        """Sparse weights of the nodes about all cells within a distance of the skin, metres."""
         if reach_m not in self._nodes_by_reach:
             shape, cells = np.array(self.weights.shape[:3]), np.array(self.skin_distance.shape)
             nearest = [

@@ -82,7 +82,7 @@ def skin_distance_volume(
     cell_m: float,
     reach_m: float,
 ) -> tuple[Float32[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
-    """How far each cell's centre is from the skin, and whether it lies under it.
+    """Distance of each cell's center from the skin, metres, and whether it lies under it.
 
     Args:
         vertices: Canonical vertices, metres.

@@ -31,12 +31,13 @@ class VisibilityStage(IntEnum):
     FACING_AWAY = 0
     """It never faced the camera."""
     OUTSIDE_IMAGE = 1
-    """It did, outside the picture."""
+    """It did, outside the image."""
     SELF_OCCLUDED = 2
-    """It did, inside the picture, behind another part of the body."""
+    """It did, inside the image, behind another part of the body."""
     OUTSIDE_MASK = 3
-    """Nothing of the body was before it, but the mask says that no person is there."""
+    """No part of the body hid it, but it was outside the mask."""
     SEEN = 4
+    """It was seen."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,7 +69,7 @@ class Coverage:
     stages: UInt8[np.ndarray, "patches"]
 
     def __init__(self, shaped: ShapedBody) -> None:
-        """Nothing of this person has been seen yet."""
+        """Starts with every patch unseen."""
         self._shaped = shaped
         self.patches = SkinPatches.from_shaped_body(shaped)
         self.cosines = np.zeros(len(self.patches.points), dtype=np.float32)

@@ -12,19 +12,20 @@ from avatar.kernels.backend_protocol import Backend
 from avatar.kernels.hash_levels import FEATURES_PER_LEVEL, HashLevels
 
 HIDDEN_WIDTH = 64
+"""Width of the hidden layer."""
 INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 POINTS_PER_CHUNK = 1 << 13
-"""Points whose features and hidden numbers a cache still holds when they are read."""
+"""Points per chunk, whose features and hidden layer fit into a cache."""
 
 
 class Activations(NamedTuple):
-    """What the backward pass needs of the forward pass.
+    """Intermediate values of the forward pass, for the backward pass.
 
     Attributes:
         points: Canonical positions, metres.
-        features: Of the hash grid.
-        hidden: After the first layer's ReLU.
+        features: Hash-grid features.
+        hidden: Hidden layer after the ReLU.
         raw: Color logits and log density (log 1/m).
     """
 
@@ -53,7 +54,7 @@ class RadianceField:
         device: torch.device,
         generator: torch.Generator,
     ) -> None:
-        """A field that has seen nothing; `generator` (on the CPU) decides how it starts."""
+        """Draws the initial parameters from `generator`, on the CPU."""
         self.levels = levels
         self.backend = backend
 
@@ -74,7 +75,7 @@ class RadianceField:
             parameter.grad = torch.zeros_like(parameter)
 
     def clone(self) -> "RadianceField":
-        """A field of its own with the same numbers."""
+        """An independent copy of the field."""
         other = copy.copy(self)
         other.table, *other.layers = (
             torch.nn.Parameter(parameter.detach().clone()) for parameter in self.parameters()
@@ -89,7 +90,7 @@ class RadianceField:
 
     @property
     def table_grad(self) -> Float32[Tensor, "entries 4"]:
-        """Where the gradient of the table adds up until it is zeroed."""
+        """Gradient of the table, which accumulates until it is zeroed."""
         assert self.table.grad is not None, "the table's gradient is zeroed, never taken away"
         return self.table.grad
 

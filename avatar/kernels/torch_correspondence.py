@@ -1,4 +1,4 @@
-"""What a frame's warp cells mean, in plain torch: roots, and how the warp bends there."""
+"""Reference of the correspondence grid in plain torch: roots and second-order terms per cell."""
 
 import torch
 from jaxtyping import Bool, Float, Int32
@@ -7,20 +7,25 @@ from torch import Tensor
 from avatar.kernels.torch_skinning import broyden_roots, interpolate_volume, skin_points
 
 MAX_ROOTS = 3
-"""Roots kept per cell; two bits hold their number."""
+"""Largest number of roots of a cell; two bits hold it."""
 SAME_ROOT_M = 0.02
+"""Distance below which two roots of a cell are the same, metres."""
 SEARCHES_PER_CELL = 4
-"""Body parts tried per cell, nearest first."""
+"""Body parts, nearest first, from which roots of a cell are searched."""
 PROBE_DISTANCE_CELLS = 0.375
-"""How far from its centre a cell is probed, in cells: three quarters of the way to a face."""
+"""Distance of the probes from a cell's center, in cells: three quarters of the way to a face."""
 MIN_SECOND_ORDER_M = 5e-4
-"""A warp that is farther from straight than this, at the faces of its cell, is called bent."""
+"""Deviation from an affine warp, at a cell's faces, from which the cell is bent, metres."""
 MAX_PROBE_CORRECTION_M = 0.03
-"""A probe that would have to move farther than this lies beyond a fold, and stays where it is."""
+"""Largest motion of a probe, metres; one that would move farther lies beyond a fold and stays."""
 FINITE_DIFFERENCE_M = 5e-3
+"""Step of the finite differences of the skinning transforms, metres."""
 FACES = [(i, 0, 0) for i in (1, -1)] + [(0, i, 0) for i in (1, -1)] + [(0, 0, i) for i in (1, -1)]
+"""Directions to the faces of a cell."""
 CORNERS = [(i, j, k) for i in (1, -1) for j in (1, -1) for k in (1, -1)]
+"""Directions to the corners of a cell."""
 CELLS_PER_CHUNK = 4096
+"""Cells whose nearest seeds are searched together, which bounds the memory."""
 
 SkinningTensors = tuple[Tensor, Tensor, Tensor, Tensor]
 """Skinning weights (x, y, z, 24), their low corner, nodes per metre, bones (24, 12)."""

@@ -1,6 +1,6 @@
-"""What every operation of a training step means, in plain differentiable torch.
+"""Reference of every operation of a training step, in plain differentiable torch.
 
-The compiled twins must agree with these; on a device that has no twins these run.
+The compiled kernels must agree with it; devices without compiled kernels run it.
 """
 
 import math
@@ -12,10 +12,13 @@ from torch import Tensor
 from avatar.kernels.hash_levels import PRIMES, HashLevels
 
 MAX_LOG_DENSITY = 9.0
+"""Log density (log 1/m) at which the activation is clamped."""
 COLOR_HUBER_DELTA = 0.1
+"""Color error at which the Huber loss turns from quadratic to linear."""
 ALPHA_DEAD_ZONE = 1e-3
+"""Error of alpha up to which the L1 loss on alpha is zero."""
 OPAQUE_DEPTH = 12.0
-"""Optical depth, by cached densities, from which a training ray may end after its grace."""
+"""Optical depth, by cached densities, at which a training ray counts as opaque."""
 
 
 def encode(
@@ -145,15 +148,15 @@ def march(
     Int32[Tensor, "rays"],
     Int32[Tensor, "rays"],
 ]:
-    """Canonical sample points along rays of the body frame, packed ray by ray.
+    """Canonical samples along body-frame rays, packed ray by ray.
 
-    Samples lie on the lattice `t = entry + (k + jitter) step_m`. One is kept where its warp cell
-    has a root whose canonical cell is occupied; of several roots the one of highest cached density
-    counts. A ray ends `grace_steps` samples after its cached optical depth has passed
-    `OPAQUE_DEPTH`, or after `most` samples.
+    Samples lie on the lattice `t = entry + (k + jitter) sample_step_m`. A sample is kept if its
+    cell has a root whose canonical cell is occupied; of several roots the one of highest cached
+    density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
+    `OPAQUE_DEPTH`, or after `max_samples` samples.
 
     Returns:
-        The points, the root of its frame's cells that each was warped with, samples per ray, and
+        The points, the root row that each was warped with, the number of samples of each ray, and
         the step after each ray's last sample.
     """
     slot = slots.long()

@@ -1,7 +1,4 @@
-"""What linear blend skinning and its inverse mean, in plain torch.
-
-What the operations of pose refinement mean, in plain torch.
-"""
+"""Reference of skinning, its inverse, and the operations of pose refinement, in plain torch."""
 
 import torch
 from jaxtyping import Bool, Float, Int32

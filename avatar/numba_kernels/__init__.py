@@ -1,1 +1,1 @@
-"""Kernels for the CPU, compiled by numba: twins of the torch reference."""
+"""Kernels for the CPU, compiled by numba, which agree with the torch reference."""

@@ -1,8 +1,8 @@
-"""Fast-SNARF roots at the centres of a frame's warp cells, compiled for the CPU.
+"""Fast-SNARF roots at the centers of a correspondence grid's cells, compiled for the CPU.
 
-From the skin's seeds the roots flood their neighbour cells: a root, moved along its own inverse
-Jacobian by one cell, lies so close to the neighbour's that one or two steps end there. Serial and
-without the interpreter's lock: the ingest thread runs it beside the trainer.
+The roots flood from the skin's seeds to neighboring cells: a root, moved by one cell along its own
+inverse Jacobian, is so close to the neighbor's that one or two Broyden steps reach it. The kernel
+is serial and releases the GIL, so that the ingest thread can run it beside the trainer.
 """
 
 import math
@@ -37,9 +37,9 @@ FACE_DIRECTIONS = np.array(
     [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], dtype=np.int32
 )
 SEARCH_MARGIN_M = 0.03
-"""How far beyond the band root finding may look."""
+"""Margin about the band within which roots are searched, metres."""
 MAX_PREDICTED_OVERSHOOT_M = 0.015
-"""A root that is predicted this far beyond the band is not looked for."""
+"""Distance beyond the band from which a predicted root is not searched, metres."""
 
 
 def solve_correspondences(

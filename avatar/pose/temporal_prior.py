@@ -62,7 +62,7 @@ class TemporalPosePrior:
         )
 
     def prior_for(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
-        """What the others say of a slot's correction."""
+        """Prior of a slot's correction from the other slots."""
         row, asked = self._is_sequential, self._has_estimate
         if not row[slot]:
             return UNINFORMATIVE_PRIOR
@@ -97,7 +97,7 @@ def prior_from_neighbors(
     corrections: Float[np.ndarray, "others 25 3"],
     error_correlation: float,
 ) -> PosePrior:
-    """What frames around a frame say of its correction: their mean, the nearest counting most.
+    """Prior of a correction: the mean of neighboring frames' corrections, weighted by nearness.
 
     Args:
         frame: Index of the frame.

@@ -43,7 +43,7 @@ class KeyframeSelector:
     """
 
     def __init__(self, rig: Rig, *, initial_keyframes: int = INITIAL_KEYFRAMES) -> None:
-        """Nothing has been seen yet; the first `room` frames are all taken."""
+        """Starts without keyframes; the first `initial_keyframes` frames are all accepted."""
         self._rig, self._initial_left = rig, initial_keyframes
         self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 

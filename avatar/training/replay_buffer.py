@@ -114,7 +114,7 @@ class ReplayBuffer:
         return slot
 
     def replay_frames(self) -> list[ReplayFrame]:
-        """What must be kept of the frames to learn from them again."""
+        """The frames as they are saved, for training on them again."""
         kept = []
         for slot, (pose, sight) in enumerate(self._poses_and_views):
             if sight is not None:
@@ -211,7 +211,7 @@ class ReplayBuffer:
         self._descriptor_distances[slot, :held] = self._descriptor_distances[:held, slot] = gap
 
     def _most_redundant_slot(self) -> int:
-        """Of the two frames that differ least, the one nearer to a third."""
+        """Of the two most similar frames, the one that is closer to a third."""
         first, second = np.unravel_index(
             self._descriptor_distances.argmin(), self._descriptor_distances.shape
         )

@@ -1,7 +1,4 @@
-"""Two ways from a posed sample to its canonical point: our warp cells, the paper's root finding.
-
-The posed radiance field f'(x') = f(x*): the canonical field, asked in a body frame (§3.1).
-"""
+"""The posed radiance field f'(x') = f(x*) (§3.1), by our correspondences or by root finding."""
 
 import math
 from typing import NamedTuple, Protocol, final, runtime_checkable
@@ -88,7 +85,7 @@ class CorrespondenceWarp:
         return CanonicalPoints(samples.points, samples.root_rows, samples.counts > 0)
 
     def set_pose(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
-        """Nothing to learn: the cells say it all."""
+        """Ignored; the correspondence grid holds the pose."""
 
 
 @final

@@ -58,11 +58,11 @@ class NoSkipping:
         return PosedOccupancy(one[:, :1], near, 1.0 / (far - near), one, near, far)
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """None."""
+        """No points, as no cell is known to be empty."""
         return torch.zeros(0, 3, device=generator.device)
 
     def add_frame(self, slot: int, cells: CorrespondenceTables) -> None:
-        """Nothing to learn."""
+        """Ignored."""
 
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Nothing to renew."""
@@ -70,14 +70,14 @@ class NoSkipping:
 
 @final
 class CorrespondenceBand:
-    """Ours before the warp: nothing lies where no warp cell has a root."""
+    """Skips the cells of the correspondence grid that have no root."""
 
     def __init__(self, occupancy: OccupancyGrid) -> None:
         """Empty points are those of canonical occupancy."""
         self._occupancy = occupancy
 
     def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
-        """The warp cells themselves."""
+        """The cells of the correspondence grid."""
         per_m = torch.full_like(cells.low, 1.0 / cells.cell_m)
         return PosedOccupancy(
             cells.packed_cells, cells.low, per_m, cells.shape, *person_boxes(cells)
@@ -88,7 +88,7 @@ class CorrespondenceBand:
         return self._occupancy.sample_empty(count, generator)
 
     def add_frame(self, slot: int, cells: CorrespondenceTables) -> None:
-        """Nothing to learn: the cells say it."""
+        """Ignored; the correspondence grid holds the pose."""
 
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Nothing to renew; the owner of the occupancy updates it."""
@@ -96,11 +96,11 @@ class CorrespondenceBand:
 
 GRID_CELLS = 64
 GRID_DECAY = 0.8
-"""What a cell keeps of its density from one update to the next."""
+"""Factor of a cell's density at each update."""
 GRID_OPACITY = 0.01
-"""Of one centimetre; a cell below it, or below the mean if that is lower, is empty."""
+"""Opacity of one centimetre below which, or below the mean if lower, a cell is empty."""
 GRID_MARGIN_M = 0.25
-"""How far beyond the longest chain of bones the sequence's grid reaches."""
+"""Margin of the sequence's grid about the longest chain of bones, metres."""
 FRAME_GRID_INTERVAL = 4
 """Steps between renewals of a frame's grid: with 100 frames each one's turn comes in 400 steps."""
 
@@ -136,7 +136,7 @@ class EmptyPointPool:
     """Canonical points that the latest probes found in empty cells."""
 
     def __init__(self, device: torch.device) -> None:
-        """Nothing yet."""
+        """Starts empty."""
         self._points = torch.zeros(0, 3, device=device)
 
     def fill(self, points: Float32[Tensor, "points 3"]) -> None:
@@ -184,7 +184,7 @@ class SequenceGrid:
         )
 
     def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
-        """The same for every slot."""
+        """The union grid, for every slot."""
         slots = len(cells.low)
         return PosedOccupancy(
             self.occupied.view(1, -1).expand(slots, -1),

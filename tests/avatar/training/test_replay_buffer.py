@@ -178,7 +178,7 @@ def test_a_slot_that_is_taken_over_shows_the_new_frame(frames, generator):
     )
 
 
-def test_distances_that_are_kept_are_those_that_would_be_found_anew(frames, rng):
+def test_cached_distances_are_those_computed_afresh(frames, rng):
     """What goes is chosen from distances that are updated one row at a time."""
     replay = ReplayBuffer(6, CPU)
     for index in range(40):
