@@ -41,12 +41,12 @@ from export.package.table_codec import TableLayout
 from export.package_checks import (
     CHECK_PX,
     check_graph,
-    fit_camera,
     mean_psnr_to_renderer,
     quality_warnings,
 )
 from export.picture_difference import picture_on_white
 from export.player import Player
+from export.player_limits import fit_camera
 from preprocess.body.body_pose import BodyPose
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from avatar.evaluation.image_metrics import psnr
-from capture.camera import Camera
 from export.bake.bake_tables import ExportRefused
 from export.bake.render_targets import PosedView
 from export.package.manifest import GoldenFrame
@@ -18,6 +17,7 @@ from export.picture_difference import (
     premultiply,
 )
 from export.player import Player
+from export.player_limits import fit_camera
 from export.reference.reference_player import PlayerInputs, draw_reference
 
 POOR_PSNR = 30.0
@@ -37,11 +37,6 @@ POOR_WARNING = (
 """Shown below `POOR_PSNR`."""
 CHECK_PX = 256
 """Longer side of the pictures that are compared with the volume renderer, pixels."""
-
-
-def fit_camera(camera: Camera, longest_px: int) -> Camera:
-    """Return the camera with a longer side of at most `longest_px` pixels; never enlarge it."""
-    return camera.resize_longer_side(min(longest_px, max(camera.size_px)))
 
 
 def check_graph(

@@ -52,6 +52,11 @@ def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | Non
     )
 
 
+def fit_camera(camera: Camera, longest_px: int, *, max_upscale: int = 1) -> Camera:
+    """Return the camera for a longer side of `longest_px`, or `max_upscale` × its own if less."""
+    return camera.resize_longer_side(min(longest_px, max_upscale * max(camera.size_px)))
+
+
 def check_render_inputs(pose: BodyPose, camera: Camera, samples: int) -> None:
     """Check pose, camera and number of samples.
 

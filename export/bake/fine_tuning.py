@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from avatar.deformation.rig import Rig
-from capture.camera import Camera
 from export.bake.render_targets import (
     PosedView,
     RenderFunction,
@@ -30,6 +29,7 @@ from export.package.player_tables import (
 )
 from export.package.render_settings import RenderSettings
 from export.package.table_codec import add_border_voxels
+from export.player_limits import fit_camera
 from export.reference.compositor import VoxelCodes, back_project
 
 TRAINING_PX = 540
@@ -127,7 +127,7 @@ class FineTuningInputs:
             moved[:3, :3] = orbit.as_matrix()
             moved[:3, 3] = pelvis - moved[:3, :3] @ pelvis
             camera = replace(camera, camera_from_world=camera.camera_from_world @ moved)
-            perturbed.append((pose, _resize_camera(camera, longest_px)))
+            perturbed.append((pose, fit_camera(camera, longest_px, max_upscale=MAX_UPSCALE)))
         return perturbed
 
 
@@ -177,7 +177,10 @@ def fine_tune(
     tables, settings, generator = inputs.tables, inputs.settings, np.random.default_rng(0)
     training = inputs.perturbed_views(max_pictures, POSE_NOISE_RAD, generator, TRAINING_PX)
     novel = inputs.perturbed_views(NOVEL_POSES, NOVEL_POSE_NOISE_RAD, generator, VALIDATION_PX)
-    asked = [(pose, _resize_camera(camera, VALIDATION_PX)) for pose, camera in inputs.views]
+    asked = [
+        (pose, fit_camera(camera, VALIDATION_PX, max_upscale=MAX_UPSCALE))
+        for pose, camera in inputs.views
+    ]
     total = len(training) + len(asked) + 3 * NOVEL_POSES + ROUNDS
     steps = iter(range(1, total + 1))
     builder = inputs.target_builder(lambda: progress(next(steps) / total))
@@ -241,8 +244,3 @@ def _bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:
     core = np.concatenate([codes.color, codes.density[:, None]], axis=1).astype(np.uint8)
     shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
     return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))
-
-
-def _resize_camera(camera: Camera, longest_px: int) -> Camera:
-    """Return the camera for a longer side of `longest_px`, or `MAX_UPSCALE` × its own if less."""
-    return camera.resize_longer_side(min(longest_px, MAX_UPSCALE * max(camera.size_px)))

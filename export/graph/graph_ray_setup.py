@@ -27,7 +27,7 @@ from export.graph.graph_skinning import (
 )
 from export.graph.graph_zbuffer import SplatWindow
 from export.graph.onnx_builder import GraphValue
-from export.package.player_tables import SURFEL_BITS
+from export.package.player_tables import SURFEL_MASK
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,12 +93,12 @@ def trace_depth_layer(
         ray: Unit directions in the camera's frame.
         front_layer: The layer in front of the same rays; None for the first.
     """
-    graph, surfel = context.graph, keys.bitwise_and((1 << SURFEL_BITS) - 1)
-    place = surface.surfels.cell
-    place = SkinningCell(
-        rows=gather_vector(place.rows, surfel), fraction=gather_vector(place.fraction, surfel)
+    graph, surfel = context.graph, keys.bitwise_and(SURFEL_MASK)
+    cells = surface.surfels.cell
+    cell = SkinningCell(
+        rows=gather_vector(cells.rows, surfel), fraction=gather_vector(cells.fraction, surfel)
     )
-    camera, derivative = skin_points(context, surface.posed, place)
+    camera, derivative = skin_points(context, surface.posed, cell)
     inverse = invert_jacobian(context, derivative, adjugate(derivative))
     normal = gather_vector([context.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
     # where the skin is folded, look at the surface along its normal
@@ -117,24 +117,13 @@ def trace_depth_layer(
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = SegmentValues(
-        direction_camera=ray,
-        begin=begin,
-        end=end,
-        start_canonical=start,
-        direction_canonical=direction,
-    )
+        direction_camera=ray, begin=begin, end=end,
+        start_canonical=start, direction_canonical=direction,
+    )  # fmt: skip
     if front_layer is None:
         color, light = march_segments(context, surface.posed, segment)
     else:
-        settings = context.settings
-        block = composite_samples(
-            context,
-            segment,
-            begin * 0.0 + 1.0,
-            settings.further_layer_samples,
-            settings.max_segment_m,
-        )
-        color, light = block.color, block.transmittance
+        color, light = _composite_in_one_block(context, segment)
     return DepthLayer(
         ray=ray,
         surfel=surfel,
@@ -145,6 +134,17 @@ def trace_depth_layer(
         enter=enter,
         end=end,
     )
+
+
+def _composite_in_one_block(
+    context: GraphContext, segment: SegmentValues
+) -> tuple[VectorValue, GraphValue]:
+    """Composite the segments of a further layer; return premultiplied color and transmittance."""
+    settings, ones = context.settings, segment.begin * 0.0 + 1.0
+    block = composite_samples(
+        context, segment, ones, settings.further_layer_samples, settings.max_segment_m
+    )
+    return block.color, block.transmittance
 
 
 def _segment_bounds(

@@ -7,7 +7,7 @@ import numpy as np
 from export.graph.graph_context import GraphContext, VectorValue, dot
 from export.graph.graph_skinning import PosedNodeValues, PosedSurfels, faces_camera
 from export.graph.onnx_builder import GraphValue
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS
+from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK
 
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
@@ -289,9 +289,7 @@ def keys_behind_limits(
         near = near.compress(hidden.depth > limit - sheet_slack_m(context))
         cells, keys = cells.gather(near), keys.gather(near)
         passed = graph.full(graph.shape(window.cells + 1), np.int32(0)).scatter(cell, front_surfel)
-        same = _same_sheet(
-            context, surfels, keys.bitwise_and((1 << SURFEL_BITS) - 1), passed.gather(cells)
-        )
+        same = _same_sheet(context, surfels, keys.bitwise_and(SURFEL_MASK), passed.gather(cells))
         deeper = hidden.depth.gather(near) > limit.gather(near)
         cells = graph.where(deeper, cells, graph.where(same, window.cells.cast(np.int32), cells))
     else:

@@ -10,7 +10,13 @@ from scipy.spatial import KDTree
 
 from export.bake.grid_filters import remove_floaters_and_cavities, resample_grid
 from export.mesh.isosurface import extract_isosurface
-from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable, PlayerTables
+from export.package.player_tables import (
+    BRICK_SIZE,
+    BrickTable,
+    PlayerTables,
+    decode_density,
+    density_code,
+)
 
 VERTEX_SPACING_M = 0.005
 """Edge of the cells in which the surface is extracted, metres; a crossed cell gives one vertex."""
@@ -92,9 +98,9 @@ def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -
 
 def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, "x y z"]:
     """Return a function that is positive inside: log-density over the level, without floaters."""
-    level = _density_code(SURFACE_DENSITY)
+    level, haze = np.float32(density_code(np.array([SURFACE_DENSITY, HAZE_DENSITY])))
     solid = remove_floaters_and_cavities(
-        (density > level) | _solid_interior(density > _density_code(HAZE_DENSITY)),
+        (density > level) | _solid_interior(density > haze),
         MIN_VOLUME_FRACTION,
     )
     height = density.astype(np.float32) - level
@@ -102,12 +108,6 @@ def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, 
     return ndimage.gaussian_filter(
         np.clip(height, -CODE_CONTRAST, CODE_CONTRAST), BLUR_VOXELS, truncate=3.0
     )
-
-
-def _density_code(density: float) -> np.float32:
-    """Return the code of a density in 1/m, not rounded."""
-    begin, end = LOG_DENSITY_RANGE
-    return np.float32((np.log(density) - begin) / (end - begin) * 255.0)
 
 
 def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
@@ -187,7 +187,6 @@ def _vertex_colors(
     voxel_m: float,
 ) -> UInt8[np.ndarray, "vertices 3"]:
     """Composite the color of each vertex along its inward normal, from outside."""
-    begin, end = LOG_DENSITY_RANGE
     total = np.zeros((len(nodes), 3), dtype=np.float32)
     passed = np.ones(len(nodes), dtype=np.float32)
     for depth in np.arange(-COLOR_LEAD_M, COLOR_DEPTH_M, COLOR_STEP_M):
@@ -196,10 +195,7 @@ def _vertex_colors(
             ndimage.map_coordinates(codes[..., channel], place, np.float32, order=1)
             for channel in range(4)
         ]
-        density = np.where(
-            sampled[3] > 0.5, np.exp(sampled[3] * ((end - begin) / 255.0) + begin), 0.0
-        )
-        left = passed * np.exp(-density * COLOR_STEP_M).astype(np.float32)
+        left = passed * np.exp(-decode_density(sampled[3]) * COLOR_STEP_M).astype(np.float32)
         total += np.stack(sampled[:3], axis=1) * (passed - left)[:, None]
         passed = left
     opaque = 1.0 - passed

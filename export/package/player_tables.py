@@ -21,6 +21,8 @@ DENSITY_CODE_STEP = 16
 """Multiple to which density codes are rounded: steps of 72 %, invisible, and bytes halve."""
 SURFEL_BITS = 17
 """Low bits of a z-buffer key, which number the surfel."""
+SURFEL_MASK = (1 << SURFEL_BITS) - 1
+"""Mask of those bits."""
 DEPTH_CODES = 1 << (31 - SURFEL_BITS)
 """Depths that a z-buffer key distinguishes, in its high 14 bits."""
 
@@ -130,9 +132,19 @@ class PlayerTables:
 
 def encode_density(density: Float[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
     """Quantize densities in 1/m logarithmically; those below the range become 0, which is empty."""
+    return np.clip(np.round(density_code(np.maximum(density, 1e-9))), 0, 255).astype(np.uint8)
+
+
+def density_code(density: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Return codes of positive densities in 1/m, neither rounded nor clipped."""
     low, high = LOG_DENSITY_RANGE
-    logs = np.log(np.maximum(density, 1e-9))
-    return np.clip(np.round((logs - low) / (high - low) * 255.0), 0, 255).astype(np.uint8)
+    return (np.log(density) - low) / (high - low) * 255.0
+
+
+def decode_density(code: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Return densities in 1/m of interpolated codes; below half a code they are 0."""
+    low, high = LOG_DENSITY_RANGE
+    return np.where(code > 0.5, np.exp(code * ((high - low) / 255.0) + low), 0.0)
 
 
 def round_codes(

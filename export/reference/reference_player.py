@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from export.package.graph_tables import skinning_nodes
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables
+from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK, PlayerTables
 from export.package.render_settings import RenderSettings
 from export.reference.compositor import VoxelCodes, composite_segments
 from export.reference.ray_segments import RaySegments
@@ -263,7 +263,7 @@ def _inverse_skinning(
 
 
 def _surfel_of_key(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
-    return key & ((1 << SURFEL_BITS) - 1)
+    return key & SURFEL_MASK
 
 
 def _project_surfels(
