@@ -1,4 +1,4 @@
-"""Tests for poses on a body that is not their tracker's: with masks, with alpha channels, live."""
+"""Tests for poses on a body that is not their tracker's: with masks, alpha channels, live."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def body() -> BodyModel:
 
 @pytest.fixture(scope="module")
 def strangers() -> Motion:
-    """Poses of SMPL's, whose tracker thinks of a smaller person that is nearer."""
+    """SMPL's poses, whose tracker assumes a smaller person who is nearer."""
     return motion_of("smpl")
 
 
@@ -96,7 +96,7 @@ def pixels_off(fit: BodyAlignment, person: ShapedBody, motion: Motion) -> float:
     )  # fmt: skip
 
 
-def test_an_alpha_channel_says_as_much_as_masks(tmp_path, own, strangers):
+def test_an_alpha_channel_aligns_as_masks_do(tmp_path, own, strangers):
     person = taller(own, 1.1)
     source, masks = film(tmp_path, person, strangers)
     assert source.has_alpha
@@ -111,7 +111,7 @@ def test_an_alpha_channel_says_as_much_as_masks(tmp_path, own, strangers):
     assert pixels_off(by_alpha, person, strangers) < 1.2
 
 
-def test_without_masks_it_is_said_that_nothing_was_fitted(tmp_path, own, strangers):
+def test_without_masks_an_unfitted_body_is_reported(tmp_path, own, strangers):
     Image.new("RGB", SIZE).save(tmp_path / "0.png")
     fit = align_body(strangers, own, CAMERAS, open_source(tmp_path), None)
     assert fit.motion is strangers
@@ -119,7 +119,7 @@ def test_without_masks_it_is_said_that_nothing_was_fitted(tmp_path, own, strange
     assert "--body" in fit.description
 
 
-def test_poses_of_the_bodys_own_are_left_alone(tmp_path, body):
+def test_poses_of_the_bodys_own_model_stay(tmp_path, body):
     motion = motion_of("body24")
     source, masks = film(tmp_path, body.with_shape(), motion)
     fit = align_body(motion, body.with_shape(), CAMERAS, source, masks)
@@ -139,7 +139,7 @@ def betas_of(body: BodyModel, amount: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("amount", [-1.5, 1.5])
-def test_an_added_clips_poses_are_for_the_person_that_the_avatar_has(tmp_path, body, amount):
+def test_an_added_clip_is_aligned_to_the_avatars_person(tmp_path, body, amount):
     """Its tracker assumed a larger person farther away, or a smaller one nearer."""
     person, other = body.with_shape(), body.with_shape(betas_of(body, amount))
     motion = motion_of("body24")
@@ -167,9 +167,7 @@ def test_without_masks_an_added_clips_distances_follow_the_height(tmp_path, body
     np.testing.assert_allclose(fit.motion.root_translations, motion.root_translations, atol=1e-9)
 
 
-def test_a_strangers_added_clip_is_fitted_to_the_persons_own_proportions(
-    tmp_path, body, own, strangers
-):
+def test_an_added_clip_of_smpls_fits_the_avatars_proportions(tmp_path, body, own, strangers):
     person = scale_to_height(body.with_shape(), 1.1 * body_height_m(body.with_shape()))
     source, masks = film(tmp_path, person, strangers)
     pelves = person.joints[0] + strangers.root_translations
@@ -202,7 +200,7 @@ def observations(person: ShapedBody, motion: Motion):
         yield Observation(frame=frame, alpha=alpha, pose=motion[row], camera=CAMERA)
 
 
-def test_while_frames_come_the_fit_becomes_that_of_all(own):
+def test_live_alignment_converges_to_that_of_all_frames(own):
     factor = 1.1
     motion, person = motion_of("smpl", 40), taller(own, factor)
     fit, agreed = LiveAlignment(own, "smpl"), []
@@ -219,7 +217,7 @@ def test_while_frames_come_the_fit_becomes_that_of_all(own):
     assert fit.frame_count == 32  # of 40: it is made again when there are twice as many
 
 
-def test_poses_that_fit_already_are_left_as_they_come(own):
+def test_live_poses_that_fit_already_stay(own):
     fit = LiveAlignment(own, "smpl")
     for seen in observations(own, motion_of("smpl", 10)):
         assert fit.align(seen).pose is seen.pose

@@ -84,7 +84,7 @@ def test_the_bodys_joints_move_exactly_as_smpls_do(turning):
     np.testing.assert_allclose(offset, np.broadcast_to(offset[0], (24, 3)), atol=1e-12)
 
 
-def test_the_skin_goes_along_with_its_joints(shaped):
+def test_the_skin_moves_with_its_joints(shaped):
     moved = with_smpl_joints(shaped)
     rigid = shaped.body.weights.max(axis=1) > 0.999
     joint = shaped.body.weights[rigid].argmax(axis=1)
@@ -118,7 +118,7 @@ def test_joints_land_where_the_person_has_them(filmed):
         np.testing.assert_array_equal(fitted.joint_rotations, pose.joint_rotations)
 
 
-def test_what_fits_already_is_left_as_it_is(filmed):
+def test_poses_that_fit_already_stay(filmed):
     _, geometry, objective, placement = filmed
     again = place_body_on_masks(replace(geometry, motion=placement.motion), objective)
     assert not again.is_improvement

@@ -49,7 +49,7 @@ def test_points_move_with_the_skin(skin, shaped, rng):
     assert nearest < 0.04
 
 
-def test_a_silhouette_is_the_meshs_own(skin, shaped, camera):
+def test_splatted_and_exact_silhouettes_agree(skin, shaped, camera):
     drawn = splat_silhouette(skin.posed(BodyPose.rest()), camera)
     exact = np.zeros((128 * 8, 128 * 8), np.uint8)
     pixels = (camera.project(shaped.vertices) * 8).astype(np.int32)
@@ -73,14 +73,14 @@ def test_a_lens_bends_the_silhouette_as_it_bends_points(skin, camera):
     assert drawn[tuple(np.floor(pixels[:, ::-1]).astype(int).T)].all()
 
 
-def test_agreement_is_that_of_two_sets(rng):
+def test_soft_iou_of_hard_masks_is_that_of_sets(rng):
     a, b = rng.random((40, 40)) > 0.5, rng.random((40, 40)) > 0.5
     assert soft_iou(a, b.astype(np.float32)) == pytest.approx((a & b).sum() / (a | b).sum())
     assert soft_iou(a, a.astype(np.float32)) == 1.0
     assert soft_iou(a & False, np.zeros((40, 40), np.float32)) == 0.0
 
 
-def test_turning_world_and_camera_together_changes_nothing(skin, camera):
+def test_rotating_world_and_camera_together_changes_nothing(skin, camera):
     points = skin.posed(BodyPose.rest())
     turn = np.eye(4)
     turn[:3, :3] = rotation_matrices(np.array([0.3, 1.0, -0.4]))

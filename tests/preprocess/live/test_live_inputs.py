@@ -1,4 +1,4 @@
-"""Poses and masks that are still being written while a live source runs."""
+"""Tests for poses and masks that are still being written while a live source runs."""
 
 import json
 import threading
@@ -51,7 +51,7 @@ def later(work, after_s=0.1):
     return thread
 
 
-def test_a_pose_that_comes_later_is_waited_for(tmp_path):
+def test_frames_wait_for_a_late_pose(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(2))
     growing = poses(path, patience_s=10.0)
@@ -62,7 +62,7 @@ def test_a_pose_that_comes_later_is_waited_for(tmp_path):
     thread.join()
 
 
-def test_degrees_are_refused_at_once_and_one_bad_pose_is_left_out(tmp_path):
+def test_degrees_are_refused_and_one_bad_pose_is_skipped(tmp_path):
     path, bent = tmp_path / "poses.npz", np.zeros((3, 23, 3))
     bent[:, 4, 0] = 60.0
     write_motion(path, moving(3, joint_rotations=bent))
@@ -75,7 +75,7 @@ def test_degrees_are_refused_at_once_and_one_bad_pose_is_left_out(tmp_path):
     assert growing.wait_for_pose(frame(2)) == "pose invalid"
 
 
-def test_a_pose_that_does_not_come_costs_its_frame_and_no_more(tmp_path):
+def test_a_missing_pose_costs_only_its_frame(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(1))
     growing, began = poses(path), time.perf_counter()
@@ -92,7 +92,7 @@ def test_a_pose_that_does_not_come_costs_its_frame_and_no_more(tmp_path):
     [({"frames": np.array([4, 6])}, 6, 1), ({"frames": np.array([4, 6])}, 5, "no pose"),
      ({"valid": np.array([True, False])}, 1, "pose invalid")],
 )  # fmt: skip
-def test_what_will_never_come_is_not_waited_for(tmp_path, keys, index, expected):
+def test_frames_do_not_wait_for_impossible_poses(tmp_path, keys, index, expected):
     write_motion(tmp_path / "poses.npz", moving(2, **keys))
     found = poses(tmp_path / "poses.npz", patience_s=3600.0).wait_for_pose(frame(index))
     assert (found if isinstance(found, str) else row(found)) == expected
@@ -100,7 +100,7 @@ def test_what_will_never_come_is_not_waited_for(tmp_path, keys, index, expected)
 
 @pytest.mark.parametrize("epoch", [0.0, 1.7e9])
 def test_poses_belong_to_the_frames_of_their_time(tmp_path, epoch):
-    """Counted from the first picture, or since 1970, as a tracker's clock does."""
+    """Times count from the first frame or from 1970, as a tracker's clock does."""
     times = epoch + np.array([0.0, 0.1, 0.3])
     write_motion(tmp_path / "poses.npz", moving(3, times_s=times))
     growing = poses(tmp_path / "poses.npz", started_at=epoch)
@@ -109,7 +109,7 @@ def test_poses_belong_to_the_frames_of_their_time(tmp_path, epoch):
     assert growing.wait_for_pose(frame(9, time_s=0.4)) == "no pose within 0.1 s"
 
 
-def test_a_half_written_file_is_read_at_the_next_look(tmp_path):
+def test_a_half_written_file_is_read_at_the_next_poll(tmp_path):
     path = tmp_path / "poses.npz"
     write_motion(path, moving(3))
     whole = path.read_bytes()
@@ -122,7 +122,7 @@ def test_a_half_written_file_is_read_at_the_next_look(tmp_path):
     assert row(growing.wait_for_pose(frame(1))) == 1
 
 
-def test_without_a_first_pose_it_is_said_why(tmp_path):
+def test_a_missing_first_pose_is_explained(tmp_path):
     with pytest.raises(InputError, match="There are no poses"):
         poses(tmp_path / "none.npz")
     write_motion(tmp_path / "lost.npz", moving(2, valid=np.zeros(2, dtype=bool)))
@@ -168,7 +168,7 @@ def masks(folder, *, invert=None, patience_s=0.1):
     return LiveMasks(folder, PacingClock(), invert=invert, patience_s=patience_s)
 
 
-def test_a_mask_belongs_to_the_picture_of_its_name_or_to_its_number(tmp_path):
+def test_a_mask_belongs_to_a_frame_by_name_or_number(tmp_path):
     write_mask(tmp_path, "shot_17")
     growing = masks(tmp_path)
     by_name = growing.wait_for_mask(frame(3, name="shot_17"), (4, 6))
@@ -180,7 +180,7 @@ def test_a_mask_belongs_to_the_picture_of_its_name_or_to_its_number(tmp_path):
         growing.wait_for_mask(frame(17, name="shot_18"), (4, 6))
 
 
-def test_a_mask_that_comes_later_and_half_at_first_is_waited_for(tmp_path):
+def test_frames_wait_for_a_half_written_mask(tmp_path):
     whole = write_mask(tmp_path, "0")
     (tmp_path / "0.png").write_bytes(whole[:40])
     thread = later(lambda: write_mask(tmp_path, "0"))
@@ -188,8 +188,8 @@ def test_a_mask_that_comes_later_and_half_at_first_is_waited_for(tmp_path):
     thread.join()
 
 
-def test_which_side_is_the_person_is_what_most_masks_show_so_far(tmp_path):
-    """One that was written the other way round is refused at once, also if it came first."""
+def test_live_polarity_is_that_of_most_masks_so_far(tmp_path):
+    """An inverted mask is refused at once, even if it came first."""
     for number, inverted in enumerate([True, False, False, False, True]):
         write_mask(tmp_path, str(number), inverted=inverted)
     growing = masks(tmp_path, patience_s=60.0)

@@ -38,7 +38,7 @@ def turned(shaped, camera):
     return turned
 
 
-def test_what_is_seen_faces_the_camera_and_is_not_behind_something(shaped, turned):
+def test_visible_vertices_face_the_camera_and_are_not_occluded(shaped, turned):
     around, sight = turned(0.0)
     depth = around.skin[:, 2]  # the camera looks down the z axis
     trunk = (np.abs(shaped.vertices[:, 0]) < 0.1) & (np.abs(shaped.vertices[:, 1]) < 0.2)
@@ -72,7 +72,7 @@ def test_colors_seen_from_the_front_predict_the_outline_after_a_turn(shaped, cam
         assert np.isinf(spread[0]).all()
 
 
-def test_nothing_is_learnt_so_near_to_the_border_that_it_may_be_background(turned, camera):
+def test_no_color_is_learnt_near_the_border(turned, camera):
     _, sight = turned(0.0)
     colors = AppearanceModel(len(sight.visible))
     rgb = np.full((*SIZE[::-1], 3), 99, np.uint8)

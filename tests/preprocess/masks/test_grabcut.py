@@ -72,7 +72,7 @@ def agreement(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.minimum(a, b).sum() / np.maximum(a, b).sum())
 
 
-def test_the_outline_covers_what_points_of_the_skin_cover(shaped, camera):
+def test_the_filled_mesh_covers_what_skin_points_cover(shaped, camera):
     pose = standing(shaped, 0.4)
     drawn = MeshSilhouette(shaped).draw_pose(pose, camera)
     at = np.floor(camera.project(shaped.with_pose(pose).vertices())).astype(int)
@@ -93,7 +93,7 @@ def test_nothing_is_drawn_of_a_body_behind_the_camera(shaped, camera):
     )
 
 
-def test_clothes_that_are_wider_than_the_body_are_found(shaped, camera, film):
+def test_clothes_wider_than_the_body_are_segmented(shaped, camera, film):
     find = GrabCutSegmenter(shaped)
     frame, pose, true = film(0.0)
     body = MeshSilhouette(shaped).draw_pose(pose, camera)
@@ -359,7 +359,7 @@ def test_far_from_the_shape_a_segmentation_leaked_if_poses_are_good(shaped, off_
         assert leaked < 0.35
 
 
-def test_a_bun_of_hair_is_found_though_it_stands_off_far(shaped, camera, film):
+def test_a_protruding_bun_of_hair_is_segmented(shaped, camera, film):
     find = GrabCutSegmenter(shaped)
     for index, yaw in enumerate(np.linspace(0.0, 1.0, 4)):
         frame, pose, true = film(float(yaw), index)
@@ -386,7 +386,7 @@ def test_large_images_are_segmented_small_and_upsampled(shaped, camera, film):
     assert agreement(cv2.resize(mask, SIZE, interpolation=cv2.INTER_AREA), true) > 0.93
 
 
-def test_a_person_who_is_not_there_gives_no_mask(shaped, camera, film):
+def test_a_person_outside_the_image_has_no_mask(shaped, camera, film):
     frame, pose, _ = film(0.0)
     aside = replace(pose, root_translation=pose.root_translation + np.array([9.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="not in the image"):

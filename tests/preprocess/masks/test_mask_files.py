@@ -1,4 +1,4 @@
-"""Masks in every container and polarity."""
+"""Tests for masks in every container and polarity."""
 
 import json
 import pickle
@@ -21,7 +21,7 @@ SIZE = (30, 40)
 
 
 def person(shift: int = 0) -> np.ndarray:
-    """8-bit: a soft-edged rectangle of 20 % of the picture, off its rim."""
+    """8-bit: a soft-edged rectangle of 20 % of the image, off its rim."""
     mask = np.zeros((40, 30), np.uint8)
     mask[8:32, 10 + shift : 20 + shift] = 255
     mask[8:32, 10 + shift] = 77
@@ -64,15 +64,15 @@ def test_alpha_is_the_value_over_255_and_never_thresholded(write):
     ],
     ids=["0 and 1", "bool", "float", "float to 255", "int to 255"],
 )
-def test_every_scale_of_a_hard_mask_is_one_mask(write, stored):
+def test_every_scale_of_a_hard_mask_gives_the_same_mask(write, stored):
     alpha = open_masks(write([stored], suffix=".npy")).alpha(0, SIZE)
     np.testing.assert_array_equal(alpha, (person() > 200).astype(np.float32))
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "1", "P", "I;16"])
-def test_every_kind_of_picture_is_one_mask(tmp_path, mode):
+def test_every_image_mode_gives_the_same_mask(tmp_path, mode):
     hard = np.where(person() > 200, 255, 0).astype(np.uint8)
-    grey = Image.fromarray(hard)
+    gray = Image.fromarray(hard)
     folder = tmp_path / "masks"
     folder.mkdir()
     if mode == "RGBA":
@@ -83,12 +83,12 @@ def test_every_kind_of_picture_is_one_mask(tmp_path, mode):
     elif mode == "I;16":
         picture = Image.fromarray(hard.astype(np.uint16) * 257)
     else:
-        picture = grey.convert(mode)
+        picture = gray.convert(mode)
     picture.save(folder / "0.png")
     np.testing.assert_allclose(open_masks(folder).alpha(0, SIZE), hard / 255.0)
 
 
-def test_a_mask_is_turned_by_its_exif_tag_as_its_picture_is(tmp_path):
+def test_a_mask_is_rotated_by_its_exif_tag(tmp_path):
     upright = np.zeros((12, 8), np.uint8)
     upright[1:5, 2:4] = 255
     exif = Image.Exif()
@@ -113,7 +113,7 @@ def test_masks_come_in_natural_order(write):
     np.testing.assert_array_equal(open_masks(folder).alpha(11, SIZE), person(6) / np.float32(255))
 
 
-def test_inverted_masks_are_turned_unless_told_otherwise(write):
+def test_inverted_masks_are_detected_unless_stated(write):
     folder = write([255 - person(), 255 - person(2)])
     upright = person() / np.float32(255)
     found = open_masks(folder)
@@ -130,14 +130,14 @@ def test_an_empty_mask_among_others_does_not_decide(write):
     assert open_masks(write([255 - nothing, 255 - person()], "turned")).inverted
 
 
-def test_masks_that_do_not_tell_which_side_is_the_person_are_refused(write):
+def test_masks_of_unclear_polarity_are_refused(write):
     framed = np.full((40, 30), 255, np.uint8)
     framed[2:-2, 2:-2] = 0
     with pytest.raises(InputError, match="--mask-invert"):
         open_masks(write([framed]))
 
 
-def test_numbers_of_objects_in_grey_are_masks_and_dark_noise_is_none(write, rng):
+def test_gray_object_numbers_are_masks_and_dark_noise_is_not(write, rng):
     two = np.where(person() > 127, 2, 0).astype(np.uint8)
     two[:5, :5] = 1
     masks = open_masks(write([two, two], "numbers"))
@@ -147,7 +147,7 @@ def test_numbers_of_objects_in_grey_are_masks_and_dark_noise_is_none(write, rng)
     assert dark.alpha(1, SIZE).max() < 0.02
 
 
-def test_pictures_are_no_masks(write, rng):
+def test_photographs_are_not_masks(write, rng):
     photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
     for invert in (None, False):
         with pytest.raises(InputError, match="photographs, not masks: 7"):
@@ -224,7 +224,7 @@ def test_run_lengths_are_those_of_the_standards_own_example():
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_coded_masks_of_any_shape_go_round(height, width, seed):
+def test_encoded_masks_of_any_shape_round_trip(height, width, seed):
     rng = np.random.default_rng(seed)
     mask = np.repeat(rng.random((height, width)) < rng.random(), rng.integers(1, 9), axis=0)
     code = {"size": list(mask.shape), "counts": text_of(mask)}
@@ -232,7 +232,7 @@ def test_coded_masks_of_any_shape_go_round(height, width, seed):
 
 
 @pytest.mark.parametrize("container", ["list", "names", "coco", "npy", "several"])
-def test_coded_masks_are_read_from_whatever_holds_them(tmp_path, container):
+def test_encoded_masks_are_read_from_every_container(tmp_path, container):
     hard = [(person(i) > 200).astype(np.uint8) for i in range(12)]
     codes = [{"size": [40, 30], "counts": text_of(mask).decode()} for mask in hard]
     names = [f"mask_{i}.png" for i in range(12)]
@@ -274,7 +274,7 @@ def tracks(count: int = 12) -> tuple[dict, list[np.ndarray]]:
     return content, hard
 
 
-def test_the_masks_of_one_of_phalps_people_are_read_from_its_tracks(tmp_path):
+def test_one_persons_masks_are_read_from_phalps_tracks(tmp_path):
     content, hard = tracks()
     path = tmp_path / "demo.pkl"
     path.write_bytes(pickle.dumps(content))
@@ -321,7 +321,7 @@ def test_masks_beside_poses_are_taken_only_where_they_fit_the_video(tmp_path):
         {"size": [3, 4], "counts": [-1, 13]},
     ],
 )
-def test_codes_that_do_not_fill_their_picture_are_refused(tmp_path, code):
+def test_codes_that_do_not_fill_their_image_are_refused(tmp_path, code):
     path = tmp_path / "masks.json"
     path.write_text(json.dumps([code, code]))
     with pytest.raises(InputError, match="run-length code"):
@@ -346,7 +346,7 @@ def test_a_video_of_masks_is_read_in_any_order(tmp_path):
         assert alpha.max() == 1.0
 
 
-def test_arrays_that_are_no_masks_are_refused(tmp_path, write):
+def test_arrays_that_are_not_masks_are_refused(tmp_path, write):
     np.savez(tmp_path / "m.npz", masks=np.zeros((3, 40)))
     with pytest.raises(InputError, match="no array of masks"):
         open_masks(tmp_path / "m.npz")

@@ -79,7 +79,7 @@ def pictured(alpha: np.ndarray, wall: np.ndarray) -> np.ndarray:
 
 
 def test_a_border_half_a_pixel_off_comes_back(rng):
-    """Whichever way it is off; the wall may be of any colors, if they are known."""
+    """In either direction, before a wall of any known colors."""
     true = disc(20.2)
     wall = rng.integers(120, 250, (64, 64, 3)).astype(np.float32)
     picture = pictured(true, wall)
@@ -99,7 +99,7 @@ def test_nothing_changes_where_either_color_is_unknown():
 
 
 def test_the_mask_stays_where_person_and_wall_look_alike():
-    """No displacement is likelier than another, so what is found is as much as was given."""
+    """No displacement is likelier than another, so the area stays."""
     given = disc(20.2)
     found = refine_border(pictured(given, SUIT), given, constant(SUIT, 5.0), constant(SUIT, 5.0))
     assert abs(found.sum() - given.sum()) < 0.02 * given.sum()
@@ -114,7 +114,7 @@ def test_an_unexpected_foreground_color_is_still_person():
     assert found[true == 1.0].mean() > 0.97
 
 
-def test_outside_is_a_distance_to_a_part_of_a_pixel():
+def test_border_distance_has_sub_pixel_accuracy():
     y, x = np.mgrid[0:64, 0:64] + 0.5
     true = np.hypot(x - 31.3, y - 33.7) - 20.2
     near = np.abs(true) < 4.0
