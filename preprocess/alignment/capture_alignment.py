@@ -150,12 +150,10 @@ def align_body(
         return BodyAlignment(shaped=shaped, motion=motion)
     geometry = CaptureGeometry.of(motion, cameras, source)
     if masks is None and not source.has_alpha:
-        placement = place_from_video(geometry, shaped, cameras, source)
-        fit = BodyAlignment(shaped=shaped, motion=motion)
-        return fit if placement is None else _accept(placement, shaped, motion)
+        return _accept(place_from_video(geometry, shaped, cameras, source), shaped, motion)
     objective = silhouette_objective_of(shaped, cameras, source, masks)
     if objective is None:
-        return BodyAlignment(shaped=shaped, motion=motion)
+        return _accept(None, shaped, motion)
     placement = place_body_on_masks(geometry, objective)
     own = shaped.body.with_shape()
     other = place_body_on_masks(geometry, _with_body(objective, own))
@@ -198,8 +196,6 @@ def align_to_person(
         placement = place_body_on_masks(geometry, objective)
     elif foreign and not masked:
         placement = place_from_video(geometry, person, cameras, source)
-    if placement is None:
-        return BodyAlignment(shaped=person, motion=motion, description=difference)
     return _accept(placement, person, motion, difference)
 
 
@@ -213,9 +209,11 @@ def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
 
 
 def _accept(
-    placement: BodyPlacement, shaped: ShapedBody, motion: Motion, prefix: str = ""
+    placement: BodyPlacement | None, shaped: ShapedBody, motion: Motion, prefix: str = ""
 ) -> BodyAlignment:
-    """The alignment with a placement, which is taken if it is an improvement."""
+    """The alignment with a placement, if there is one, which is taken if it is an improvement."""
+    if placement is None:
+        return BodyAlignment(shaped=shaped, motion=motion, description=prefix)
     return BodyAlignment(
         shaped=shaped,
         motion=placement.motion if placement.is_improvement else motion,
