@@ -34,7 +34,7 @@ class PlayerTiming:
         reference_ms: CPU time of one run of the reference graph, median.
         provider: onnxruntime's execution provider.
         workers: How many pictures were drawn at the same time.
-        images_per_second: Wall.
+        pictures_per_second: Wall.
         format: Of this record.
     """
 
@@ -48,7 +48,7 @@ class PlayerTiming:
     reference_ms: float
     provider: str = "CPUExecutionProvider"
     workers: int = 1
-    images_per_second: float = 0.0
+    pictures_per_second: float = 0.0
     format: int = 1
 
     def to_json(self) -> str:
@@ -85,7 +85,7 @@ def benchmark_player(
         reference_ms=_reference_ms(_reference_graph()),
         provider=player.provider,
         workers=workers,
-        images_per_second=len(sequence) / wall,
+        pictures_per_second=len(sequence) / wall,
     )
 
 
