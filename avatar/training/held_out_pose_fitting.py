@@ -61,10 +61,8 @@ def fit_test_poses(
     poses = PoseOptimizer(avatar.rig, len(frames), device, avatar_frozen=True)
     for frame in frames:
         prepared = prepare_frame(frame.observation, avatar.rig)
-        slot, begin = (
-            replay.add(prepared),
-            interpolate_correction(prepared.index, trainer.pose_corrections),
-        )
+        slot = replay.add(prepared)
+        begin = interpolate_correction(prepared.index, trainer.pose_corrections)
         poses.set_pose(slot, prepared.pose, correction=begin)
         if begin.any():
             resolve_correspondences(avatar.rig, replay, poses, slot)
@@ -86,9 +84,8 @@ def fit_test_poses(
         )  # fmt: skip
         field.table_grad.zero_()
         for _ in range(2):
-            correct_one_pose(
-                avatar.rig, trainer.backend, replay, poses, rate=cosine_decay(step / steps)
-            )
+            rate = cosine_decay(step / steps)
+            correct_one_pose(avatar.rig, trainer.backend, replay, poses, rate=rate)
         progress(FITTING_SHARE * (step + 1) / steps)
     for slot, frame in enumerate(frames):
         pose = poses.pose(slot)
