@@ -1,11 +1,12 @@
-"""How well cameras are solved: a phone carried round the actor, in a room and in one of tiles.
+"""Accuracy of solved cameras: a phone is carried around the actor, in a room and in one of tiles.
 
-    python -m benchmarks.camera_accuracy [--seeds 3] [--size 640] [--frames 90] [--keep DIR] [--no-psnr]
+    python -m benchmarks.camera_accuracy [--seeds 3] [--size 640] [--frames 90] [--keep DIR]
+                                         [--no-psnr]
 
-For each film: errors of all cameras after the best alignment (rotation and shift; and scale, which
-is a figure of its own), core time and memory of the solving process. In tiles it may refuse, but
-never lie. Then the scale for a tracker whose body is 4 % too tall, without and with the stated
-height; and what solved cameras cost an avatar.
+For each film: errors of all cameras after the best alignment (rotation, shift, and scale, which is
+a figure of its own), core time and memory of the solver. Between tiles it may refuse, but not give
+wrong cameras. Then the scale for a tracker whose body is 4 % too tall, without and with the stated
+height; and the PSNR that solved cameras cost an avatar.
 """
 
 import argparse
@@ -145,8 +146,8 @@ def measure_film(capture: Path, runs: Path) -> tuple[str, bool | None]:
     assert recording.camera_report is not None
     frames = recording.camera_report["frames"]
     return (
-        f"{errors}; {solved.keys} key frames + {frames['placed']}; {costs['cpu_seconds']:.0f} "
-        f"core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.camera_report['scale']['cues']}",
+        f"{errors}; {solved.keyframe_count} key frames + {frames['placed']}; "
+        f"{costs['cpu_seconds']:.0f} core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.camera_report['scale']['cues']}",
         errors.good,
     )
 

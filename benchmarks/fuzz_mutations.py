@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 ZIPS = (".npz", ".pt", ".r3d", ".iavatar")
+"""Endings of files that are zip archives."""
 
 PICKLE_CALLS = (
     b"cos\nsystem\n(S'true'\ntR", b"cbuiltins\neval\n(S'1'\ntR", b"(S'true'\nios\nsystem\n",

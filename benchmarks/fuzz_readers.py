@@ -35,9 +35,11 @@ FILES_PER_HUNDRED = {
 }  # fmt: skip
 """Files of each reader, of a hundred."""
 BOMB_EVERY = 500
+"""Every file of this number is a bomb, where its reader unpacks."""
 MAX_MEMORY_MB = 1100
 """Of one file: 1 GiB, which is what a stranger's file may unpack to, and some for its records."""
 TIMEOUT_S = 60
+"""Longest time that one file may take, seconds."""
 RUNS = (
     "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.", "socket.",
     "webbrowser.",

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, and never in the place of somebody else's."""
+"""Write files and folders whole or not at all, and never over a file of another program."""
 
 import os
 import re
@@ -17,12 +17,12 @@ from capture.output_file_list import OutputFileList
 class AtomicFile:
     """A file under a random name beside its own, which it takes when it is finished.
 
-    A link is followed: what it points to is replaced. The passing name keeps the suffix, by which
-    encoders know what to write. An older file stays until then. In a folder with a `OutputFileList` the
-    file is listed.
+    The target of a link is replaced. The temporary name keeps the suffix, by which encoders choose
+    a format. An older file stays until `commit`. In a folder with an `OutputFileList` the file is
+    listed.
 
     Attributes:
-        part: Where to write.
+        temporary_path: Where to write until `commit`.
     """
 
     def __init__(self, path: Path, *, replace: bool | None = None) -> None:
@@ -198,11 +198,12 @@ def _remove_replaced(old: Path, path: Path) -> None:
 
 
 def _temporary_name(name: str, kind: str) -> str:
-    """A name that nobody else has, of a length that every file system takes."""
+    """Return an unused name of a length that every file system takes."""
     return f".{name[:100]}.{secrets.token_hex(8)}.{kind}"
 
 
 STREAM_PATH = re.compile(r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd/\d+")
+"""Paths of open streams, which are never replaced."""
 
 
 def is_stream(path: Path) -> bool:

@@ -68,13 +68,13 @@ class Camera:
         )
 
     def resize_longer_side(self, longer_px: int) -> "Camera":
-        """The same camera for a picture whose longer side is so long."""
+        """The same camera for an image with a longer side of `longer_px`."""
         scale = longer_px / max(self.size_px)
         width, height = (max(1, round(side * scale)) for side in self.size_px)
         return self.resize((width, height))
 
     def rotate_quarter_turns(self, quarter_turns: int) -> "Camera":
-        """The camera of the same pictures, turned by so many times 90° against the clock.
+        """The camera of the same pictures, rotated counter-clockwise by this many quarter turns.
 
         Its axes turn with the picture; where it stands and what it sees stay. Distortion can only
         follow where it is radial, or by half a turn of its tangential part's signs.

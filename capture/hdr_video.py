@@ -1,4 +1,4 @@
-"""HDR video: how to see that a file holds it, and how its colours become other pictures'."""
+"""HDR video: detect it in a file's index, and map its colors to 8-bit sRGB."""
 
 from functools import cache
 from pathlib import Path
@@ -7,18 +7,26 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
-PQ, HLG = 16, 18
+PQ = 16
+"""Transfer characteristics of SMPTE ST 2084 (code of ITU-T H.273)."""
+
+HLG = 18
+"""Transfer characteristics of ARIB STD-B67 (code of ITU-T H.273)."""
+
 HDR_TRANSFERS = frozenset({PQ, HLG})
-"""Transfer characteristics of HDR (ITU-T H.273): SMPTE ST 2084, and ARIB STD-B67."""
+"""Codes of all HDR transfer curves."""
 
 WHITE_NITS = 203.0
-"""Of a white page in HDR (ITU-R BT.2408); it becomes white."""
+"""Luminance of diffuse white in HDR (ITU-R BT.2408), which maps to white; cd/m²."""
 
 PEAK_NITS = 1000.0
+"""Luminance of the brightest highlight that stays distinct; cd/m²."""
+
 TONE_MAP_KNEE = 0.75
-"""From here on light is compressed, so that the peak becomes white, too."""
+"""Fraction of white from which light is compressed, so that the peak becomes white."""
 
 MAX_MOOV_BYTES = 64 << 20
+"""Most bytes of a file's index that are searched."""
 
 BT709_FROM_BT2020 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
@@ -26,6 +34,7 @@ BT709_FROM_BT2020 = np.array(
 """Linear BT.709 from linear BT.2020 (ITU-R BT.2087)."""
 
 LUT_SIZE = 4096
+"""Entries of the table from code values to linear light (12 bits)."""
 
 
 def read_hdr_transfer(path: Path) -> int | None:
@@ -63,8 +72,8 @@ def tone_map_hdr(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """8-bit sRGB of a 16-bit picture in BT.2020 with an HDR curve.
 
-    Light is made linear, white brought to `WHITE_NITS`, colours to BT.709; above the knee all three
-    channels are compressed alike, so that hues stay.
+    Light is linearised, white scaled to `WHITE_NITS` and colors converted to BT.709; above the knee
+    all three channels are compressed by one factor, which preserves hues.
     """
     light = np.take(_linear_light_lut(curve), rgb >> 4)
     if curve == HLG:  # the display's gamma of 1.2 for the luminance (ITU-R BT.2100)

@@ -1,7 +1,4 @@
-"""OpenCV without its noise on stderr: what is wrong with a file is said in our own words.
-
-A folder of pictures as frames, in natural order; and the reading of one picture.
-"""
+"""A folder of images as frames, in natural order, and the reading of one image."""
 
 import io
 import os
@@ -20,24 +17,26 @@ from capture.input_error import InputError
 from capture.source import FrameSelection
 
 LOG_LEVEL_SILENT = 0
-"""OpenCV's own number."""
+"""OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
 
 
 @cache
 def silence_opencv() -> None:
     """Silences OpenCV and its FFmpeg; to be called before a file is opened."""
-    import cv2  # heavy, and this file must not make others so
-
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
     (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
 
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+"""File endings of images that are read."""
 
 EXIF_ORIENTATION = 0x0112
+"""EXIF's tag of the orientation."""
+
 EXIF_QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
-"""By EXIF's orientation: turns by 90° against the clock that make a stored picture upright."""
+"""Counter-clockwise quarter turns that make a stored image upright, by EXIF's orientation."""
+
 EXIF_TRANSPOSE = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -47,24 +46,26 @@ EXIF_TRANSPOSE = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""The same with those that are mirrored, for pixels."""
+"""Pillow's operation that makes stored pixels upright, by EXIF's orientation."""
 
 TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
 """How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
 ALPHA_SAMPLES = 5
-"""Pictures, evenly spread, that are asked whether an alpha channel cuts the person out."""
+"""Number of images, evenly spread, whose alpha channel is examined."""
+
 ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
-"""Kinds of pictures that can have an alpha channel."""
+"""File endings of images that can have an alpha channel."""
+
 MIN_TRANSPARENT_FRACTION = 0.01
-"""Share of the pixels that an alpha channel must clear to be a mask: rounded corners clear less."""
+"""Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
 
 ASSUMED_FPS = 30.0
-"""Pictures a second, where nobody has said when each was taken."""
+"""Frame rate of a folder, whose images have no timestamps; 1/s."""
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
-    """Sorts `image_9` before `image_10`."""
+    """Sort `image_9` before `image_10`."""
     return [
         (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)
     ]
@@ -113,7 +114,7 @@ def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
 def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     """Whether the alpha channel of any of a few pictures, spread over all, cuts the person out.
 
-    One picture is no evidence: matting tools write the first ones opaque, or where they see nobody.
+    One image proves nothing: matting tools write opaque ones at first, or where nothing is found.
     """
     able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
     places = np.linspace(0, len(able) - 1, min(ALPHA_SAMPLES, len(able))).round().astype(int)
@@ -145,7 +146,7 @@ def exif_orientation(data: bytes) -> int:
 def _rotate_alpha(
     alpha: UInt8[np.ndarray, "_ _"], data: bytes
 ) -> UInt8[np.ndarray, "height width"]:
-    """An alpha channel as it was stored, made upright as OpenCV makes the colours."""
+    """An alpha channel as it was stored, made upright as OpenCV makes the colors."""
     found = exif_orientation(data)
     if found == 1 or data.startswith(TIFF_MAGIC):
         return alpha
@@ -202,7 +203,7 @@ class ImageFolder:
         )
 
     def frames(self) -> Iterator[Frame]:
-        """The wanted pictures in order; every call starts anew."""
+        """The wanted pictures in order; every call starts from the first."""
         previous = None
         for index, path in enumerate(self._images):
             if not self.selection.contains(index):

@@ -1,4 +1,4 @@
-"""Where two speeds meet: one thread fills, another takes what is there."""
+"""A queue between two threads: one produces items at its own speed, the other takes them."""
 
 import queue
 import threading
@@ -12,14 +12,14 @@ Item = TypeVar("Item")
 class Inbox(Generic[Item]):
     """Runs an iterable on a thread of its own and hands its items over, in order.
 
-    Of a recording nothing is lost: when the inbox is full the producer waits. Of a live source the
-    latest is kept: when the inbox is full the oldest item that nobody has taken gives way. An error
-    in the producer is raised in the consumer, after the items that came before it.
+    When the inbox is full, the producer of a recording waits, so that nothing is lost; for a live
+    source the oldest pending item is dropped. An error in the producer is raised in the consumer,
+    after the items that came before it.
 
     Attributes:
         paced: Whether items come at times of their own, so that hurrying would not help.
         live: Whether the latest is kept.
-        dropped: How many items gave way.
+        dropped: Number of items that were dropped for later ones.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Inbox(Generic[Item]):
 
     @property
     def pending(self) -> int:
-        """How many items have arrived and nobody has taken."""
+        """Number of items that have arrived and were not taken."""
         return self._queue.qsize()
 
     def take(self, *, timeout_s: float = 0.0, max_items: int | None = None) -> list[Item]:
@@ -63,7 +63,7 @@ class Inbox(Generic[Item]):
 
         Args:
             timeout_s: Seconds to wait for a first item.
-            most: Number of items taken at most; None for all.
+            max_items: Number of items taken at most; None for all.
         """
         taken: list[Item] = []
         try:
@@ -101,7 +101,7 @@ class Inbox(Generic[Item]):
         try:
             self._queue.get_nowait()
             self.dropped += 1
-        except queue.Empty:  # somebody has just taken everything
+        except queue.Empty:  # the consumer has just taken everything
             return
 
     def _fill(self, items: Iterable[Item]) -> None:

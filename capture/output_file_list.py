@@ -1,7 +1,7 @@
 """Which files of a folder this program wrote: known by name and content, from a list in the folder.
 
-A file is ours if the list holds its name together with the hash of what it holds now. So a file
-that somebody else put there, or changed, is never taken for ours, and a copied folder still is.
+A file is ours if the list holds its name together with the hash of what it holds now. A file
+that another program wrote or changed is therefore never taken for ours; a copied folder is.
 """
 
 import functools
@@ -21,6 +21,7 @@ RESERVED_PREFIX = ".instant-avatar-"
 LIST_NAME = f"{RESERVED_PREFIX}files"
 """Of the list, in the folder whose files it lists."""
 HEADER = b'{"program": "instant-avatar-stream", "list": "files it wrote here", "format": 1}'
+"""First line of every list; a file without it is not a list of ours."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class OutputFileList:
         """Begins the list, unless there is one.
 
         Raises:
-            InputError: If a file of somebody else has the list's name.
+            InputError: If a foreign file has the list's name.
             OSError: If the disk is full.
         """
         if self.exists():
@@ -124,7 +125,7 @@ class OutputFileList:
             self.remove(name)
         folders = {str(parent) for name in listed for parent in Path(name).parents} - {"."}
         for name in sorted(folders, key=len, reverse=True):
-            with suppress(OSError):  # somebody else's file is in it
+            with suppress(OSError):  # a foreign file is in it
                 (self.folder / name).rmdir()
         self.remove_temporaries()
         self.remove_if_empty()

@@ -1,7 +1,4 @@
-"""How much memory this process has needed.
-
-What is kept of a stream of numbers that may never end: its percentiles, in bounded memory.
-"""
+"""Figures about this process: its peak memory, and percentiles of an endless stream of numbers."""
 
 import random
 import resource
@@ -12,6 +9,7 @@ from typing import final
 import numpy as np
 
 PROC_STATUS = Path("/proc/self/status")
+"""Linux's figures about this process."""
 
 
 def peak_memory_mb() -> float:
@@ -29,7 +27,7 @@ def peak_memory_mb() -> float:
 
 
 RESERVOIR_SIZE = 4096
-"""Numbers that are kept; up to so many the percentiles are exact."""
+"""Numbers that are kept; the percentiles of a shorter stream are exact."""
 
 
 @final
@@ -42,7 +40,7 @@ class ReservoirSample:
     """
 
     def __init__(self, kept: int = RESERVOIR_SIZE) -> None:
-        """An empty one that keeps at most so many."""
+        """Start an empty sample of at most `kept` numbers."""
         self._most = kept
         self._kept: list[float] = []
         self._random = random.Random(0)

@@ -1,9 +1,4 @@
-"""What every source of frames is, recorded or live.
-
-Which frames of a source are wanted: START:STOP:STEP, counted from 0.
-
-A recording whose width and height are exchanged in name only.
-"""
+"""The interface of every source of frames, recorded or live, and the selection of its frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -76,16 +71,16 @@ class FrameSource(Protocol):
         selection: The frames that are wanted.
         frames_in_file: How many frames there are in all, wanted or not, as the container claims;
             of a live source 0.
-        frame_count: How many of them are wanted; fewer may come, see `warnings`. None if nobody
-            knows, of a live source.
-        duration_s: How long the wanted frames last, as the container claims; None if nobody knows.
+        frame_count: Number of selected frames; fewer may come, see `warnings`. None for a live
+            source.
+        duration_s: How long the wanted frames last, as the container claims; None if unknown.
         has_alpha: Whether the frames' own alpha channel is their mask: it cuts the person out of
             one of the pictures that were looked at, and no segmenter was asked for instead.
-        quarter_turns: How often stored pictures are turned by 90° against the clock to be upright.
+        quarter_turns: Counter-clockwise quarter turns that make stored images upright.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
         waited_s: How long `frames()` has waited for frames, in all.
-        dropped: How many frames were lost because nobody took them in time.
+        dropped: Number of frames that were lost because they were not taken in time.
         started_at: When the first frame of a live source was filmed, in seconds since 1970.
         warnings: What was wrong so far; grows while `frames()` is read.
     """
@@ -110,11 +105,11 @@ class FrameSource(Protocol):
 
     @property
     def dropped(self) -> int:
-        """How many frames were lost because nobody took them in time."""
+        """Number of frames that were lost because they were not taken in time."""
         ...
 
     def frames(self) -> Iterator[Frame]:
-        """The frames, lazily and in order; every call starts anew."""
+        """The frames, lazily and in order; every call starts from the first."""
         ...
 
     def count_frames(self) -> int:
@@ -128,10 +123,10 @@ class FrameSource(Protocol):
 
 @final
 class TransposedSource:
-    """A source that is said to be as high as it is wide, and as wide as it is high.
+    """A recording that reports its width as its height and its height as its width.
 
-    With it masks and cameras of the upright pictures can be opened for a film that was rotated by
-    a quarter turn afterwards. The frames themselves stay as they are.
+    With it masks and cameras of upright images can be opened for a video that was rotated by a
+    quarter turn afterwards. The frames themselves are unchanged.
     """
 
     live = False

@@ -11,10 +11,13 @@ from capture.source import FrameSelection, FrameSource
 from capture.video import VIDEO_SUFFIXES, VideoFile
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
+"""File endings of phone images that OpenCV does not read."""
+
 NON_VIDEO_SUFFIXES = HEIC_SUFFIXES | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
-"""Endings of files that people name by mistake."""
+"""Endings of files that are named as a video by mistake."""
+
 SIDE_VIDEO_PREFIXES = ("mask", "preview")
-"""How the names of videos begin that lie beside the one that is meant."""
+"""Starts of the names of videos that lie beside the one that is meant."""
 
 
 def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
@@ -55,7 +58,7 @@ def _list_videos(folder: Path) -> list[Path]:
 
 
 def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
-    """What is said of a folder that is neither pictures nor one video."""
+    """Explain why a folder is neither a folder of images nor one with a single video."""
     if videos:
         found, advice = ", ".join(file.name for file in videos), "Name the video itself."
     else:
@@ -79,7 +82,7 @@ def open_live_source(
         camera: Number or address of a camera instead.
         frames: Which frames are wanted. All if None.
         pace: The clock of a folder.
-        idle_s: No new picture for so long is a folder's end.
+        idle_s: Time without a new image after which a folder ends, seconds.
 
     Raises:
         InputError: If there is no such camera, or no picture comes into the folder.

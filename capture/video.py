@@ -15,6 +15,7 @@ from capture.video_decoder import DecoderFrame, open_decoder
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
 )
+"""File endings of videos that are read."""
 
 CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
@@ -24,10 +25,10 @@ class VideoFile:
     """A recorded video, whose rotation flag is applied.
 
     A file that ends early or has gaps is read as far as it goes, with a warning. Known limit:
-    without PyAV nobody tells which pictures FFmpeg has patched up from damaged data.
+    without PyAV it is unknown which images FFmpeg has concealed damage in.
 
     Attributes:
-        quarter_turns: How often its stored pictures are turned by 90° against the clock.
+        quarter_turns: Counter-clockwise quarter turns that make its stored images upright.
         has_unread_alpha: Whether it has an alpha channel; it is not read (pictures' are).
     """
 
@@ -68,7 +69,7 @@ class VideoFile:
         self._warn_of_hdr()
 
     def frames(self) -> Iterator[Frame]:
-        """The wanted frames in order; every call starts anew."""
+        """The wanted frames in order; every call starts from the first."""
         previous = None
         for index, shot in self._numbered():
             if not self.selection.contains(index):

@@ -1,8 +1,6 @@
-"""What every decoder of videos gives: one picture after the other.
+"""Decode a video file image by image, by PyAV where it is installed and else by OpenCV's FFmpeg.
 
-PyAV's decoder (extra `[video]`): it says which pictures are damaged, and turns HDR into SDR.
-
-Pictures out of a video file, one after the other; OpenCV's FFmpeg, or PyAV where installed.
+PyAV (extra `[video]`) also reports damaged images and converts HDR to SDR.
 """
 
 import importlib
@@ -45,12 +43,12 @@ class VideoDecoder(Protocol):
 
     Attributes:
         fps: Frames per second, as the container claims; 0 if it does not.
-        claimed_frames: How many frames there are, as the container claims; 0 or less if it does not.
-        quarter_turns: How often its pictures are turned by 90° against the clock to stand upright.
-        is_high_bit_depth: Whether its pictures have more than 8 bits.
+        claimed_frames: Number of frames that the container claims; 0 or less if unknown.
+        quarter_turns: Counter-clockwise quarter turns that make its images upright.
+        is_high_bit_depth: Whether its images have more than 8 bits per channel.
         supports_hdr: Whether HDR's highlights are kept.
-        has_unread_alpha: Whether its pictures have an alpha channel, as far as is known one that is not
-            opaque; it is not read.
+        has_unread_alpha: Whether its images have an alpha channel (known not to be opaque, by
+            PyAV); it is not read.
     """
 
     fps: float
@@ -61,12 +59,12 @@ class VideoDecoder(Protocol):
     has_unread_alpha: bool
 
     def decode(self) -> Iterator[DecoderFrame]:
-        """The pictures in order; every call starts anew."""
+        """The pictures in order; every call starts from the first."""
         ...
 
 
 def unreadable_video_error(path: Path) -> InputError:
-    """What is said of a file that no decoder opens."""
+    """Explain a file that no decoder opens."""
     return InputError(
         f"{path} is no video that can be opened; does it hold pictures, or sound "
         "alone? A recording that was cut off before "
@@ -107,7 +105,7 @@ class PyAvDecoder:
         self.quarter_turns = 0 if first is None else int(first[0].rotation) // 90 % 4
 
     def decode(self) -> Iterator[DecoderFrame]:
-        """The pictures in order; every call starts anew."""
+        """The pictures in order; every call starts from the first."""
         with import_pyav().open(str(self._path)) as container:
             stream = container.streams.video[0]
             start = stream.start_time or 0
@@ -211,7 +209,7 @@ class OpenCvDecoder:
         capture.release()
 
     def decode(self) -> Iterator[DecoderFrame]:
-        """The pictures in order; every call starts anew."""
+        """The pictures in order; every call starts from the first."""
         capture, failures = self._open(), 0
 
         def rgb() -> UInt8[np.ndarray, "height width 3"] | None:

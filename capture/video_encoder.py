@@ -21,14 +21,17 @@ from capture.input_error import InputError
 
 Pixels = UInt8[np.ndarray, "height width channels"]
 VIDEO_EXTRA_INSTALL = "pip install 'instant-avatar-stream[video]'"
+"""Command that installs PyAV, for messages."""
 
 H264 = ("libx264", {"crf": "17", "preset": "medium"})
+"""FFmpeg's encoder of MP4, and its options."""
 VP9 = ("libvpx-vp9", {"crf": "22", "b:v": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"})
+"""FFmpeg's encoder of WebM with an alpha channel, and its options."""
 BT709_LIMITED = {"colorspace": 1, "color_primaries": 1, "color_trc": 1, "color_range": 1}
-"""So that every player turns the numbers into the same colours."""
+"""Color tags (codes of ITU-T H.273), so that every player shows the same colors."""
 YUV_ROUNDING = np.array([1, 0, 2], dtype=np.uint8)
-"""OpenCV's way to YUV rounds down, and grey came back darker by (4, 2, 5): so much more is handed
-over. White cannot be made whiter, and comes back as (251, 253, 250)."""
+"""Added to RGB before OpenCV converts to YUV and rounds down: gray came back darker by (4, 2, 5).
+White cannot be raised, and comes back as (251, 253, 250)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +39,7 @@ class ClipEncoder:
     """One way to write a clip.
 
     Attributes:
-        said: What is written, and where it plays, for the user.
+        description: What is written, and where it plays, for the user.
         write: Takes the path, pictures of one size (RGB, or RGBA with straight alpha) and the
             pictures a second; returns how many there were.
     """
@@ -172,8 +175,8 @@ def _write_opencv(path: Path, pictures: Iterator[Pixels], fps: float, code: str)
                     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, size_px)
                 if not writer.isOpened():
                     raise InputError(
-                        f"This OpenCV cannot write {code} video. {VIDEO_EXTRA_INSTALL} can, or choose .webp, "
-                        ".gif or a folder of frames."
+                        f"This OpenCV cannot write {code} video. {VIDEO_EXTRA_INSTALL} can, or "
+                        "choose .webp, .gif or a folder of frames."
                     )
             lifted = np.minimum(even, 255 - YUV_ROUNDING) + YUV_ROUNDING
             writer.write(np.ascontiguousarray(lifted[..., ::-1]))

@@ -1,4 +1,4 @@
-"""Where the parts of a capture lie: what was named, what lies in its folder, what lies beside."""
+"""Find the parts of a capture: as named, in its folder, or beside it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class CapturePaths:
         video: Video file, folder of pictures, or native capture folder.
         poses: The pose file.
         masks: Folder or file of masks; None where there are none.
-        cameras: The camera file; None for a static camera that nobody described.
+        cameras: The camera file; None for a static camera without a description.
     """
 
     video: Path
@@ -66,7 +66,7 @@ def find_capture_paths(
         video: Video file, folder of pictures, or native capture folder.
         poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
         masks: Folder or file of masks.
-        cameras: Camera file; "static" for a static camera that nobody described; "solve" for a
+        cameras: Camera file; "static" for a static camera without a description; "solve" for a
             moving one, for which no file is looked for either.
 
     Raises:
@@ -117,7 +117,7 @@ def find_live_capture_paths(
         cameras: Camera file, or "static".
 
     Raises:
-        InputError: If nobody says where the poses will be, or a camera file is not there.
+        InputError: If it is unknown where the poses will be, or a camera file is not there.
     """
     inside = video.parent if video.name == "images" else video
     is_folder = video.is_dir()
@@ -126,7 +126,7 @@ def find_live_capture_paths(
     if poses is None:
         raise InputError(
             f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "
-            "written anew again and again, or a .jsonl, a frame a line)."
+            "rewritten whenever there are more, or a .jsonl, one line per frame)."
         )
     if masks is None:
         masks = (inside if is_folder else poses.parent) / "masks"

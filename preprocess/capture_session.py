@@ -1,7 +1,4 @@
-"""What a user names of a recording.
-
-All that is known about a video before its first frame is read, checked together.
-"""
+"""A capture: what the user named, and everything opened and aligned before its first frame."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -43,7 +40,7 @@ class CaptureInputs:
             all the rest until cameras were solved), or None.
         body: A body file; None for the embedded body.
         frames: Which frames are wanted.
-        mask_invert: Whether the person is dark in the masks; None finds out.
+        invert_masks: Whether the person is dark in the masks; None finds out.
         live: Whether `video` is a folder that grows; a camera is live without it.
         person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Of a live source: how long nothing new may come.
@@ -96,9 +93,9 @@ class Capture:
         live: Poses and masks of a live source, which come while it runs; `motion` is what had come
             when it was opened.
         segment: What estimates the masks, if nothing holds them.
-        solved: What the report says of cameras that were solved.
+        camera_report: Entry of the report about solved cameras.
         refit: How the poses were fitted to the masks, if they were made for another body.
-        growing_fit: The same of a live source, which goes on while its frames come.
+        live_fit: Fit of a live source's poses to the masks, repeated while frames arrive.
     """
 
     paths: CapturePaths
@@ -125,7 +122,7 @@ class Capture:
         self.pixel_footprint_m()
 
     def observations(self) -> Iterator[Observation | DroppedFrame]:
-        """The frames with pose, mask and camera, in order, lazily; every call starts anew."""
+        """Frames with pose, mask and camera, in order, lazily; every call starts from the first."""
         return map(self.observation_builder(), self.source.frames())
 
     def observation_builder(self) -> Callable[[Frame], Observation | DroppedFrame]:

@@ -31,7 +31,7 @@ def read_npz(
 
     Raises:
         InputError: If the file is missing, damaged, too large, or holds pickled objects under a key
-            that is asked for.
+            in `keys`.
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")

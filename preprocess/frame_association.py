@@ -1,12 +1,7 @@
-"""Which row of a file belongs to which frame, where nothing but the order tells.
+"""Find the row of a file that belongs to a frame: by order, by time, or by the names of its images.
 
-Which pose belongs to which frame, where times tell.
-
-Which frame each mask of a folder belongs to, where some frames have none: by their names.
-
-Frame numbers out of the names of files that hold a frame each.
-
-Which frame each camera belongs to: by the picture's name, by the number in it, or by order.
+Poses have times or come one per frame, masks and cameras have names or come one per frame. What
+cannot be associated with certainty is refused; a wrong association would train a wrong avatar.
 """
 
 import re
@@ -25,6 +20,7 @@ from capture.source import FrameSource
 from preprocess.cameras.named_camera import NamedCamera
 
 NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `time`)"
+"""End of a message about poses."""
 
 
 def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:
@@ -47,16 +43,17 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
             return lambda index: index
         if rows == source.selection.count(count):
             return source.selection.position
+    hint = NUMBERING_HINT if things.startswith("poses") else ""
     raise InputError(
         f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
-        f"frame, in order{NUMBERING_HINT if things.startswith('poses') else ''}.{_mismatch_hint(rows, count)}"
+        f"frame, in order{hint}.{_mismatch_hint(rows, count)}"
     )
 
 
 def _mismatch_hint(rows: int, count: int) -> str:
     """What may have happened, and what to do then."""
     if rows > count:
-        return " Was the video cut, or written anew with fewer frames a second?"
+        return " Was the video cut, or re-encoded with fewer frames per second?"
     step = round(count / rows)
     if step > 1 and rows == -(-count // step):
         return f" If they are those of one frame in {step}: --frames ::{step}."
@@ -64,9 +61,10 @@ def _mismatch_hint(rows: int, count: int) -> str:
 
 
 MAX_TIME_OFFSET_S = 0.05
-"""A pose from farther away is no frame's own, however few poses there are."""
+"""Largest distance of a pose from its frame, seconds."""
+
 MIN_MATCHED_FRACTION = 0.1
-"""Share of the frames, or of the poses, that must belong together by their times."""
+"""Fraction of the frames, or of the poses, that must be associated by their times."""
 
 
 def associate_by_time(
@@ -141,7 +139,7 @@ def associate_by_name(names: Sequence[str], source: FrameSource) -> dict[int, in
     In a folder of pictures a mask belongs to the picture of its name, or of its number. In a video
     numbers count the frames, from 0 if one is 0, from 1 if one is that of the last frame. Numbers
     without a gap are the count of a few chosen frames, and say nothing. Where half of the frames or
-    more would have no mask, somebody has chosen, and should say so.
+    more would have no mask, the masks are a choice that --frames has to state.
 
     Args:
         names: Of the masks' files, without their endings.
@@ -195,9 +193,10 @@ def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
 
 
 MAX_INTERPOLATED_FRAMES = 12
-"""Frames without a camera between two that have one; longer gaps stay gaps."""
+"""Longest run of frames without a camera that is interpolated."""
+
 MIN_NUMBERED_COVERAGE = 0.9
-"""Share of a video's frames that consecutive numbers must reach, to be its frames' own."""
+"""Fraction of a video's frames that consecutive numbers must reach to be frame numbers."""
 
 
 def cameras_by_frame(

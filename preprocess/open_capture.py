@@ -1,9 +1,4 @@
-"""What a user should know about how the parts of a recording were read.
-
-Whose body a recording's poses move: its own, one of a stated height, or a finished avatar's.
-
-Finds, opens and checks the parts of a recording.
-"""
+"""Find, open and align the parts of a capture, and describe what was assumed on the way."""
 
 import shlex
 from collections.abc import Iterator
@@ -65,8 +60,8 @@ def describe_capture(
         masks: The masks, if a file holds them.
         cameras: The cameras.
         choice: Which masks are used.
-        unread: The video, if it has an alpha channel that is not read.
-        looked_for: Where a segmenter was expected to write the masks of a live source.
+        unread_alpha_video: The video, if it has an alpha channel that is not read.
+        expected_masks: Where a segmenter was expected to write the masks of a live source.
     """
     motion, family = fit.motion, fit.shaped.body.family
     if motion.note is not None:
@@ -86,8 +81,8 @@ def describe_capture(
             shlex.quote(str(path)) for path in (unread_alpha_video, folder, folder / "%06d.png")
         )
         yield (
-            f"{unread_alpha_video.name} has an alpha channel, which is not read from videos. If it cuts the "
-            "person out, write pictures, and learn from their folder: "
+            f"{unread_alpha_video.name} has an alpha channel, which is not read from videos. If it "
+            "cuts the person out, write pictures, and learn from their folder: "
             f"mkdir {made} && ffmpeg -i {video} {pictures}"
         )
     if choice.uses_alpha_channel:
@@ -110,8 +105,10 @@ def describe_capture(
 
 
 HEIGHT_TOLERANCE_CM = 1.5
-"""A stated height that is so near to the avatar's own says the same."""
+"""Largest difference between a stated height and the avatar's own, centimetres."""
+
 LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
+"""Note about a live source whose poses are fitted to masks or images."""
 
 
 def fit_person(
@@ -130,8 +127,8 @@ def fit_person(
         motion: In the cameras' world, for the body `shaped`.
         shaped: As the poses' tracker had it in mind.
         cameras, source, masks: See `align_body`.
-        avatars: The person of a finished avatar, as a file, if these poses are added to one.
-        height_m: How tall the person is, if somebody knows.
+        avatar_body: File of a finished avatar's person, if these poses are added to one.
+        height_m: Stated height of the person, metres.
 
     Raises:
         InputError: If a stated height cannot be had.
@@ -156,13 +153,13 @@ def fit_person(
 def fit_live_person(
     motion: Motion, shaped: ShapedBody, *, avatar_body: Path | None, has_masks: bool
 ) -> tuple[BodyAlignment, LiveAlignment | None]:
-    """The same of a live source, whose masks are yet to come.
+    """Choose the body of a live source, whose masks are yet to come.
 
     Args:
         motion: What has come of the poses.
         shaped: As their tracker had it in mind.
-        avatars: See `person_of`.
-        masked: Whether there will be masks that are not estimated.
+        avatar_body: See `fit_person`.
+        has_masks: Whether there will be masks that are not estimated.
 
     Returns:
         The body, and what fits the poses to it while they come, if that is needed.
@@ -182,7 +179,7 @@ def _check_height(person: ShapedBody, height_m: float | None) -> None:
     if height_m is not None and abs(100.0 * height_m - height_cm) > HEIGHT_TOLERANCE_CM:
         raise InputError(
             f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is {height_cm:.0f} cm "
-            "tall, which was settled by its first video. Leave it out, or learn the avatar anew "
+            "tall, which was settled by its first video. Leave it out, or train it from the start "
             "(--overwrite)."
         )
 
@@ -197,10 +194,10 @@ def open_capture(
     """A recording, or a live source whose first picture and first pose are waited for.
 
     Args:
-        wanted: What the user named.
+        inputs: What the user named.
         size_px: Longer side that training will see.
-        doubtful: Leaves out whether the parts fit together, for somebody who wants to find out.
-        avatars: The person of a finished avatar, as a file, to whom the poses are to belong.
+        skip_checks: Opens the parts even if they do not fit together, to find out why.
+        avatar_body: File of a finished avatar's person, to whom the poses belong.
 
     Raises:
         InputError: If a part is missing or unreadable, or they do not fit together.
@@ -208,21 +205,21 @@ def open_capture(
     camera = camera_address(inputs.video)
     if inputs.live or camera is not None:
         return _open_live(inputs, camera, size_px, avatar_body)
-    recording = _open_recorded(inputs, size_px, avatar_body, doubtful=skip_checks)
+    recording = _open_recorded(inputs, size_px, avatar_body, skip_checks=skip_checks)
     if not skip_checks:
         recording.check()
     return recording
 
 
 def _open_recorded(
-    wanted: CaptureInputs, size_px: int | None, avatars: Path | None, *, doubtful: bool
+    wanted: CaptureInputs, size_px: int | None, avatars: Path | None, *, skip_checks: bool
 ) -> Capture:
     paths = find_capture_paths(wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras)
     source, body = open_source(paths.video, frames=wanted.frames), load_body_model(wanted.body)
     source = TransposedSource(source) if wanted.transposed else source
     motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
     doubts: tuple[str, ...] = ()
-    if not doubtful:  # ia-check wants the numbers as they are, and says what is odd by itself
+    if not skip_checks:  # ia-check wants the numbers as they are, and says what is odd by itself
         doubts, motion = (
             tuple(plausibility_warnings(motion)),
             require_plausible(motion, paths.poses),
@@ -263,7 +260,7 @@ def _open_live(
     if wanted.cameras == "solve" or wanted.height_m is not None:
         raise InputError(
             "--cameras solve and --height-cm need a recording; of a live source the camera "
-            "stands still (--cameras static), and nobody knows its poses yet."
+            "stands still (--cameras static), and its poses are yet to come."
         )
     paths = find_live_capture_paths(
         wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras

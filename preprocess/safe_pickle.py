@@ -46,7 +46,7 @@ MAX_NESTED_PICKLES = 2
 """Deepest nesting of pickles in joblib's arrays of objects."""
 
 OLD_TORCH_MAGIC = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
-"""The number with which PyTorch's files before 1.6 begin, as an opcode of a pickle."""
+"""Number at the start of PyTorch's files before 1.6, as an opcode of a pickle."""
 
 
 class UnsafePickleError(Exception):

@@ -1,10 +1,8 @@
-"""Solved cameras joined to a recording, and written beside its avatar.
+"""Solve a run's cameras before training, or beside it, and write them next to the avatar.
 
-When a run's cameras are solved: before it learns, or beside it where it needs only the lens.
-
-An avatar is learnt from poses in the camera of each frame; where that camera stood matters only to
-the world around it. So with a stated K and masks at hand training does not wait. Without K the
-lens must be found first; without masks they are estimated, which must know that the camera moves.
+An avatar is trained from poses in the camera of each frame; where that camera stood matters only to
+the world around it. With a stated K and given masks training therefore does not wait. Without K the
+focal length has to be solved first; without masks the segmenter must know how the camera moves.
 """
 
 import threading
@@ -27,7 +25,7 @@ from preprocess.sfm.metric_world import MetricPlacement, place_in_metric_world, 
 
 
 def apply_camera_solution(recording: Capture, solved: CameraSolution) -> Capture:
-    """The recording in the world of its solved cameras; as it was, if the camera stood still.
+    """Return the capture in the world of its solved cameras; unchanged if the camera stood still.
 
     Args:
         recording: With poses in the camera of each frame.
@@ -36,10 +34,10 @@ def apply_camera_solution(recording: Capture, solved: CameraSolution) -> Capture
     Raises:
         InputError: If nothing tells the size of the world.
     """
-    if solved.still:
+    if solved.is_static:
         note = (
-            f"The camera stood still (what is behind the person moved by {solved.moved:.2%} of the "
-            "picture), so there was nothing to solve."
+            "The camera stood still (the background moved by "
+            f"{solved.background_motion:.2%} of the picture), so there was nothing to solve."
         )
         return replace(
             recording,
@@ -60,7 +58,7 @@ def apply_camera_solution(recording: Capture, solved: CameraSolution) -> Capture
 
 
 def write_solved_capture(recording: Capture, run: RunFolder) -> None:
-    """cameras.npz and poses.npz of the run: the capture's own walk, to be played or reused."""
+    """Write cameras.npz and poses.npz of the run, which can be played or reused."""
     with atomic_file(run.cameras) as path:
         write_cameras(path, recording.cameras)
     with atomic_file(run.poses) as path:
@@ -68,7 +66,7 @@ def write_solved_capture(recording: Capture, run: RunFolder) -> None:
 
 
 def _tracker_camera(recording: Capture) -> Camera | None:
-    """The camera that the poses were made for; None if its lens was only assumed."""
+    """Return the camera that the poses were made for; None if its focal length was only assumed."""
     motion, camera = recording.motion, recording.cameras[0]
     stated = motion.intrinsic is not None or motion.assumed_focal is not None
     return camera if stated or recording.cameras.source != ASSUMED_CAMERA_SOURCE else None
@@ -85,26 +83,26 @@ def _describe_solution(found: dict[str, Any], place: MetricPlacement) -> str:
 
 
 MAX_FOCAL_DIFFERENCE = 0.02
-"""Of a stated focal length, before it is said that the pictures tell another one."""
+"""Relative difference between the stated and the solved focal length that is worth a warning."""
 
 
 @final
 class CameraSolving:
-    """The cameras of one run, sooner or later.
+    """The cameras of one run, while they are being solved.
 
     Attributes:
-        beside: Whether the run learns meanwhile.
-        refused: Why there are none, if a run has learnt without them.
+        beside: Whether training runs at the same time.
+        refused: Why there are no cameras, if the run was trained without them.
     """
 
     def __init__(self, solving: SolverProcess, *, beside: bool) -> None:
-        """Takes over a process that has begun."""
+        """Take over a process that has begun."""
         self._solving, self.beside = solving, beside
         self.refused: str | None = None
         self._asked = False
 
     def wait_before_training(self, recording: Capture, console: Console) -> Capture:
-        """What the run learns from: the recording in its solved world, if it had to be waited for.
+        """Return what the run is trained on: in its solved world, if training had to wait for it.
 
         Raises:
             InputError: If the cameras cannot be solved with certainty.
@@ -113,7 +111,7 @@ class CameraSolving:
             return recording
         try:
             solved = self._solving.wait(console)
-            assert solved is not None  # nobody can stop it here
+            assert solved is not None  # there is no event that could stop it here
             found = apply_camera_solution(recording, solved)
         except KeyboardInterrupt as error:
             error.add_note("Stages of the cameras that were finished are kept: the same command "
@@ -125,9 +123,9 @@ class CameraSolving:
     def wait_after_training(
         self, recording: Capture, run: RunFolder, console: Console, stop: threading.Event
     ) -> Capture:
-        """What the report is about, once the run has learnt beside the solving; it is written.
+        """Return and write what the report is about, after training beside the solver.
 
-        Cameras that are refused now cost nobody the avatar.
+        Refused cameras do not stop the run: the avatar is finished already.
 
         Raises:
             OSError: If the cameras cannot be written.
@@ -156,14 +154,14 @@ class CameraSolving:
 
     @contextmanager
     def save_on_exit(self, recording: Capture, run: RunFolder, console: Console) -> Iterator[None]:
-        """Writes the cameras that are solved already, and, if the block fails, those since then.
+        """Write the cameras solved so far and, if the block fails, those solved since.
 
-        Solving takes minutes: whatever becomes of the avatar, its result is not lost.
+        Solving takes minutes: its result is kept whatever happens to the avatar.
 
         Args:
-            recording: As `before` gave it.
-            run: Where they go; it has begun.
-            console: Where they are named.
+            recording: The capture that `wait_before_training` returned.
+            run: The run, which has begun.
+            console: Prints the paths of the files.
 
         Raises:
             OSError: If cameras that were solved before the block cannot be written.
@@ -173,7 +171,7 @@ class CameraSolving:
             yield
         except BaseException:
             if self.beside and not self._asked:
-                with suppress(InputError, OSError):  # what ended the block is what is said
+                with suppress(InputError, OSError):  # report what ended the block instead
                     at_once = threading.Event()
                     at_once.set()
                     self.wait_after_training(recording, run, console, at_once)
@@ -191,12 +189,12 @@ class CameraSolving:
 def start_camera_solving(
     job: SolveJob | None, recording: Capture, run: RunFolder
 ) -> Iterator[CameraSolving | None]:
-    """Solving that begins now, if there is a job, and does not outlive the block.
+    """Start solving, if there is a job; it does not outlive the block.
 
     Args:
-        job: What is to be solved; None if nothing is.
-        recording: The same capture, opened.
-        run: Where stages are kept.
+        job: What is to be solved, if anything.
+        recording: The opened capture of that job.
+        run: Keeps the stages.
 
     Raises:
         InputError: If pycolmap is missing.

@@ -217,7 +217,7 @@ class SolverProcess:
         self.stop()
 
     def _listen(self, receiver: Connection) -> None:
-        """Empties the pipe, so that the process never waits for somebody to read."""
+        """Empty the pipe all the time, so that the process never blocks on a full one."""
         with receiver, suppress(EOFError, OSError):
             while True:
                 self._messages.put(receiver.recv())

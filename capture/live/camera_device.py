@@ -21,10 +21,13 @@ from capture.live.pacing_clock import PacingClock
 from capture.source import FrameSelection
 
 CAMERA_PREFIX = "camera:"
+"""Start of an argument that names a camera instead of a file."""
+
 MAX_QUEUED_FRAMES = 16
-"""Pictures that wait at most, so that one whose pose is late does not cost the next ones."""
+"""Most frames that wait, so that one whose pose is late does not cost the next ones."""
+
 MAX_READ_FAILURES = 16
-"""How many failures in a row are the end: the camera was unplugged, or the stream is over."""
+"""Consecutive failures that mean the end: the camera was unplugged, or the stream is over."""
 
 
 def camera_address(path: Path) -> str | None:
@@ -101,7 +104,7 @@ class CameraDevice:
                 yield frame
 
     def count_frames(self) -> int:
-        """Nobody knows."""
+        """Return 0: the length of a live source is unknown."""
         return 0
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Waiting that ends at once when somebody says so, and that is counted."""
+"""A clock whose waits are summed up, and can be ended at once from another thread."""
 
 import threading
 import time
@@ -18,11 +18,11 @@ class PacingClock:
     """
 
     def __init__(self, *, clock: Clock = time.perf_counter, wait: Wait | None = None) -> None:
-        """A pace that nobody has ended.
+        """Start a clock that was not stopped.
 
         Args:
             clock: Seconds; another one in tests.
-            wait: Lets so many seconds go by, fewer once the pace is ended.
+            wait: Sleeps for the given seconds, or until the clock is stopped.
         """
         self._ended = threading.Event()
         self._clock = clock
@@ -31,7 +31,7 @@ class PacingClock:
 
     @property
     def stopped(self) -> bool:
-        """Whether nobody waits any more."""
+        """Whether `stop` was called: every wait returns at once."""
         return self._ended.is_set()
 
     def now(self) -> float:
@@ -46,7 +46,7 @@ class PacingClock:
         """Waits for a moment on the clock; does not if it has gone by.
 
         Returns:
-            Whether to go on: False once somebody has ended it.
+            Whether to go on: False after `stop`.
         """
         began = self._clock()
         if moment > began and not self.stopped:

@@ -56,7 +56,7 @@ class RealtimePlayback:
         return self._source.dropped
 
     def frames(self) -> Iterator[Frame]:
-        """The frames when they are due, read one ahead; every call plays anew."""
+        """The frames when they are due, read one ahead; every call plays from the start."""
         began = due = None
         for frame in self._source.frames():
             if began is None or due is None or self.catch_up:

@@ -22,16 +22,22 @@ from capture.live.pacing_clock import PacingClock
 from capture.source import FrameSelection
 
 DONE_FILE_NAME = "DONE"
-"""A file of this name in the folder says that no more pictures will come."""
+"""Name of the file whose presence means that no more images will come."""
+
 IDLE_TIMEOUT_S = 10.0
-"""No new picture for so long is the end, too."""
+"""Time without a new image after which the source ends, seconds."""
+
 POLL_INTERVAL_S = 0.05
+"""Shortest time between two looks at the folder, seconds."""
+
 DAMAGED_AFTER_S = 2.0
-"""A picture that cannot be read so long after its last change is damaged, not incomplete."""
+"""Time after its last change from which an unreadable image counts as damaged, seconds."""
+
 MAX_PENDING = 8
-"""Of more pictures than this that wait, so many are taken, evenly, the newest among them."""
+"""Most pending images; of more, this number is taken, evenly spaced and with the newest."""
+
 MAX_PENDING_AT_START = 200
-"""The same of those that are there already when the watch begins."""
+"""Most images that are taken of those that exist when the watch begins, evenly spaced."""
 
 Picture = tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]
 

@@ -1,7 +1,4 @@
-"""Body files: SMPL's own keys or the embedded body's, from .npz or .pkl.
-
-The person at rest as a file: the body that an avatar has, for poses that come later.
-"""
+"""Read body models (SMPL's keys, .npz or .pkl), and read or write the resting body of an avatar."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +13,10 @@ from preprocess.file_content import read_npz
 from preprocess.safe_pickle import read_pickled_arrays
 
 REQUIRED_BODY_KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
+"""Keys of SMPL's body files that must exist."""
+
 BODY_KEYS = (*REQUIRED_BODY_KEYS, "J_regressor", "J", "J_shapedirs", "posedirs")
+"""All keys of body files that are read."""
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
@@ -128,6 +128,7 @@ def _normalize_weights(
 
 
 SHAPED_BODY_KEYS = ("family", "vertices", "joints")
+"""Keys of a file that holds an avatar's person."""
 
 
 def write_shaped_body(path: Path, person: ShapedBody) -> None:
@@ -164,6 +165,6 @@ def read_shaped_body(path: Path, body: BodyModel) -> ShapedBody:
         raise InputError(
             f"{path}: the avatar was learnt on a {family!r} body of {len(vertices)} vertices, "
             f"now it is {body.family!r} with {len(body.template)}. Give the same --body as then "
-            "(none is the embedded body), or learn the avatar anew (--overwrite)."
+            "(none is the embedded body), or train the avatar from the start (--overwrite)."
         )
     return ShapedBody(body=body, vertices=vertices, joints=arrays["joints"].astype(np.float64))

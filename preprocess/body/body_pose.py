@@ -43,8 +43,8 @@ class RelativeFocalLength:
     """A focal length that is known only as a share of the picture, looking at its middle.
 
     Attributes:
-        share: The focal length in units of `of`.
-        of: The picture's longer side, or its diagonal.
+        ratio: Focal length as a fraction of `reference`.
+        reference: The image's longer side, or its diagonal.
     """
 
     ratio: float
@@ -70,20 +70,20 @@ class Motion:
     Attributes:
         root_rotations, root_translations, joint_rotations: As in `BodyPose`, one row a pose.
         valid: Which rows may be used (finite, and not marked as lost by the tracker).
-        betas: Shape coefficients; they mean something only to the body family named in `model`.
-        model: Body family whose tracker made the poses: "smpl" or "body24".
+        betas: Shape coefficients; they are valid only for the body family named in `body_model`.
+        body_model: Body family whose tracker made the poses: "smpl" or "body24".
         model_is_stated: Whether the file names that family; if not, it is a guess.
         frames: Index of the video frame that each row belongs to, if the file says so.
         times_s: Time of each row in seconds, if the file says so.
         intrinsic: The tracker's own camera matrix K, if the file holds one.
-        lens: What the tracker took for the focal length, where the file holds no K.
-        anchor: Which point of the resting body `root_translations` speak of. "pelvis": the root
-            turns about it, and they are SMPL's. "origin" and "hips" (the middle between both):
-            that point is carried to `root_translations` (EasyMocap; BEV). `preprocess.poses.root_placement`
-            makes them SMPL's, once the body is known.
+        assumed_focal: Focal length that the tracker assumed, where the file holds no K.
+        anchor: Point of the resting body that `root_translations` refer to. "pelvis": SMPL's
+            convention, the root rotates about it. "origin" (EasyMocap) and "hips" (BEV; the middle
+            between both): that point moves to `root_translations`; `root_placement` converts them
+            to SMPL's convention once the body is known.
         space: "world", or "camera": each row in the camera of its frame.
         camera_from_world: The camera of each row, if the file holds them.
-        bridged: Which rows the tracker had lost, filled in between their neighbours.
+        interpolated: Rows that the tracker had lost, filled in between their neighbors.
         note: What a user should know about how the file was read.
     """
 
@@ -123,7 +123,7 @@ class Motion:
 
         Args:
             rows: Which ones, in their new order.
-            frames: The frame that each belongs to; None if nobody says so.
+            frames: The frame that each row belongs to; None if unknown.
         """
         cameras, bridged = self.camera_from_world, self.interpolated
         return replace(

@@ -1,7 +1,4 @@
-"""The 24-joint tree that every body and every pose here is about (SMPL's; Loper et al. 2015).
-
-Forward kinematics of the 24-joint tree, in numpy alone (the player uses it too).
-"""
+"""SMPL's tree of 24 joints (Loper et al. 2015) and its forward kinematics, in numpy alone."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -1,7 +1,4 @@
-"""The parametric body in three stages: a model, a shape of it, a pose of that.
-
-Which shape a motion gives a body.
-"""
+"""A parametric body in three stages: the model, a shape of it, and a pose of that shape."""
 
 import json
 from dataclasses import dataclass

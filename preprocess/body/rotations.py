@@ -12,6 +12,7 @@ SHARED_JOINTS = 22
 """Root and body joints that SMPL, SMPL+H and SMPL-X have in common, in one order."""
 
 SMPL_JOINTS = 24
+"""Number of SMPL's joints, the root included."""
 
 SUPPORTED_JOINT_COUNTS = (22, 24, 52, 55)
 """How many joints a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""

@@ -18,7 +18,7 @@ from preprocess.frame_association import cameras_by_frame, interpolate_missing_c
 DEFAULT_FOCAL_RATIO = 0.85
 """Focal length of a phone's main camera in video, in units of the picture's longer side."""
 ASSUMED_CAMERA_SOURCE = f"{DEFAULT_FOCAL_RATIO} x longer side"
-"""Where a camera comes from of which nothing at all was said."""
+"""Origin of a camera, for the report, if neither a file nor the poses state one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -27,9 +27,9 @@ class CameraTrack:
 
     Attributes:
         cameras: One for all frames, or one for each in order.
-        source: Where they come from, in words for the report.
+        source: Where they come from, for the report.
         note: What was changed to make them fit, if anything.
-        missing: Frames that have no camera of their own, and cannot be used.
+        frames_without_camera: Numbers of frames that have no camera and cannot be used.
     """
 
     cameras: tuple[Camera, ...]
@@ -191,8 +191,9 @@ def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrac
     note = f"No camera was given; a focal length of {focal:.0f} px is assumed."
     if motion.assumed_focal is not None:
         note += (
-            f" The tracker's own ({motion.assumed_focal.ratio:.1f} times the {motion.assumed_focal.reference}) is no "
-            "camera's; the person's distance was solved anew."
+            f" The tracker's own ({motion.assumed_focal.ratio:.1f} times the "
+            f"{motion.assumed_focal.reference}) is no camera's; the person's distance was solved "
+            "again."
         )
     return CameraTrack(cameras=(camera,), source=ASSUMED_CAMERA_SOURCE, note=note)
 

@@ -14,8 +14,8 @@ from preprocess.cameras.camera_file import CameraTrack, read_cameras
 from preprocess.cameras.colmap import find_colmap_model
 
 MIRRORED_EXIF_QUARTER_TURNS = {2: 0, 4: 2, 5: 1, 7: 3}
-"""EXIF's orientations of photographs that are mirrored: how many turns by 90° against the clock
-make them upright, once left and right were exchanged."""
+"""Counter-clockwise quarter turns that make a mirrored photograph upright after left and right were
+exchanged, by EXIF's orientation."""
 
 
 def read_upright_cameras(path: Path, source: FrameSource) -> CameraTrack:
@@ -101,7 +101,7 @@ def _rotate_track(stored: CameraTrack, path: Path, source: FrameSource) -> Camer
 
 
 def _map_cameras(track: CameraTrack, said: str, change: Callable[[Camera], Camera]) -> CameraTrack:
-    """All cameras changed, and that it is said."""
+    """Change all cameras, and add a sentence to the note."""
     return replace(
         track,
         cameras=tuple(change(camera) for camera in track.cameras),

@@ -1,4 +1,4 @@
-"""One door for cameras of other programs: which one wrote them is told by what is inside."""
+"""Read the cameras of any known program, which is recognised by the content of its files."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ READABLE_FORMATS = (
     "images.bin, or .txt), a transforms.json of nerfstudio or instant-ngp, Record3D's .r3d or its "
     "metadata, Polycam's folder, EasyMocap's intri.yml and extri.yml, or ZJU-MoCap's annots.npy"
 )
-"""For messages."""
+"""List of the formats, for messages."""
 
 
 def read_named_cameras(path: Path, size_px: tuple[int, int] | None = None) -> list[NamedCamera]:

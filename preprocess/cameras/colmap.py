@@ -15,8 +15,14 @@ from preprocess.cameras.named_camera import NamedCamera, image_name
 MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""
 
-MIN_CAMERA_BYTES, IMAGE_HEADER_BYTES, POINT_BYTES = 24 + 3 * 8, 4 + 7 * 8 + 4, 24
-"""Bytes of a camera in cameras.bin, before a picture's name in images.bin, of a point behind it."""
+MIN_CAMERA_BYTES = 24 + 3 * 8
+"""Bytes of the shortest camera in cameras.bin."""
+
+IMAGE_HEADER_BYTES = 4 + 7 * 8 + 4
+"""Bytes before an image's name in images.bin."""
+
+POINT_BYTES = 24
+"""Bytes of a point behind an image's name in images.bin."""
 
 OPENCV_DISTORTION = {
     "SIMPLE_PINHOLE": lambda p: (),
@@ -47,7 +53,7 @@ def read_colmap_model(folder: Path) -> list[NamedCamera]:
     """
     import pycolmap  # heavy, and only needed for its own files
 
-    pycolmap.logging.minloglevel = 3  # it would print to stderr what is said here
+    pycolmap.logging.minloglevel = 3  # the message below explains the error instead
     try:
         with TemporaryDirectory() as bare:
             _copy_without_points(folder, Path(bare))
@@ -105,7 +111,8 @@ def _camera(image: Any, model: Any, folder: Path) -> Camera:
     if kind not in OPENCV_DISTORTION:
         raise InputError(
             f"The COLMAP model in {folder} has a camera of the model {kind}; expected one of "
-            f"{', '.join(OPENCV_DISTORTION)}. Undistort the pictures first (colmap image_undistorter)."
+            f"{', '.join(OPENCV_DISTORTION)}. Undistort the pictures first (colmap "
+            "image_undistorter)."
         )
     camera_from_world = np.eye(4)
     camera_from_world[:3] = image.cam_from_world().matrix()

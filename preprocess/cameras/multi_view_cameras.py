@@ -20,7 +20,14 @@ from capture.input_error import InputError
 from preprocess.cameras.named_camera import parse_pinhole_camera, parse_rigid_transform
 from preprocess.file_content import read_untrusted_file
 
-INTRINSICS, EXTRINSICS, ZJU = "intri.yml", "extri.yml", "annots.npy"
+INTRINSICS = "intri.yml"
+"""EasyMocap's file of camera matrices and distortions."""
+
+EXTRINSICS = "extri.yml"
+"""EasyMocap's file of rotations and translations."""
+
+ZJU = "annots.npy"
+"""ZJU-MoCap's file of all cameras."""
 
 OPENCV_MATRIX_PATTERN = re.compile(
     r"^(\w+):\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+data:\s*\[([^\]]*)\]",
@@ -29,10 +36,16 @@ OPENCV_MATRIX_PATTERN = re.compile(
 """A matrix in OpenCV's YAML. OpenCV's own reader writes beyond its memory on damaged files."""
 
 IMAGE_SIZE_PATTERN = re.compile(r"^([HW]_\w+):\s*([0-9.]+)\s*$", re.MULTILINE)
+"""Width or height of a camera's images in OpenCV's YAML."""
+
 MAX_YAML_BYTES = 1 << 24
+"""Largest YAML file that is read."""
+
 MM_PER_M = 1000.0
+"""Millimetres in a metre: the unit of ZJU-MoCap's translations."""
+
 MAX_PARENT_FOLDERS = 3
-"""Names of so many folders above a picture may be its camera's."""
+"""Number of folders above an image whose names may be its camera's."""
 
 Numbers = Mapping[str, Float[np.ndarray, "rows columns"]]
 

@@ -99,7 +99,8 @@ def parse_pinhole_camera(
     sizes = min(width, height) >= 1.0 and max(width, height) <= MAX_IMAGE_SIDE_PX
     if not np.isfinite([fx, fy, cx, cy, width, height]).all() or min(fx, fy) <= 0.0 or not sizes:
         raise InputError(
-            f"{where}: focal length and size must be positive pixels, and at most {MAX_IMAGE_SIDE_PX}."
+            f"{where}: focal length and size must be positive pixels, and at most "
+            f"{MAX_IMAGE_SIDE_PX}."
         )
     return Camera(
         focal_px=(fx, fy),

@@ -20,9 +20,10 @@ from preprocess.cameras.named_camera import (
 SUPPORTED_CAMERA_MODELS = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
 )  # fmt: skip
+"""Camera models of transforms.json that OpenCV's distortion can express."""
 
 MAX_CENTER_OFFSET = 0.1
-"""By so much of its size a principal point may be off the middle of its own picture."""
+"""Largest offset of a principal point from the image's center; a fraction of the image's size."""
 
 
 def read_transforms(
@@ -30,7 +31,7 @@ def read_transforms(
 ) -> list[NamedCamera]:
     """The cameras of a transforms.json, sorted by their pictures' names.
 
-    `applied_transform`, with which ns-process-data turns COLMAP's world, is taken back.
+    ns-process-data turns COLMAP's world by `applied_transform`; that is undone.
 
     Args:
         content: The JSON.
@@ -64,7 +65,9 @@ def read_transforms(
 
 def _name(frame: dict[str, Any], path: Path) -> str:
     if not isinstance(frame.get("file_path"), str):
-        raise InputError(f"{path}: a frame has no `file_path`, so nobody knows whose camera it is.")
+        raise InputError(
+            f"{path}: a frame has no `file_path`, which would tell whose camera it is."
+        )
     return image_name(frame["file_path"])
 
 
@@ -75,8 +78,9 @@ def _camera(
     lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")
     if lens not in SUPPORTED_CAMERA_MODELS:
         raise InputError(
-            f"{path}: camera model {lens}; expected one of {', '.join(SUPPORTED_CAMERA_MODELS)}. Undistort the "
-            "pictures first (cv2.fisheye.undistortImage, or colmap image_undistorter)."
+            f"{path}: camera model {lens}; expected one of {', '.join(SUPPORTED_CAMERA_MODELS)}. "
+            "Undistort the pictures first (cv2.fisheye.undistortImage, or colmap "
+            "image_undistorter)."
         )
     numbers = _with_size(numbers, size_px)
     world = parse_rigid_transform(numbers.get("transform_matrix"), f"{path}, transform_matrix")

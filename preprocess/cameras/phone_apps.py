@@ -26,9 +26,13 @@ POLYCAM_SUBFOLDERS = (
     "corrected_cameras",
     "cameras",
 )
+"""Folders of Polycam's cameras, best first."""
+
 POLYCAM_KEYS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
+"""Polycam's keys of the upper three rows of world-from-camera."""
+
 MAX_METADATA_BYTES = 1 << 28
-"""A metadata file that is larger is none."""
+"""Largest metadata file that is read."""
 
 
 def read_record3d(content: dict[str, Any], path: Path) -> list[NamedCamera]:

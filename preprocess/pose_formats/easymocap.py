@@ -15,6 +15,7 @@ from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
 REQUIRED_KEYS = {"Rh", "Th", "poses"}
+"""Keys by which a file of EasyMocap is recognised."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -11,6 +11,7 @@ from typing import Any
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 COORDINATE_KEYS = ("smpl_params_incam", "smpl_params_global")
+"""Keys of the poses in the camera and in the world."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -1,8 +1,8 @@
 """The keys of InstantAvatar, which its successors write too, in any container; and HumanData.
 
 Layout: global_orient, body_pose, transl; or thetas, transl; or poses, trans; with optional keys of
-ours (frame, time, valid, K, camera, model): see `preprocess.poses.pose_file`. mmhuman3d's HumanData holds
-the same under `smpl`, and so does EMDB. Other names of the same things are known, too (`KEY_ALIASES`).
+ours (frame, time, valid, K, camera, model): see `preprocess.poses.pose_file`. mmhuman3d's HumanData
+and EMDB hold these under `smpl`. Other names of the keys are known, too (`KEY_ALIASES`).
 """
 
 from collections.abc import Mapping
@@ -40,8 +40,8 @@ MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
 SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
 """What may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
-    *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame", "time",
-    "valid", "K", "model", "space", "scale",
+    *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
+    "time", "valid", "K", "model", "space", "scale",
 )  # fmt: skip
 """What is taken of a file; whatever else is in it is left there."""
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
@@ -82,8 +82,8 @@ def parse_people(content: Any, path: Path, default_model: str) -> MotionByPerson
     if default_model == "smpl" and motion.body_model == "smpl" and sex in GENDERED_MODELS:
         motion = replace(
             motion,
-            note=f"The shape in {path.name} is one of SMPL's {GENDERED_MODELS[sex]} body; another body "
-            "(--body) makes somebody else of it.",
+            note=f"The shape in {path.name} is one of SMPL's {GENDERED_MODELS[sex]} body; with "
+            "another body (--body) it is another person's.",
         )
     return {"0": motion}
 
@@ -95,10 +95,10 @@ def _gender(held: Mapping[Any, Any], content: Mapping[Any, Any]) -> Any:
 
 
 def normalize_keys(held: Mapping[Any, Any]) -> dict[str, Any]:
-    """The same by the house's keys, where another name stands for what is missing.
+    """Rename other programs' keys to ours, where ours are missing.
 
-    The body is named where other keys tell: hands and face are SMPL-X's; whoever states a gender,
-    or uses other names, has fitted SMPL.
+    The body model follows from other keys: hands and face are SMPL-X's; a gender, or other names,
+    mean SMPL.
     """
     found = {str(key): value for key, value in held.items() if value is not None}
     foreign, ours = False, any(set(keys) <= found.keys() for keys in POSE_KEY_LAYOUTS)
@@ -114,7 +114,7 @@ def normalize_keys(held: Mapping[Any, Any]) -> dict[str, Any]:
         if SMPLX_KEYS & found.keys() or "smplx" in kind:
             found["model"] = "smplx"
         elif "gender" in found or foreign:
-            found["model"] = "smpl"  # nobody else's programs know the embedded body
+            found["model"] = "smpl"  # only our own programs know the embedded body
     return found
 
 

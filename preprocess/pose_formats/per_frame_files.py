@@ -1,8 +1,8 @@
 """A file, or an object of JSON, for each frame, each with one pose: many programs' way.
 
 Layout: a folder of .npz, .json or .pkl, or one file with a list or with objects by frames' names,
-each with the keys of `preprocess.pose_formats.instant_avatar` for one row: ExAvatar's `smplx_params/0.json`
-{root_pose, body_pose, trans}, LHM's with focal and princpt beside, SMPLer-X's `00001_0.npz`, ARAH's
+each with the keys of `instant_avatar` for one row: ExAvatar's `smplx_params/0.json` {root_pose,
+body_pose, trans}, LHM's with focal and princpt beside, SMPLer-X's `00001_0.npz`, ARAH's
 `models/000001.npz` {root_orient, pose_body, trans}, HumanNeRF's `metadata.json` {frame_000001:
 {poses, cam_intrinsics, cam_extrinsics}}, whose camera alone says where the person is.
 """
@@ -23,8 +23,13 @@ from preprocess.poses.pose_file import motion_from_arrays
 ROTATION_MATRIX_SIZES = frozenset(9 * joints for joints in (1, 21, 22, 23, 24, 52, 55))
 """How many numbers a row of rotation matrices has; 63 of body_pose are axis-angles."""
 ROTATION_KEYS = ("global_orient", "body_pose", "thetas", "poses")
+"""Keys of rotations."""
+
 ROW_SHAPES = {"transl": (3,), "K": (3, 3), "camera": (4, 4), "betas": (-1,)}
+"""Shape of one row of each other array."""
+
 ROW_KEYS = (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
+"""All keys that are read of one row."""
 
 
 def parse_people(content: Any, path: Path, default_model: str) -> MotionByPerson | None:

@@ -15,6 +15,7 @@ from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
 PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
+"""PHALP's focal length: 5,000 px on a square of 256 px."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -1,7 +1,4 @@
-"""Files that are no poses, or poses that are not read: what they are, and what to do.
-
-The one door to all pose files: which tracker's it is, whose poses are wanted.
-"""
+"""Read any pose file: recognise its tracker, choose the person, explain files that are not read."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -53,7 +50,7 @@ ADVICE_BY_KEYS = (
         "it has vertices of meshes, not the rotations that made them.",
     ),
 )
-"""Keys of which one is enough, and what is to be said then."""
+"""Keys of files that are not read (one of a set is enough), and the advice for each."""
 
 ADVICE_BY_ROW_SIZE = {
     322: "(N, 322) is Motion-X's: write root_orient = [:, :3], pose_body = [:, 3:66] and trans = "
@@ -123,19 +120,19 @@ def read_poses(
 ) -> Motion:
     """Poses from a file, or a folder of files, of any tracker that is known (docs/formats.md).
 
-    Of several people the one with most poses is taken, and the others are named in the note. What
-    the tracker lost for a few frames is bridged and marked. The poses are still about the file's
-    own anchor, in its own space: `preprocess.poses.root_placement` brings them to a body and its cameras.
+    Of several people the one with most poses is chosen, and the note names the others. Short gaps
+    of the tracker are interpolated and marked. The poses keep the file's anchor and space;
+    `preprocess.poses.root_placement` converts them for a body and its cameras.
 
     Args:
         path: The file or folder; of a capture folder the poses in it.
         default_model: Body family of files that do not say theirs.
         person: Whose poses, by the file's own number or name.
-        driving: Whether they shall move an avatar: then in the world rather than in a camera.
+        prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
 
     Raises:
-        InputError: If there is no such file, it holds no poses that are known, or nobody of that
-            name.
+        InputError: If there is no such file, it holds no known poses, or no person of
+            that name.
     """
     path = resolve_pose_path(path)
     if path.suffix.lower() == ".jsonl":
@@ -149,8 +146,8 @@ def read_poses(
     note = motion.note
     if motion.interpolated is not None:
         said = (
-            f"{int(motion.interpolated.sum())} poses that {tool} had lost were filled in between their "
-            f"neighbours (gaps of up to {MAX_GAP_FRAMES} frames)."
+            f"{int(motion.interpolated.sum())} poses that {tool} had lost were filled in between "
+            f"their neighbours (gaps of up to {MAX_GAP_FRAMES} frames)."
         )
         note = said if note is None else f"{note} {said}"
     return replace(motion, note=note)
@@ -185,9 +182,9 @@ def _recognize(
         ) from cause
     if people is None:
         raise InputError(
-            f"{path} holds no poses that are known: {describe_unknown_content(content)} Expected global_orient, "
-            f"body_pose and transl (or poses and trans), or a file of {', '.join(TRACKERS)}; see "
-            "docs/formats.md."
+            f"{path} holds no poses that are known: {describe_unknown_content(content)} Expected "
+            "global_orient, body_pose and transl (or poses and trans), or a file of "
+            f"{', '.join(TRACKERS)}; see docs/formats.md."
         )
     return "its tracker", people
 
@@ -196,7 +193,7 @@ def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Mo
     """The person that is wanted, or the one with most poses."""
     if person is not None and person not in people:
         raise InputError(
-            f"{path} holds nobody called {person!r} (--person); it holds {_list_people(people)}."
+            f"{path} holds no person called {person!r} (--person); it holds {_list_people(people)}."
         )
     name = person or max(people, key=lambda known: int(people[known].valid.sum()))
     motion = people[name]
@@ -205,7 +202,8 @@ def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Mo
     others = {known: held for known, held in people.items() if known != name}
     note = (
         f"{path.name} holds {len(people)} people; {name} was taken, who has most poses "
-        f"({int(motion.valid.sum())}). The others: {_list_people(others)}. --person ID takes another."
+        f"({int(motion.valid.sum())}). The others: {_list_people(others)}. --person ID takes "
+        "another."
     )
     return replace(motion, note=note)
 

@@ -11,6 +11,7 @@ from preprocess.pose_formats.tram import intrinsic_from_focal
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 COORDINATE_KEYS = ("smplx_cam", "smplx_world")
+"""Keys of the poses in the camera and in the world."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -22,9 +22,10 @@ WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
 """The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 
 VIDEO_RESULTS = "video_results.npz"
+"""Name of ROMP's file for a whole video."""
 
 MAX_STEP_M = 1.0
-"""From frame to frame nobody is expected to move farther; without track numbers that tells."""
+"""Largest step of one person between frames, metres; it separates people without track numbers."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -1,6 +1,6 @@
-"""Several people in one array: SLAHMR_KEYS and its successors, and the data set 3DPW.
+"""Several people in one array: SLAHMR and its successors, and the data set 3DPW.
 
-Layout: SLAHMR_KEYS's `*_world_results.npz` {trans (P, N, 3), root_orient (P, N, 3), pose_body
+Layout: SLAHMR's `*_world_results.npz` {trans (P, N, 3), root_orient (P, N, 3), pose_body
 (P, N, 63), betas (P, 16), cam_R (P, N, 3, 3) and cam_t (P, N, 3) camera-from-world, intrins (4,) =
 fx fy cx cy, perhaps track_mask (P, N)}, metres; 3DPW's pickle {poses [(N, 72)], trans [(N, 3)],
 betas, cam_poses (N, 4, 4), cam_intrinsics}. (github.com/vye16/slahmr, optim/output.py; 3DPW's
@@ -16,7 +16,10 @@ from preprocess.body.body_pose import Motion
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 SLAHMR_KEYS = frozenset({"root_orient", "pose_body", "trans"})
+"""Keys by which a file of SLAHMR is recognised."""
+
 DPW_KEYS = frozenset({"poses", "trans", "cam_poses", "cam_intrinsics"})
+"""Keys by which a file of 3DPW is recognised."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 REQUIRED_KEYS = {"pred_rotmat", "pred_trans", "frame"}
+"""Keys by which a file of TRAM is recognised."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
@@ -48,6 +49,7 @@ def _person(rows: dict[str, Any], camera: Any) -> Any:
 
 
 def intrinsic_from_focal(focal: Any, center: Any) -> Float[np.ndarray, "3 3"] | None:
+    """Camera matrix K of a focal length and a principal point; None where one is missing."""
     if focal is None or center is None:
         return None
     f, (x, y) = float(np.asarray(focal).reshape(-1)[0]), np.asarray(center).reshape(-1)[:2]

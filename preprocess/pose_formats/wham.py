@@ -11,6 +11,7 @@ from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 WHAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
+"""WHAM's focal length where none was given."""
 
 
 def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | None:

@@ -1,4 +1,4 @@
-"""Gaps in a track, bridged between their neighbours, and marked."""
+"""Fill short gaps in a motion between their neighbors, and mark the filled rows."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.rotations import slerp
 
 MAX_GAP_FRAMES = 12
-"""Missing frames in a row that are filled in; a person does a lot in a second half of 24."""
+"""Longest gap that is filled, frames: half a second at 24 Hz."""
 
 
 def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
@@ -21,10 +21,10 @@ def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
 
     Args:
         motion: One row a frame at most.
-        longest: Of how many frames a gap may be.
+        max_gap: Longest gap that is filled, frames.
     """
     if motion.camera_from_world is not None and motion.frames is not None:
-        return motion  # nobody knows where the cameras of the missing frames stood
+        return motion  # the cameras of the missing frames are unknown
     numbers = motion.frames if motion.frames is not None else np.arange(len(motion))
     good = np.flatnonzero(motion.valid)
     before = good[:-1][(np.diff(numbers[good]) > 1) & (np.diff(numbers[good]) <= max_gap + 1)]

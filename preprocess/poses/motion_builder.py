@@ -31,12 +31,13 @@ def build_motion(
 
     Args:
         rotations: What holds the rotations, root first; see `joint_rotations`.
-        places: Where the root is, one row a pose, metres.
+        translations: Where the root is, one row a pose, metres.
         betas: One row, or one row a pose: then their median.
         frames: The frames' numbers; of a number that comes twice the first row counts.
         times_s: Times in seconds.
         lost: Which rows the tracker itself calls lost.
-        model, space, anchor, intrinsic, lens, note: As in `Motion`; one K, or one a pose.
+        body_model, space, anchor, assumed_focal, note: See `Motion`.
+        intrinsic: One K, or one per pose.
 
     Raises:
         ValueError: If the parts do not fit together.

@@ -1,10 +1,10 @@
 """Plausibility of poses: which numbers cannot be a body's pose, and which are only odd.
 
-Every command that reads poses judges them here, so that all of them know the same mistakes:
+Every command that reads poses checks them here:
 
-    motion = read_poses(path)            # as the file has it; ia-check needs it so, to mend it
-    motion = plausible(motion, path)     # refuses degrees and millimetres, drops single bad rows
-    for sentence in oddities(motion): …  # what may be meant, as a warning
+    motion = read_poses(path)                         # as the file has it, for ia-check to correct
+    motion = require_plausible(motion, path)          # refuses degrees and millimetres
+    for sentence in plausibility_warnings(motion): …  # possible, but hardly meant
 """
 
 from collections.abc import Iterator
@@ -28,11 +28,11 @@ MAX_DISTANCE_M = 1000.0
 SUSPICIOUS_DISTANCE_M = 50.0
 """Median distance from the origin beyond which the unit is in doubt, metres."""
 FULL_TURN_RAD = 2.0 * np.pi
-"""Root angles beyond this are those of a spin that goes on counting, or degrees. A spin …"""
+"""Angle of the root beyond which it is either a spin that keeps counting, or in degrees."""
 MAX_SPIN_STEP_RAD = np.pi
-"""… counts on by less than this from pose to pose (the median), …"""
+"""Largest median step of a spin from pose to pose; a larger one means degrees."""
 MAX_SPIN_START_RAD = 8.0 * np.pi
-"""… and begins below this."""
+"""Largest angle at which a spin begins; a larger one means degrees."""
 ASSUMED_FPS = 30.0
 """Rate that is assumed where poses have times but no frame numbers."""
 
@@ -121,7 +121,7 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
 
 
 def _has_assumed_focal(motion: Motion) -> bool:
-    """Whether depths are for the tracker's own focal length, with which they grow without limit."""
+    """Whether depths are for the tracker's own focal length, and grow with it without limit."""
     return motion.assumed_focal is not None or (
         motion.space == "camera" and motion.intrinsic is not None
     )

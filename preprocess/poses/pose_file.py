@@ -20,9 +20,10 @@ POSE_KEY_LAYOUTS = (
 """The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
 
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
+"""Keys of camera-from-world, best first."""
 
 MAX_MAGNITUDE = 1e9
-"""Angles and places beyond this are damage, and nothing can be computed with them."""
+"""Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 

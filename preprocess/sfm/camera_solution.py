@@ -14,31 +14,32 @@ from preprocess.sfm.quality_gates import QualityGate
 from preprocess.sfm.sparse_model import SparseModel
 
 MISSING, INTERPOLATED, PLACED, KEY = range(4)
-"""What a frame's camera is: none, between its neighbours', by known points, or a key frame's."""
+"""Status of a frame: no camera, between its neighbors, placed by known points, or a key frame."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraSolution:
-    """Cameras in a world of unknown size, or the news that the camera stood still.
+    """Cameras in a world of unknown scale, or the finding that the camera stood still.
 
     Attributes:
-        still: Whether it did; there is nothing else then.
-        moved: How far the background moved, in longer sides of the picture; NaN if it was lost.
+        is_static: Whether the camera stood still; then there is no model.
+        background_motion: Largest shift of the background, as a fraction of the image's longer
+            side; NaN if it was lost.
         gates: What the solution has passed.
         model: The key frames' cameras and the points; None if it stood still.
         camera_from_solved: One for every frame of the file.
-        marks: What each of them is: MISSING, INTERPOLATED, PLACED or KEY.
-        keys: How many key frames there were.
-        costs: Of all stages together.
+        frame_status: What each of them is: MISSING, INTERPOLATED, PLACED or KEY.
+        keyframe_count: Number of key frames.
+        costs: Time and memory of all stages together.
     """
 
-    still: bool
-    moved: float
+    is_static: bool
+    background_motion: float
     gates: tuple[QualityGate, ...]
     model: SparseModel | None
     camera_from_solved: Float[np.ndarray, "frames 4 4"]
     frame_status: Int[np.ndarray, "frames"]
-    keys: int
+    keyframe_count: int
     costs: dict[str, Any]
 
     def lens(self, size_px: tuple[int, int]) -> Camera:
@@ -56,7 +57,8 @@ class CameraSolution:
             marks=self.frame_status,
         )
         content = {
-            "still": self.still, "moved": self.moved, "keys": self.keys, "costs": self.costs,
+            "is_static": self.is_static, "background_motion": self.background_motion,
+            "keyframe_count": self.keyframe_count, "costs": self.costs,
             "gates": [asdict(gate) for gate in self.gates],
         }  # fmt: skip
         write_text_atomically(
@@ -70,7 +72,7 @@ class CameraSolution:
         with np.load(folder / "solved.npz", allow_pickle=False) as file:
             cameras, marks = file["camera_from_solved"], file["marks"]
         gates = tuple(QualityGate(**gate) for gate in content.pop("gates"))
-        model = None if content["still"] else SparseModel.load(folder / "model.npz")
+        model = None if content["is_static"] else SparseModel.load(folder / "model.npz")
         return cls(
             gates=gates, model=model, camera_from_solved=cameras, frame_status=marks, **content
         )

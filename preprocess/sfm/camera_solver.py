@@ -39,17 +39,22 @@ from preprocess.sfm.sparse_model import SparseModel
 from preprocess.sfm.stage_cache import StageCache, StageProgressFn
 
 SEED_OFFSETS = (0, 1)
-"""A pair of mappings that disagrees is made anew with the next seed."""
+"""Added to the seed for each pair of mappings; the second pair is made if the first disagrees."""
+
 MIN_PARALLAX_FRACTION = 0.02
-"""Share of the matched pairs of pictures that must be more than one plane's, or a mere turn's."""
+"""Fraction of matched image pairs that must show parallax, not one plane or a mere rotation."""
+
 MAX_TRACKED_POINT_ERROR_PX = 3.0
-"""How far points that were followed may land from where a key frame's own camera sees them."""
+"""Largest distance of tracked points from their projection by a key frame's own camera, pixels."""
+
 MIN_TRACKED_KEYFRAMES = 0.5
-"""Share of the key frames that points must be followed into."""
+"""Fraction of the key frames that points must be tracked into."""
+
 MIN_SOLVED_FRAMES = 0.5
-"""Share of the frames that must have a camera in the end."""
+"""Fraction of the frames that must have a camera in the end."""
+
 MAX_IGNORED_DISTORTION_PX = 0.3
-"""A lens that bends the corners by less is taken for straight."""
+"""Distortion of the corners below which a lens counts as free of distortion, pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +62,10 @@ class SolverSettings:
     """What a solution depends on, beside the pictures.
 
     Attributes:
-        focal_ratio: Focal length in longer sides of the picture, if somebody knows it.
-        seed: Of everything random.
-        threads: Of features and matches.
-        max_keyframes: Key frames at most.
+        focal_ratio: Known focal length as a fraction of the image's longer side, if any.
+        seed: Seed of everything random.
+        threads: Threads for features and matches.
+        max_keyframes: Largest number of key frames.
     """
 
     focal_ratio: float | None = None
@@ -80,10 +85,10 @@ def solve_cameras(
 
     Args:
         source: The frames.
-        person_in: Where the person is, who moves and must not be looked at.
+        person_mask: Where the person is, who moves and must not be looked at.
         folder: Where stages leave their results; what is finished there is not done again.
         settings: What it depends on.
-        told: Called with the stage and how much of it is done.
+        report_progress: Called with the stage and how much of it is done.
 
     Raises:
         InputError: If pycolmap is missing, or no solution can be vouched for.
@@ -114,8 +119,9 @@ def solve_cameras(
             "movements, or give only the part that goes well (--frames START:STOP)."
         )
     return CameraSolution(
-        still=False, moved=rest.background_motion, gates=tuple(gates), model=model, camera_from_solved=cameras,
-        frame_status=marks, keys=len(keys), costs=stages.totals(),
+        is_static=False, background_motion=rest.background_motion, gates=tuple(gates), model=model,
+        camera_from_solved=cameras, frame_status=marks, keyframe_count=len(keys),
+        costs=stages.totals(),
     )  # fmt: skip
 
 
@@ -135,8 +141,9 @@ def _static_solution(
 ) -> CameraSolution:
     none = np.zeros((source.frames_in_file, 4, 4))
     return CameraSolution(
-        still=True, moved=rest.background_motion, gates=(), model=None, camera_from_solved=none,
-        frame_status=np.zeros(source.frames_in_file, dtype=np.int64), keys=len(keys),
+        is_static=True, background_motion=rest.background_motion, gates=(), model=None,
+        camera_from_solved=none, keyframe_count=len(keys),
+        frame_status=np.zeros(source.frames_in_file, dtype=np.int64),
         costs=stages.totals(),
     )  # fmt: skip
 
@@ -172,8 +179,10 @@ def _parallax(bench: ColmapWorkspace, keys: int) -> QualityGate:
             passed=False, failure_reason="the pictures have hardly anything in common",
         )  # fmt: skip
     return QualityGate(
-        name="pairs_with_parallax", value=share, bound=MIN_PARALLAX_FRACTION, passed=share >= MIN_PARALLAX_FRACTION,
-        failure_reason="the camera turns on the spot, or sees one flat wall, so that nothing shows depth",
+        name="pairs_with_parallax", value=share, bound=MIN_PARALLAX_FRACTION,
+        passed=share >= MIN_PARALLAX_FRACTION,
+        failure_reason="the camera turns on the spot, or sees one flat wall, so that nothing shows "
+        "depth",
     )  # fmt: skip
 
 
@@ -279,7 +288,7 @@ def _tracking_gate(between: ResectionResult, keys: int) -> QualityGate:
 def _drop_small_distortion(model: SparseModel) -> SparseModel:
     """The same with a straight lens, if it bends too little to be told from one."""
     corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
-    bends = abs(model.bend) * corner**3 * model.focal_px
+    bends = abs(model.radial_distortion) * corner**3 * model.focal_px
     return replace(model, bend=0.0) if bends < MAX_IGNORED_DISTORTION_PX else model
 
 

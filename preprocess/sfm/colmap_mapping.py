@@ -20,18 +20,28 @@ from capture.input_error import InputError
 from preprocess.sfm.sparse_model import SparseModel
 
 MAX_FEATURES = 2048
+"""Most features per key frame."""
+
 SEQUENTIAL_OVERLAP = 10
-"""Each key frame is matched with so many after it, and with powers of two beyond."""
+"""Number of following key frames that each is matched with, besides powers of two beyond."""
+
 MAX_EXHAUSTIVE_IMAGES = 40
-"""Of so few key frames every pair is matched, which closes loops."""
-MAX_MODELS, MAX_INITIAL_PAIRS = 2, 50
-"""How often the incremental mapper begins anew, and with how many pairs at most: pictures without
-parallax would keep it busy for minutes."""
+"""Largest number of key frames of which every pair is matched, which closes loops."""
+
+MAX_MODELS = 2
+"""Most models that the incremental mapper starts."""
+
+MAX_INITIAL_PAIRS = 50
+"""Most pairs that it tries to start with; without parallax it would try for minutes."""
+
 MIN_MATCHES = 15
+"""Fewest matches of an image pair that is used."""
+
 STATED_FOCAL_TOLERANCE = 0.01
-"""A stated focal length as near as this to the solved one is the true one."""
+"""Relative difference to the solved focal length within which the stated one is used."""
+
 IMAGES_PER_THREAD = 4
-"""Pictures that each thread looks at before progress is told."""
+"""Images per thread between two reports of progress."""
 
 ProgressFn = Callable[[float], None]
 """Called now and then with how much of a stage is done, in [0, 1]."""

@@ -8,16 +8,25 @@ from jaxtyping import Bool, Float
 from preprocess.sfm.sparse_model import SparseModel
 
 MAX_TILT_DEG = 20.0
-"""Between the floor's normal and the first guess of up."""
+"""Largest angle between the floor's normal and the first guess of up, degrees."""
+
 PLANE_TOLERANCE = 0.01
-"""Points this near belong to a plane; in median distances of points from cameras."""
+"""Distance within which points belong to a plane; a fraction of their median camera distance."""
+
 MIN_POINTS = 40
+"""Fewest points that a floor is fitted to."""
+
 MIN_INLIER_FRACTION = 0.05
-"""Of the points below the cameras that the floor must hold."""
+"""Fraction of the points below the cameras that must lie on the floor."""
+
 MAX_FRACTION_BELOW = 0.05
-"""Of the points, how many may lie below a floor."""
+"""Largest fraction of the points that may lie below the floor."""
+
 RANSAC_ITERATIONS = 2000
+"""Number of planes through three points that are tried."""
+
 MIN_VIEWS = 3
+"""Fewest cameras that must see a point."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,22 +17,35 @@ from jaxtyping import Float
 
 from preprocess.sfm.floor_plane import FloorPlane
 
-SIGMA_GROUND_M, SIGMA_PLACE_M = 0.06, 0.20
-"""How far, as a rule, a sole is from the floor by a tracker's depth, and a person from its
-place."""
+SIGMA_GROUND_M = 0.06
+"""Standard deviation of a sole's height above the floor by a tracker's depth, metres."""
+
+SIGMA_PLACE_M = 0.20
+"""Standard deviation of a person from its usual place, metres."""
+
 IRLS_ITERATIONS = 5
+"""Rounds of reweighted least squares."""
+
 HUBER_THRESHOLD = 1.345
+"""Residual beyond which a cue counts less; standard deviations (95 % efficiency)."""
+
 MAX_CUE_DIFFERENCE = 0.10
-"""Beyond this difference of both cues the person walks, and the ground is right."""
+"""Relative difference of both cues beyond which the person walks and only the ground counts."""
+
 MAX_GROUND_SPREAD = 0.25
-"""Of the frames' own scales by ground contact (robust standard deviation)."""
+"""Largest relative spread of the frames' own scales by ground contact (robust deviation)."""
+
 MAX_WANDER_M = 0.35
-"""How far the person may be from its place, r.m.s., if only that tells the scale."""
+"""Largest r.m.s. distance of the person from its place, if that is the only cue; metres."""
+
 MIN_FRAMES = 5
+"""Fewest frames with a pose and a camera."""
+
 SOLE_THICKNESS_M = 0.01
-"""What is under a foot: nothing, or a shoe of two centimetres or three. Bodies are barefoot."""
+"""Usual height of a body's bare sole above the floor, from barefoot to a shoe of 3 cm; metres."""
+
 MIN_CAMERA_PATH_M = 0.3
-"""Of the camera's path, for the second cue to say anything."""
+"""Shortest path of the camera for which the second cue counts, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,7 +55,7 @@ class PersonInCameras:
     Attributes:
         world_from_camera: Rotations R_iᵀ.
         centers: Cameras in the solved world's unit.
-        pelves: Pelvis in the camera, metres.
+        pelvis_positions: Pelvis in the camera, metres.
         soles: Skin of both feet in the camera, metres.
     """
 
@@ -57,11 +70,11 @@ class MetricScale:
     """Metres per unit of the solved world.
 
     Attributes:
-        metres: The scale.
+        metres_per_unit: The scale.
         cues: Which cues made it: "ground", "in place".
         ground, place: What each would say alone; None where it says nothing.
         spread: Of the frames' own values by ground contact, relative; NaN without ground.
-        refused: Why it is not to be believed; None if it is.
+        rejection_reason: Why it is not to be believed; None if it is.
     """
 
     metres_per_unit: float

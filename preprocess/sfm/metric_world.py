@@ -1,8 +1,7 @@
-"""The world of a solved capture: metres, y up, the floor at 0, the person over the origin.
+"""Bring solved cameras and a tracker's poses into one metric world.
 
-z points from the person to the first camera, so that who faces it has SMPL's own axes.
-
-Solved cameras and a tracker's poses brought into one metric world.
+Units are metres, y points up, the floor is at 0 and the person above the origin. z points from the
+person to the first camera, so that a person who faces it has SMPL's own axes.
 """
 
 from dataclasses import dataclass, replace
@@ -68,7 +67,7 @@ def to_metric_world(
 FOOT_JOINTS = (7, 8, 10, 11)
 """Ankles and feet among SMPL's joints."""
 MAX_LEAN_DEG = 30.0
-"""Between up as the cameras are held and up as the person stands."""
+"""Largest angle between up as the cameras are held and up as the person stands."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,8 +99,8 @@ def place_in_metric_world(
     Args:
         solved: Cameras of unknown size.
         motion: Each row in the camera of its frame, metres.
-        seen_by: The camera that the poses were made for, at its world's origin; None if nobody
-            knows, and then they are taken to be right for the solved lens.
+        tracker_camera: Camera that the poses were made for, at its world's origin; None if unknown:
+            then they are taken to be right for the solved focal length.
         shaped: The person.
         source: The frames.
 
@@ -217,9 +216,9 @@ def solution_report(
     wanted = [i for i in range(len(solved.frame_status)) if source.selection.contains(i)]
     marks = solved.frame_status[wanted]
     content: dict[str, object] = {
-        "verdict": "still" if solved.still else "solved",
-        "background_moved": solved.moved,
-        "key_frames": solved.keys,
+        "verdict": "still" if solved.is_static else "solved",
+        "background_moved": solved.background_motion,
+        "key_frames": solved.keyframe_count,
         **solved.costs,
     }
     if place is None or solved.model is None:

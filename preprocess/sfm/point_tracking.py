@@ -1,6 +1,6 @@
-"""Points followed from picture to picture (Lucas & Kanade 1981, in pyramids: Bouguet 2000).
+"""Track points from image to image, and detect a static camera by them.
 
-Whether the camera stood still: then there is nothing to solve.
+The tracker is that of Lucas & Kanade 1981, in pyramids (Bouguet 2000).
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,16 @@ from jaxtyping import Bool, Float, UInt8
 from preprocess.sfm.sfm_keyframes import SfmKeyframe
 
 WINDOW = (17, 17)
-LEVELS, LEVELS_WITH_GUESS = 4, 3
+"""Size of the patch around a point, pixels."""
+
+LEVELS = 4
+"""Levels of the pyramid without a guess."""
+
+LEVELS_WITH_GUESS = 3
+"""Levels of the pyramid with a guess of where a point is."""
+
 MAX_ROUND_TRIP_PX = 0.7
-"""A point that does not come back to where it came from was lost."""
+"""Largest distance of a point that was tracked there and back, pixels; beyond it is lost."""
 
 GrayImage = UInt8[np.ndarray, "height width"]
 
@@ -72,13 +79,19 @@ def _optical_flow(
 
 
 MAX_CORNERS = 400
+"""Most points of the background that are tracked."""
+
 MIN_TRACKED_FRACTION = 0.3
-"""Share of the points that must be found again before they say that nothing moved."""
+"""Fraction of the points that must be tracked for a static camera."""
+
 MAX_STATIC_SHIFT = 0.005
-"""How far the background may move in the picture, in longer sides: 5 px of 960."""
+"""Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
+
 MIN_TRACKED_POINTS = 12
+"""Fewest points that must be tracked for a static camera."""
+
 COMPARED_KEYFRAMES = 12
-"""Key frames that are compared with the first."""
+"""Number of key frames that are compared with the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +99,9 @@ class StaticCameraTest:
     """How far the background moves in the picture.
 
     Attributes:
-        still: Whether the camera counts as standing.
-        moved: The largest shift of the background between the first key frame and another, in
-            longer sides of the picture (median over its points); NaN if it was lost.
+        is_static: Whether the camera counts as standing.
+        background_motion: Largest shift of the background between the first key frame and another
+            (median over its points), as a fraction of the image's longer side; NaN if it was lost.
     """
 
     is_static: bool

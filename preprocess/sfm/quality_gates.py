@@ -1,8 +1,8 @@
-"""What a solution must pass before anybody believes it: structure from motion can fail in silence.
+"""Quality gates of a solution, because structure from motion can fail silently.
 
-A mapper calls it a success, too, when repeating texture has led it to a wrong world with every
-frame in it. Wrong ones stand out by some of the figures below, or because the other mapper, or
-tracking from frame to frame, says something else.
+A mapper also reports success when repeating texture has led it to a wrong world with every frame
+in it. Wrong solutions fail one of the gates below, or contradict the other mapper or the points
+that are tracked from frame to frame.
 """
 
 from dataclasses import dataclass
@@ -14,17 +14,35 @@ from scipy.spatial.transform import Rotation
 from preprocess.sfm.sparse_model import SparseModel
 
 MIN_REGISTERED_FRACTION = 0.9
+"""Fraction of the key frames that must have a camera."""
+
 MAX_REPROJECTION_PX = 0.6
+"""Largest median reprojection error, pixels."""
+
 MIN_OBSERVATION_RATIO = 0.4
-"""Of the median camera's; a camera with fewer may have been placed by a few wrong matches."""
+"""Fewest observations of a camera, as a fraction of the median camera's: with fewer it may rest on
+a few wrong matches."""
+
 FOCAL_RANGE = (0.5, 2.0)
+"""Plausible focal lengths, as fractions of the image's longer side."""
+
 MIN_TRIANGULATION_ANGLE_DEG = 1.0
-"""Under which the median point is seen from different places; depth is a guess below it."""
+"""Smallest angle between the views of the median point; below it depth is a guess."""
+
 MIN_SPARSE_POINTS = 60
-JUMP_SIGMAS, JUMP_DEG = 6.0, 1.0
-"""How far a rotation may be off the mean of its neighbours'."""
-MAX_MODEL_DISTANCE, MAX_MODEL_ROTATION_DEG = 0.01, 1.0
-"""How far two mappers' cameras may differ: in lengths of the path, and by rotation."""
+"""Fewest points of a model."""
+
+JUMP_SIGMAS = 6.0
+"""Deviation of a rotation from its neighbors' mean that counts as a jump; standard deviations."""
+
+JUMP_DEG = 1.0
+"""Deviation of a rotation from its neighbors' mean that counts as a jump; degrees."""
+
+MAX_MODEL_DISTANCE = 0.01
+"""Largest distance between two mappers' cameras, as a fraction of the path's length."""
+
+MAX_MODEL_ROTATION_DEG = 1.0
+"""Largest rotation between two mappers' cameras, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +50,11 @@ class QualityGate:
     """One figure and its bound.
 
     Attributes:
-        name: As the report calls it.
-        value: What was found.
-        bound: What it was held against.
+        name: Key in the report.
+        value: Measured figure.
+        bound: Threshold that it is compared with.
         passed: Whether it is good enough.
-        words: What it means if it is not.
+        failure_reason: What it means if it is not.
     """
 
     name: str
@@ -68,7 +86,8 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
         QualityGate(
             name="registered", value=registered, bound=MIN_REGISTERED_FRACTION,
             passed=registered >= MIN_REGISTERED_FRACTION,
-            failure_reason=f"only {len(model.frames)} of {keys} key frames could be placed with certainty",
+            failure_reason=f"only {len(model.frames)} of {keys} key frames could be placed with "
+            "certainty",
         ),
         QualityGate(
             name="points", value=float(len(model.points)), bound=float(MIN_SPARSE_POINTS),
@@ -86,8 +105,10 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),
         QualityGate(
-            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG, passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
-            failure_reason=f"the camera hardly changes its place (points are seen under {angle:.1f}°)",
+            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
+            passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
+            failure_reason="the camera hardly changes its place (points are seen under "
+            f"{angle:.1f}°)",
         ),
     ]  # fmt: skip
 
@@ -123,7 +144,8 @@ def compare_models(one: SparseModel, other: SparseModel) -> QualityGate:
     )
     return QualityGate(
         name="agreement", value=apart, bound=MAX_MODEL_DISTANCE, passed=bool(passed),
-        failure_reason=f"{words} by {100.0 * apart:.1f} % of the path and {angles.max():.1f} degrees",
+        failure_reason=f"{words} by {100.0 * apart:.1f} % of the path and {angles.max():.1f} "
+        "degrees",
     )  # fmt: skip
 
 

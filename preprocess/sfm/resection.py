@@ -20,11 +20,19 @@ from preprocess.sfm.sfm_keyframes import SfmKeyframe, to_grayscale
 from preprocess.sfm.sparse_model import SparseModel
 
 MIN_PNP_POINTS = 20
+"""Fewest tracked points that a camera is placed by."""
+
 MAX_PNP_POINTS = 600
+"""Most points that are tracked from a key frame."""
+
 INLIER_PX = 2.0
+"""Largest reprojection error of an inlier, pixels."""
+
 MIN_INLIER_FRACTION = 0.5
+"""Fraction of the tracked points that must be inliers."""
+
 MAX_BUFFERED_FRAMES = 256
-"""Frames between two key frames that are kept in memory; of longer stretches the middle is left."""
+"""Most frames between two key frames that are kept in memory; the middle of more is skipped."""
 
 Grey = UInt8[np.ndarray, "height width"]
 
@@ -34,9 +42,9 @@ class ResectionResult:
     """What following points has found.
 
     Attributes:
-        placed: Camera-from-world by the frame's number; key frames' own are not among them.
-        bridges: For each key frame that points were followed into from the one before: how far,
-            in pixels, they land from where its own camera sees them (median); by its number.
+        cameras: Camera-from-world by the frame's number; key frames' own are not among them.
+        keyframe_errors_px: Median distance of points that were tracked into a key frame from their
+            projection by its own camera, pixels; by the key frame's number.
     """
 
     cameras: dict[int, Float[np.ndarray, "4 4"]]

@@ -13,17 +13,27 @@ from capture.image_folder import list_images
 from capture.input_error import InputError
 from capture.source import FrameSource
 
-MAX_KEYFRAMES, MIN_TARGET_KEYFRAMES, MIN_KEYFRAME_SPACING = 60, 24, 4
-"""Key frames at most; how many are always chosen, if there are so many frames; and of more only one
-in so many: frames between are placed as well as key frames, for a tenth of the time."""
+MAX_KEYFRAMES = 60
+"""Most key frames of a video."""
+
+MIN_TARGET_KEYFRAMES = 24
+"""Number of key frames that is chosen from a short video, if it has that many frames."""
+
+MIN_KEYFRAME_SPACING = 4
+"""Frames per key frame beyond that number: the frames between are placed as well as key frames, in
+a tenth of the time."""
+
 MIN_KEYFRAMES = 8
+"""Fewest key frames that can be solved."""
+
 FEATURE_IMAGE_PX = 960
-"""Longer side of the pictures in which features are looked for."""
+"""Longer side of the images that features are detected in, pixels."""
+
 PERSON_MARGIN = 0.015
-"""How far round the person nothing is looked at, in widths of the picture."""
+"""Width of the ignored border around the person; a fraction of the image's width."""
 
 PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
-"""Where the person is in a frame, in pixels of another size; None if nobody knows."""
+"""Where the person is in a frame, in pixels of a given size; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,8 +42,8 @@ class SfmKeyframe:
 
     Attributes:
         index: Number of the frame.
-        grey: The picture.
-        person: Where nothing is to be looked at: the person, and a margin.
+        gray: The image.
+        person_mask: Pixels that are ignored: the person, and a margin.
     """
 
     index: int
@@ -42,7 +52,7 @@ class SfmKeyframe:
 
 
 def feature_image_size(size_px: tuple[int, int]) -> tuple[int, int]:
-    """The size in which pictures are worked on: that of the frames, at most `WORK_PX`."""
+    """The size in which pictures are worked on: that of the frames, at most `FEATURE_IMAGE_PX`."""
     scale = min(1.0, FEATURE_IMAGE_PX / max(size_px))
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
@@ -67,9 +77,9 @@ def select_keyframes(
 
     Args:
         source: The frames.
-        person_in: Where the person is; frames in which nobody knows are passed over.
-        told: Called with how much of the video was looked at.
-        most: Key frames at most.
+        person_in: Where the person is; frames without an answer are skipped.
+        report_progress: Called with the fraction of the video that was examined.
+        max_keyframes: Largest number of key frames.
     """
     total = source.frame_count or source.frames_in_file
     stretches = min(max_keyframes, total, max(MIN_TARGET_KEYFRAMES, total // MIN_KEYFRAME_SPACING))

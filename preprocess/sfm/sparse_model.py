@@ -15,13 +15,13 @@ class SparseModel:
 
     Attributes:
         frames: Number of the frame that each camera belongs to, ascending.
-        camera_from_world: Rigid transforms; the world's unit is anybody's guess.
+        camera_from_world: Rigid transforms; the world's unit is unknown.
         focal_px: Focal length.
         center_px: Principal point; the first pixel's centre is at (0.5, 0.5).
-        bend: First coefficient of radial distortion.
+        radial_distortion: First coefficient of radial distortion.
         size_px: Width and height of the pictures.
         points: What the cameras see.
-        seen_by, seen_point: Camera and point of each observation, as rows of the above.
+        observation_camera, observation_point: Rows of each observation's camera and point.
         pixels: Where it was seen.
     """
 
@@ -29,7 +29,7 @@ class SparseModel:
     camera_from_world: Float[np.ndarray, "cameras 4 4"]
     focal_px: float
     center_px: tuple[float, float]
-    bend: float
+    radial_distortion: float
     size_px: tuple[int, int]
     points: Float[np.ndarray, "points 3"]
     observation_camera: Int[np.ndarray, "observations"]
@@ -43,7 +43,7 @@ class SparseModel:
             center_px=self.center_px,
             size_px=self.size_px,
             camera_from_world=camera_from_world,
-            distortion=(self.bend, 0.0, 0.0, 0.0) if self.bend else (),
+            distortion=(self.radial_distortion, 0.0, 0.0, 0.0) if self.radial_distortion else (),
         )
 
     def camera_centers(self) -> Float[np.ndarray, "cameras 3"]:
@@ -89,5 +89,5 @@ class SparseModel:
             arrays = {key: file[key] for key in file.files if key != "allow_pickle"}
         x, y = (float(value) for value in arrays.pop("center_px"))
         width, height = (int(value) for value in arrays.pop("size_px"))
-        focal, bend = float(arrays.pop("focal_px")), float(arrays.pop("bend"))
-        return cls(focal_px=focal, bend=bend, center_px=(x, y), size_px=(width, height), **arrays)
+        numbers = {key: float(arrays.pop(key)) for key in ("focal_px", "radial_distortion")}
+        return cls(center_px=(x, y), size_px=(width, height), **numbers, **arrays)

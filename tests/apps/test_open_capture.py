@@ -64,7 +64,7 @@ def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp
     chosen = open_capture(CaptureInputs(**paths, person="1"))
     assert len(chosen.motion) == 6
     assert not any("people" in note for note in chosen.notes)
-    with pytest.raises(InputError, match="nobody called '7'"):
+    with pytest.raises(InputError, match="no person called '7'"):
         open_capture(CaptureInputs(**paths, person="7"))
 
 
@@ -91,7 +91,7 @@ def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_p
     rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
     rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
     far = own.motion.root_translations.copy()
-    far[:, 2] -= 0.4  # of somebody an eighth taller than SMPL's mean, as its tracker thinks
+    far[:, 2] -= 0.4  # of a person an eighth taller than SMPL's mean, as its tracker estimates
     np.savez(tmp_path / "poses.npz", **rows, transl=far)
     fitted = open_capture(CaptureInputs(video=film, poses=tmp_path / "poses.npz"))
     note = next(note for note in fitted.notes if "body model 'smpl'" in note)
@@ -118,7 +118,7 @@ def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
     assert all((observation.alpha > 0.5).any() for observation in found)
 
 
-def test_a_focal_length_that_nobody_knows_is_found_in_the_masks(capture, own):
+def test_an_unknown_focal_length_is_found_from_the_masks(capture, own):
     capture_corruptions.convert_to_camera_space(capture)
     (capture / "cameras.npz").unlink()
     found = open_capture(CaptureInputs(video=capture))

@@ -100,7 +100,7 @@ def listing(tmp_path):
     return made
 
 
-def test_a_listed_file_is_ours_until_somebody_changes_it(tmp_path, listing):
+def test_a_listed_file_is_ours_until_it_is_changed(tmp_path, listing):
     path = tmp_path / "report.json"
     write_text_atomically(path, "one")
     assert listing.owns("report.json")
@@ -190,7 +190,7 @@ def test_what_comes_into_a_folder_that_is_being_replaced_is_not_lost(tmp_path):
     assert names(tmp_path) == ["frames/0000.png", "frames/mine.txt"]
 
 
-def test_somebody_elses_list_is_not_written_to(tmp_path):
+def test_a_foreign_list_is_not_written_to(tmp_path):
     (tmp_path / LIST_NAME).write_text("milk, eggs")
     with pytest.raises(InputError, match="not a list"):
         OutputFileList(tmp_path).create()

@@ -1,4 +1,4 @@
-"""HDR: seen in a file's index, and brought to the colours of other pictures."""
+"""HDR: seen in a file's index, and brought to the colors of other pictures."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ def box(kind: bytes, content: bytes) -> bytes:
     return (len(content) + 8).to_bytes(4, "big") + kind + content
 
 
-def colour(transfer: int, kind: bytes = b"nclx") -> bytes:
+def color_box(transfer: int, kind: bytes = b"nclx") -> bytes:
     return box(b"colr", kind + (9).to_bytes(2, "big") + transfer.to_bytes(2, "big") + b"\0\x09\0")
 
 
@@ -28,10 +28,10 @@ def movie(*boxes: bytes, wide: bool = False) -> bytes:
 @pytest.mark.parametrize(
     ("boxes", "curve"),
     [
-        ([colour(HLG)], HLG),
-        ([colour(PQ, b"nclc")], PQ),
-        ([colour(1)], None),
-        ([box(b"colr", b"prof" + bytes(40)), colour(HLG)], HLG),
+        ([color_box(HLG)], HLG),
+        ([color_box(PQ, b"nclc")], PQ),
+        ([color_box(1)], None),
+        ([box(b"colr", b"prof" + bytes(40)), color_box(HLG)], HLG),
         ([], None),
     ],
 )

@@ -52,7 +52,7 @@ def test_a_picture_is_turned_upright_by_its_exif_tag(tmp_path):
 
 @pytest.mark.parametrize("ending", ["png", "webp"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_colours_and_alpha_are_turned_alike(tmp_path, ending, orientation):
+def test_colors_and_alpha_are_rotated_together(tmp_path, ending, orientation):
     """Each pixel is as opaque as it is red, however the file is turned or mirrored."""
     ramp = np.arange(128, 248, dtype=np.uint8).reshape(10, 12)
     rgba = np.stack([ramp, ramp // 2, 255 - ramp, ramp], axis=-1)

@@ -1,7 +1,4 @@
-"""Tests for the peak of memory: this process's own, whoever has started it.
-
-Percentiles of a stream of numbers, in bounded memory.
-"""
+"""Peak memory of this process alone, and percentiles of a stream in bounded memory."""
 
 import subprocess
 import sys

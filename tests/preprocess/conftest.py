@@ -1,7 +1,4 @@
-"""A small body of random vertices on the real tree, and a motion.
-
-Files of other people's trackers, written byte by byte as those programs write them.
-"""
+"""Fixtures: a small body of random vertices, motions, and joblib's way to write arrays."""
 
 import io
 import pickle
@@ -49,7 +46,7 @@ def motion(rng) -> Motion:
 
 @pytest.fixture
 def truth(rng) -> Motion:
-    """Forty poses of somebody who turns round and waves, 3 m before a camera, y down."""
+    """Forty poses of a person who turns round and waves, 3 m before a camera, y down."""
     count = 40
     phase = np.linspace(0.0, 2.0 * np.pi, count)
     yaw = phase[:, None] * np.array([0.0, 1.0, 0.0])

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from capture.input_error import InputError
-from preprocess.body.body_file import load_body_model
 from preprocess import safe_pickle
+from preprocess.body.body_file import load_body_model
 from preprocess.safe_pickle import read_pickled_arrays
 
 

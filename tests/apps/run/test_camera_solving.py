@@ -143,7 +143,9 @@ def test_a_stated_height_is_the_size_of_everything(walkaround, solved_run):
 
 def test_a_camera_that_stood_stays_where_it_is(walkaround, solved_run):
     recording = open_capture(job_of(walkaround).paths)
-    standing = replace(solved_of(solved_run), still=True, moved=0.001, model=None, gates=())
+    standing = replace(
+        solved_of(solved_run), is_static=True, background_motion=0.001, model=None, gates=()
+    )
     found = apply_camera_solution(recording, standing)
     assert found.cameras is recording.cameras
     assert found.motion is recording.motion
@@ -259,11 +261,11 @@ def test_a_run_learns_beside_the_solving_and_tells_of_both(
         )
     )  # fmt: skip
     heights = [again.shaped.with_pose(motion[row]).vertices()[:, 1].min() for row in range(FRAMES)]
-    assert np.abs(heights).max() < 0.06  # whoever stands on the floor stands on y = 0
+    assert np.abs(heights).max() < 0.06  # the floor is y = 0
 
 
 @pytest.mark.slow
-def test_an_avatar_that_is_refused_costs_nobody_the_cameras(
+def test_cameras_are_kept_when_the_avatar_is_refused(
     walkaround, solved_run, call_ingest, tmp_path, monkeypatch
 ):
     def refuse(*_, **__):
@@ -292,7 +294,7 @@ def attempt(monkeypatch):
     def make(solved, *, beside):
         def wait(self, console, stop=None):
             assert stop is not None
-            assert stop.is_set()  # nobody waits any longer
+            assert stop.is_set()  # the run is over
             return solved
 
         monkeypatch.setattr(SolverProcess, "wait", wait)
@@ -345,7 +347,7 @@ def test_what_is_solved_when_the_run_is_stopped_counts(walkaround, solved_run, t
 
 
 @pytest.mark.slow
-def test_cameras_that_are_refused_cost_nobody_the_avatar(
+def test_the_avatar_is_kept_when_its_cameras_are_refused(
     walkaround, call_ingest, tmp_path, without_baking, monkeypatch
 ):
     def refuse(self, console, stop=None):
@@ -364,7 +366,7 @@ def test_cameras_that_are_refused_cost_nobody_the_avatar(
     assert not (tmp_path / "run" / "cameras.npz").exists()
 
 
-def test_a_lens_that_nobody_knows_is_solved_first(
+def test_an_unknown_focal_length_is_solved_first(
     walkaround, call_ingest, changed, tmp_path, monkeypatch
 ):
     """And if that fails, nothing is learnt."""
@@ -407,7 +409,7 @@ def test_cameras_are_read_as_they_were_written(walkaround, tmp_path):
         (("--height-cm", 900), "--height-cm is 900"),
     ],
 )
-def test_heights_that_nobody_has_are_refused(walkaround, call_ingest, tmp_path, words, said):
+def test_impossible_heights_are_refused(walkaround, call_ingest, tmp_path, words, said):
     outcome = call_ingest(walkaround, *words, "--out", tmp_path / "run")
     assert outcome.code == 2
     assert said in outcome.complaint()

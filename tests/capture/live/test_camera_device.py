@@ -16,7 +16,7 @@ from capture.source import FrameSelection
 
 
 class Quick:
-    """A camera that gives so many pictures at once, and is then unplugged."""
+    """A camera that gives all its pictures at once, and is then unplugged."""
 
     def __init__(self, pictures):
         self.left, self.number = pictures, -1
@@ -53,7 +53,7 @@ def test_an_argument_names_a_camera_or_does_not(argument, address):
 
 
 def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
-    """Ten pictures at 25 a second: 0.36 s; nobody is late, so none is lost."""
+    """Ten pictures at 25 a second: 0.36 s; the reader keeps up, so none is lost."""
     source = CameraDevice(str(write_video(frames=10)), FrameSelection(), PacingClock())
     began = time.perf_counter()
     frames = list(source.frames())

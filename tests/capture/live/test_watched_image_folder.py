@@ -136,7 +136,7 @@ def test_what_was_there_before_is_not_lost(tmp_path):
     frames = list(source.frames())
     assert greys(frames) == list(range(60))
     assert source.dropped == 0
-    # nobody was late for pictures that are older than the watch
+    # pictures that are older than the watch are not late
     assert all(frame.due_s <= time.perf_counter() for frame in frames)
     assert frames[0].due_s > time.perf_counter() - 60.0
 

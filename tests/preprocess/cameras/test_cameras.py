@@ -216,7 +216,7 @@ def folder(tmp_path) -> FrameSource:
 
 @pytest.fixture
 def video(tmp_path):
-    """A video of so many frames."""
+    """A video with this number of frames."""
 
     def make(frames: int) -> FrameSource:
         path = tmp_path / f"{frames}.avi"

@@ -1,4 +1,4 @@
-"""Tests for what transforms.json and others look like where nobody followed the documentation."""
+"""Tests for what transforms.json and others look like when it departs from the documentation."""
 
 import json
 from pathlib import Path

@@ -211,7 +211,7 @@ def test_the_number_of_joints_tells_the_body(world, numbers, model):
     assert read_poses(rated).body_model == (model if numbers == 165 else "smpl")
 
 
-def test_a_gendered_shape_is_spoken_of_where_somebodys_own_body_is_used(world):
+def test_a_gendered_shape_is_noted_where_another_body_is_used(world):
     path = emdb(world)
     assert "SMPL's male body" in read_poses(path, default_model="smpl").note
     assert read_poses(path, default_model="body24").note is None

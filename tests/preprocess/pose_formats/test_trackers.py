@@ -409,7 +409,7 @@ def test_of_several_people_the_longest_is_taken_and_the_others_are_named(
     assert "--person" in motion.note
     assert len(read_poses(path, person=taken)) == 40
     assert read_poses(path, person=other).valid.sum() in (rows, 14, 40)
-    with pytest.raises(InputError, match=rf"nobody called '99'.*{other} \("):
+    with pytest.raises(InputError, match=rf"no person called '99'.*{other} \("):
         read_poses(path, person="99")
 
 

@@ -1,7 +1,7 @@
-"""Files that mean harm, and thousands of random ones: refused with a reason, or read; no worse.
+"""Hostile files and thousands of random ones are read, or refused with a reason, and run nothing.
 
-A few hundred are tried with every run, and as many as one likes with
-`IA_FUZZ=10000 pytest tests/preprocess/pose_formats -k random`; benchmarks.fuzz_readers tries every reader.
+Every run tries a few hundred; `IA_FUZZ=10000 pytest tests/preprocess/pose_formats -k random` tries
+more, and benchmarks.fuzz_readers tries every reader.
 """
 
 import gzip

@@ -77,10 +77,10 @@ def test_rows_find_their_camera_by_frame_number(truth, shaped, rng):
 
 def test_a_files_own_cameras_count_unless_others_are_given(truth, shaped, joints_of, rng):
     transforms = np.stack([rigid(rng) for _ in range(len(truth))])
-    told = replace(truth, camera_from_world=transforms)
+    stated = replace(truth, camera_from_world=transforms)
     cameras = track_of(camera(900.0))
-    assert place_in_camera_world(told, shaped, cameras, cameras_given=True) is told
-    there = joints_of(place_in_camera_world(told, shaped, cameras, cameras_given=False))
+    assert place_in_camera_world(stated, shaped, cameras, cameras_given=True) is stated
+    there = joints_of(place_in_camera_world(stated, shaped, cameras, cameras_given=False))
     expected = np.einsum("nab,njb->nja", transforms[:, :3, :3], joints_of(truth))
     np.testing.assert_allclose(there, expected + transforms[:, None, :3, 3], atol=1e-9)
 

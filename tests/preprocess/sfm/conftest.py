@@ -29,7 +29,7 @@ def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def arc(
     count: int, *, degrees: float, radius_m: float = 2.2, size_px: tuple[int, int], focal_px: float
 ) -> list[Camera]:
-    """A walk round the middle of the room by somebody who does not hold quite still."""
+    """A walk round the middle of the room with an unsteady hand."""
     rng = np.random.default_rng(1)
     cameras = []
     for angle in np.radians(np.linspace(-degrees / 2, degrees / 2, count)):

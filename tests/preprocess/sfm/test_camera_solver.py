@@ -21,7 +21,7 @@ SIZE = (320, 240)
 FRAMES, KEYS = 20, 10
 
 
-def nobody(frame, size_px):
+def no_person(frame, size_px):
     return np.zeros(size_px[::-1], dtype=bool)
 
 
@@ -41,14 +41,14 @@ def walk(room, walked, tmp_path_factory):
     told = []
     settings = SolverSettings(max_keyframes=KEYS)
     solved = solve_cameras(
-        source, nobody, folder / "work", settings, lambda *what: told.append(what)
+        source, no_person, folder / "work", settings, lambda *what: told.append(what)
     )
     return cameras, source, solved, folder / "work", told
 
 
 def test_cameras_of_a_walk_are_solved_to_millimetres(walk):
     cameras, _, solved, _, _ = walk
-    assert not solved.still
+    assert not solved.is_static
     assert (
         np.bincount(solved.frame_status, minlength=4)[[PLACED, KEY]] == [FRAMES - KEYS, KEYS]
     ).all()
@@ -86,7 +86,7 @@ def test_what_is_finished_is_not_done_again(walk, tmp_path, monkeypatch):
         monkeypatch.setattr(colmap_mapping, name, None)  # calling it would be an error
     monkeypatch.setattr(camera_solver, "resect_intermediate_frames", None)
     again = solve_cameras(
-        source, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
+        source, no_person, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
     )
     np.testing.assert_array_equal(again.camera_from_solved, solved.camera_from_solved)
     assert again.gates == solved.gates
@@ -97,7 +97,7 @@ def test_a_stage_that_was_cut_off_is_done_anew(walk, tmp_path):
     shutil.copytree(work, tmp_path / "work")
     (tmp_path / "work" / "frames between").rename(tmp_path / "work" / "part.frames between")
     again = solve_cameras(
-        source, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
+        source, no_person, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
     )
     np.testing.assert_allclose(again.camera_from_solved, solved.camera_from_solved, atol=1e-9)
 
@@ -124,7 +124,7 @@ def test_a_frame_that_shows_nothing_is_interpolated(walk, tmp_path):
     spoilt = filmed(tmp_path / "film", pictures)
     (tmp_path / "work" / "frames between").unlink()
     again = solve_cameras(
-        spoilt, nobody, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
+        spoilt, no_person, tmp_path / "work", SolverSettings(max_keyframes=KEYS), lambda *what: None
     )
     assert again.frame_status[lost] == INTERPOLATED
     assert (again.frame_status == INTERPOLATED).sum() == 1
@@ -136,7 +136,7 @@ def test_pictures_that_have_nothing_in_common_are_refused(tmp_path, rng):
     with pytest.raises(
         InputError, match="with certainty: the pictures have hardly anything in common"
     ):
-        solve_cameras(source, nobody, tmp_path / "work", SolverSettings(), lambda *what: None)
+        solve_cameras(source, no_person, tmp_path / "work", SolverSettings(), lambda *what: None)
 
 
 def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_path, monkeypatch):
@@ -151,7 +151,7 @@ def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_pa
     with pytest.raises(InputError, match="turns on the spot"):
         solve_cameras(
             filmed(tmp_path / "film", pictures),
-            nobody,
+            no_person,
             tmp_path / "w",
             SolverSettings(),
             lambda *w: 0,
@@ -181,7 +181,7 @@ def test_two_ways_of_solving_that_differ_are_refused(walk, tmp_path, monkeypatch
     with pytest.raises(InputError, match="contradict each other"):
         solve_cameras(
             source,
-            nobody,
+            no_person,
             tmp_path / "work",
             SolverSettings(max_keyframes=KEYS),
             lambda *what: None,
@@ -192,10 +192,12 @@ def test_a_tripod_needs_no_solution(room, walked, tmp_path, monkeypatch):
     monkeypatch.setattr(colmap_mapping, "extract_features", None)
     camera = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
     source = filmed(tmp_path / "film", [room.seen(camera)] * 9)
-    solved = solve_cameras(source, nobody, tmp_path / "work", SolverSettings(), lambda *what: None)
-    assert solved.still
+    solved = solve_cameras(
+        source, no_person, tmp_path / "work", SolverSettings(), lambda *what: None
+    )
+    assert solved.is_static
     solved.save(tmp_path / "work")
-    assert CameraSolution.load(tmp_path / "work").still
+    assert CameraSolution.load(tmp_path / "work").is_static
 
 
 def test_a_missing_pycolmap_is_said(monkeypatch, tmp_path):

@@ -62,7 +62,7 @@ def test_key_frames_that_are_missing_are_counted(model):
 
 
 @pytest.mark.parametrize("share", [0.3, 2.6])
-def test_a_lens_that_nobody_has_is_refused(cameras, room_points, exact_model, share):
+def test_an_impossible_focal_length_is_refused(cameras, room_points, exact_model, share):
     focal = share * 640
     lenses = [replace(camera, focal_px=(focal, focal)) for camera in cameras]
     assert "focal" in failed(evaluate_gates(exact_model(lenses, room_points), len(cameras)))
@@ -89,8 +89,8 @@ def test_a_camera_placed_by_a_few_points_is_found(model):
     few = model.observations_of_camera(7)[20:]
     kept = np.setdiff1d(np.arange(len(model.pixels)), few)
     thinned = replace(
-        model, observation_camera=model.observation_camera[kept], observation_point=model.observation_point[kept],
-        pixels=model.pixels[kept],
+        model, observation_camera=model.observation_camera[kept],
+        observation_point=model.observation_point[kept], pixels=model.pixels[kept],
     )  # fmt: skip
     assert find_outlier_cameras(thinned).nonzero()[0].tolist() == [7]
     rest = thinned.without_cameras(find_outlier_cameras(thinned))

@@ -16,7 +16,7 @@ from preprocess.sfm.sfm_keyframes import (
 COUNT, SHARP = 36, (1, 5, 6, 11, 13, 17, 18, 22, 25, 29, 32, 35)
 
 
-def nobody(frame, size_px):
+def no_person(frame, size_px):
     return np.zeros(size_px[::-1], dtype=bool)
 
 
@@ -35,7 +35,7 @@ def film(tmp_path, rng):
 
 def test_the_sharpest_frame_of_each_stretch_is_chosen(film):
     told = []
-    keys = list(select_keyframes(film, nobody, told.append, 12))
+    keys = list(select_keyframes(film, no_person, told.append, 12))
     assert tuple(key.index for key in keys) == SHARP
     assert told[-1] == 1.0
     assert told == sorted(told)
@@ -43,14 +43,14 @@ def test_the_sharpest_frame_of_each_stretch_is_chosen(film):
 
 def test_only_wanted_frames_are_chosen(film):
     part = open_source(film.path, frames=slice(6, 30, 2))
-    assert {key.index for key in select_keyframes(part, nobody, lambda s: None, 60)} == set(
+    assert {key.index for key in select_keyframes(part, no_person, lambda s: None, 60)} == set(
         range(6, 30, 2)
     )
 
 
-def test_frames_in_which_nobody_knows_the_person_are_passed_over(film):
+def test_frames_without_a_known_person_are_skipped(film):
     def sometimes(frame, size_px):
-        return None if frame.index in (5, 6) else nobody(frame, size_px)
+        return None if frame.index in (5, 6) else no_person(frame, size_px)
 
     chosen = [key.index for key in select_keyframes(film, sometimes, lambda share: None, 12)]
     assert not {5, 6} & set(chosen)
@@ -67,7 +67,7 @@ def test_the_person_is_left_out_with_a_margin():
 
 def test_key_frames_are_read_as_they_were_written(film, tmp_path):
     def left_half(frame, size_px):
-        person = nobody(frame, size_px)
+        person = no_person(frame, size_px)
         person[:, : size_px[0] // 2] = True
         return person
 
@@ -86,7 +86,7 @@ def test_key_frames_are_read_as_they_were_written(film, tmp_path):
 def test_too_few_key_frames_are_refused(film, tmp_path):
     with pytest.raises(InputError, match="Only 5 frames"):
         write_keyframes(
-            select_keyframes(film, nobody, lambda share: None, 5),
+            select_keyframes(film, no_person, lambda share: None, 5),
             tmp_path / "images",
             tmp_path / "masks",
         )
