@@ -147,7 +147,8 @@ def measure_film(capture: Path, runs: Path) -> tuple[str, bool | None]:
     frames = recording.camera_report["frames"]
     return (
         f"{errors}; {solved.keyframe_count} key frames + {frames['placed']}; "
-        f"{costs['cpu_seconds']:.0f} core-s, {costs['peak_memory_mb']:.0f} MB; by {recording.camera_report['scale']['cues']}",
+        f"{costs['cpu_seconds']:.0f} core-s, {costs['peak_memory_mb']:.0f} MB; "
+        f"by {recording.camera_report['scale']['cues']}",
         errors.good,
     )
 

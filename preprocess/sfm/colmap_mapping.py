@@ -244,7 +244,7 @@ def _to_sparse_model(found: Any) -> SparseModel:
         camera_from_world=transforms,
         focal_px=focal,
         center_px=(x, y),
-        bend=bend,
+        radial_distortion=bend,
         size_px=(int(lens.width), int(lens.height)),
         points=np.array([found.points3D[number].xyz for number in ids]).reshape(-1, 3),
         observation_camera=np.array(seen_by, dtype=np.int64),
