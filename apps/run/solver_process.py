@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple, final
 
@@ -140,7 +141,7 @@ class SolverProcess:
         """
         job = job.with_absolute_paths()
         self.folder = job.folder(run).resolve()
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
         self._messages: queue.Queue[StageProgress | InputError | None] = queue.Queue()
         if (self.folder / SOLUTION_FILE).exists():
             return
@@ -149,11 +150,10 @@ class SolverProcess:
         (self.folder / LOG_FILE).write_text("", encoding="utf-8")
         spawn = multiprocessing.get_context("spawn")
         receiver, sender = spawn.Pipe(duplex=False)
-        self._process = spawn.Process(
-            target=_run, args=(job, self.folder, gently, sender), daemon=True
-        )
+        process = spawn.Process(target=_run, args=(job, self.folder, gently, sender), daemon=True)
         with _environment_of_child(job.threads):
-            self._process.start()
+            process.start()
+        self._process = process
         sender.close()  # the child's copy is the only one: its end is the end of the messages
         threading.Thread(target=self._listen, args=(receiver,), daemon=True).start()
 
