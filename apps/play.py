@@ -137,7 +137,8 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     console.info(
         f"{result.cpu_ms_per_frame:.1f} CPU-ms a picture of {result.size} px, "
         f"{result.pictures_per_second:.1f} pictures a second with "
-        f"{_format_workers(result.workers)} ({result.frames} pictures, {result.pixels_covered:.0%} covered, {result.provider}); "
+        f"{_format_workers(result.workers)} "
+        f"({result.frames} pictures, {result.pixels_covered:.0%} covered, {result.provider}); "
         f"loaded in {result.load_ms:.0f} ms; reference graph {result.reference_ms:.1f} ms"
     )
     return DONE
