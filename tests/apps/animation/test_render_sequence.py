@@ -235,4 +235,4 @@ def test_a_person_who_is_not_there_is_named(call_play, package, player, novel, t
     path, _ = humans(read_motion(novel), player.manifest.rest_joints[0], tmp_path)
     outcome = call_play(package, "--poses", path, "--person", "5")
     assert outcome.code == 2
-    assert "nobody called '5'" in outcome.complaint("ia-play")
+    assert "no person called '5'" in outcome.complaint("ia-play")
