@@ -1,4 +1,4 @@
-"""ia-check: says in seconds what is wrong with a capture, and how to mend it."""
+"""ia-check: diagnose a capture in seconds and suggest corrections."""
 
 import json
 import sys
@@ -31,24 +31,23 @@ from preprocess.alignment.correction_search import GOOD_IOU, USABLE_IOU
 from preprocess.capture_session import CaptureInputs
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-"""How the name of a picture that --sheet names may end."""
+"""Formats of the contact sheet that --sheet names."""
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckArguments:
-    """Says in seconds what is wrong with a capture, and how to mend it. Nothing is trained.
+    """Diagnose a capture in seconds and suggest corrections. Nothing is trained.
 
-    The body is drawn where poses and camera say, and held against the masks. Where they disagree,
-    the usual mistakes are undone one after another: poses late or early, of another frame rate or
-    backwards, OpenGL's axes, pictures rotated for the tracker, degrees, world and camera mixed up,
-    a wrong focal length, left for right, EasyMocap's root, another size or unit, masks of the
-    background or of a second person. Then the masks' outlines are held against edges in the
-    pictures: was the film alone rotated, mirrored, cropped or cut afterwards? Without masks the
-    body's outline is. The mistake is named, with the agreement that correcting it would bring
-    (intersection over union, 0 to 1; 0.75 to 0.9 is what good poses reach, as clothes are wider
-    than bodies).
+    The body is projected with the given poses and camera and compared with the masks. If they
+    disagree, known mistakes are tested one by one: poses late, early, backwards or at another frame
+    rate, OpenGL axes, images rotated for the tracker, degrees, world and camera exchanged, a wrong
+    focal length, left and right exchanged, EasyMocap's root, another size or unit, masks of the
+    background or of a second person. Then the masks' outlines are compared with edges in the images
+    to find a video that was rotated, mirrored, cropped or cut on its own; without masks, the body's
+    outline is. The report names the mistake and the IoU after its correction (intersection over
+    union, 0 to 1; good poses reach 0.75 to 0.9, because clothes are wider than bodies).
 
     Try it:
 
@@ -56,47 +55,47 @@ class CheckArguments:
 
         ia-check video.mp4 --poses poses.npz --fix corrected/
 
-    Look at the sheet it draws: white is the mask (if there is one), orange the body.
+    The contact sheet shows the mask's outline in white and the body's in orange.
 
-    Exit codes: 0 good, or not so good but usable (with --fix: once mended); 2 unusable or
+    Exit codes: 0 good, or usable with warnings (with --fix: after correction); 2 unusable or
     unreadable; 3 disk full; 130 Ctrl-C.
     """
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
-    """Video file, folder of pictures, or capture folder."""
+    """Video file, folder of images, or capture folder."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """SMPL poses, as ia-ingest takes them."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, as ia-ingest takes them."""
     mask_invert: Flag = False
-    """The person is dark in the masks."""
+    """Masks are dark where the person is (default: detected automatically)."""
     no_mask_invert: Flag = False
-    """The person is bright in the masks."""
+    """Masks are bright where the person is (default: detected automatically)."""
     cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Cameras, as ia-ingest takes them."""
     body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Your own SMPL body; else the embedded one."""
+    """Your own SMPL body (default: the embedded body)."""
     frames: str = "::"
-    """Which frames, START:STOP:STEP, counted from 0."""
+    """Frames to use: START:STOP:STEP, counted from 0."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
-    """Whose poses, where the file holds several people's; else the longest track."""
+    """Person ID in the pose file (default: the longest track)."""
     fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="")] = None
-    """Write the capture with the named cures applied to this folder."""
+    """Write a corrected copy of the capture to this folder."""
     sheet: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
-    """Where the sheet of pictures goes; without it runs/NAME-check.png, after the video."""
+    """Contact sheet to write (default: runs/NAME-check.png, named after the video)."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write what was found to this file."""
+    """Write the diagnosis to this file as JSON."""
     overwrite: Flag = False
-    """Replace the files that --sheet and --json name, if they are there."""
+    """Replace the files that --sheet and --json name, if they exist."""
 
     def capture_inputs(self) -> CaptureInputs:
-        """What is to be opened.
+        """Return the inputs to open.
 
         Raises:
-            InputError: If the arguments contradict each other.
+            InputError: If arguments contradict each other.
         """
         if camera_address(self.video) is not None:
-            raise InputError(f"{self.video} is a camera; a recording was expected.")
+            raise InputError(f"{self.video} is a camera, but ia-check needs a recording.")
         return CaptureInputs(
             video=self.video,
             poses=self.poses,
@@ -111,17 +110,17 @@ class CheckArguments:
         )
 
     def check_outputs(self) -> None:
-        """Whether what is found can be written where it should go.
+        """Check that the outputs can be written.
 
         Raises:
-            InputError: If not.
+            InputError: If one cannot.
         """
         inputs = self.capture_inputs().input_paths()
         if self.json is not None:
             check_output_file(self.json, "--json", inputs, overwrite=self.overwrite)
         if self.sheet is not None and self.sheet.suffix.lower() not in IMAGE_SUFFIXES:
             raise InputError(
-                f"--sheet is {self.sheet}; a name in {', '.join(IMAGE_SUFFIXES)} was expected."
+                f"--sheet is {self.sheet}, but must end in {', '.join(IMAGE_SUFFIXES)}."
             )
         check_output_file(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
         if self.fix is not None:
@@ -129,30 +128,30 @@ class CheckArguments:
             check_new_or_empty(self.fix)
 
     def sheet_path(self) -> Path:
-        """Where the sheet goes."""
+        """Return the path of the contact sheet."""
         name = self.video.resolve()
         own = name.name if name.is_dir() else name.stem
         return self.sheet or Path("runs") / f"{own}-check.png"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     given = parse_arguments(CheckArguments, "ia-check", argv)
     return run_command("ia-check", lambda: check(given, Console()))
 
 
 def check(arguments: CheckArguments, console: Console) -> int:
-    """Does what the arguments say.
+    """Diagnose a capture, draw the contact sheet, and write a corrected copy for --fix.
 
     Raises:
-        InputError: If there is nothing that can be examined, or nothing to mend where --fix asks.
-        OSError: If something cannot be written.
+        InputError: If the capture cannot be read, or --fix finds nothing to correct.
+        OSError: If an output cannot be written.
     """
-    wanted = arguments.capture_inputs()
+    inputs = arguments.capture_inputs()
     arguments.check_outputs()
     try:
-        with console.status("looking at poses, masks and cameras"):
-            examined = check_capture(wanted)
+        with console.status("comparing poses, masks and cameras"):
+            check_result = check_capture(inputs)
     except InputError as error:
         if arguments.json is not None:
             write_text_atomically(
@@ -161,36 +160,36 @@ def check(arguments: CheckArguments, console: Console) -> int:
             )  # fmt: skip
         raise
     if arguments.json is not None:
-        text = json.dumps(check_to_json(examined), indent=1) + "\n"
+        text = json.dumps(check_to_json(check_result), indent=1) + "\n"
         write_text_atomically(arguments.json, text, replace=arguments.overwrite)
-    _print_findings(examined, console)
+    _print_findings(check_result, console)
     path, ours = arguments.sheet_path(), arguments.sheet is None
-    if write_contact_sheet(path, examined, replace=arguments.overwrite, listed=ours):
+    if write_contact_sheet(path, check_result, replace=arguments.overwrite, listed=ours):
         console.print_artifact("look at it", path)
     else:
         console.warning(f"{path} was not written: no frame with a pose could be decoded.")
     if arguments.fix is not None:
-        write_corrected_capture(examined, arguments.fix)
+        write_corrected_capture(check_result, arguments.fix)
         console.print_artifact("corrected", arguments.fix)
-        return DONE if examined.corrected_iou >= USABLE_IOU else BAD_INPUT
-    if examined.causes and not examined.is_auto_corrected:
-        console.info(f"To correct it:  {check_command(wanted)}")
-    return BAD_INPUT if examined.verdict == "unusable" else DONE
+        return DONE if check_result.corrected_iou >= USABLE_IOU else BAD_INPUT
+    if check_result.causes and not check_result.is_auto_corrected:
+        console.info(f"To correct it:  {check_command(inputs)}")
+    return BAD_INPUT if check_result.verdict == "unusable" else DONE
 
 
-def check_to_json(examined: CaptureValidation) -> dict[str, Any]:
-    """What was found; agreements are null where there are no masks, `edges` where there are."""
-    diagnosis = examined.diagnosis
+def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
+    """Convert a diagnosis to JSON; IoUs are null without masks, `edges` is null with masks."""
+    diagnosis = check_result.diagnosis
     cures = diagnosis.corrections if diagnosis else ()
     tried = diagnosis.candidates if diagnosis else ()
     film = diagnosis.video if diagnosis else None
     return {
         "format": 1,
-        "verdict": examined.verdict,
-        "cause": examined.causes[0] if examined.causes else None,
+        "verdict": check_result.verdict,
+        "cause": check_result.causes[0] if check_result.causes else None,
         "iou": {
-            "now": json_number(examined.stored_iou),
-            "after_fix": json_number(examined.corrected_iou),
+            "now": json_number(check_result.stored_iou),
+            "after_fix": json_number(check_result.corrected_iou),
         },
         "tried": [
             {
@@ -215,14 +214,14 @@ def check_to_json(examined: CaptureValidation) -> dict[str, Any]:
             ],
         },
         "corrections": [{"cause": cure.cause, "words": cure.description} for cure in cures],
-        "anomalies": list(examined.anomalies),
-        "refused": examined.refusal,
-        "edges": json_number(examined.edge_ratio),
+        "anomalies": list(check_result.anomalies),
+        "refused": check_result.refusal,
+        "edges": json_number(check_result.edge_ratio),
     }
 
 
 def unreadable_to_json(reason: str) -> dict[str, Any]:
-    """The same for what could not even be opened."""
+    """Return the JSON of a capture that could not be opened."""
     return {
         "format": 1, "verdict": "unusable", "cause": None,
         "iou": {"now": None, "after_fix": None}, "tried": [], "corrections": [], "anomalies": [],
@@ -230,51 +229,51 @@ def unreadable_to_json(reason: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _print_findings(examined: CaptureValidation, console: Console) -> None:
-    for note in examined.recording.notes:
+def _print_findings(check_result: CaptureValidation, console: Console) -> None:
+    for note in check_result.recording.notes:
         console.warning(note)
-    for sentence in (*examined.recording.source.warnings, *examined.anomalies):
+    for sentence in (*check_result.recording.source.warnings, *check_result.anomalies):
         console.warning(sentence)
-    if examined.refusal is not None:
-        console.info(f"ia-ingest would refuse it: {examined.refusal}")
-    if examined.diagnosis is None:
-        console.info(_describe_without_masks(examined))
+    if check_result.refusal is not None:
+        console.info(f"ia-ingest would refuse this capture: {check_result.refusal}")
+    if check_result.diagnosis is None:
+        console.info(_describe_without_masks(check_result))
         return
-    if examined.is_auto_corrected:
+    if check_result.is_auto_corrected:
         console.info(
-            f"{examined.verdict}: body and masks agree by {examined.corrected_iou:.2f} (0 to 1). The masks "
-            "show the background in white (mask_polarity); ia-ingest inverts such masks by itself, "
-            "so nothing needs to be done."
+            f"{check_result.verdict}: IoU of body and masks: {check_result.corrected_iou:.2f}. The "
+            "masks are bright in the background (mask_polarity); ia-ingest inverts them "
+            "automatically, so nothing needs to be done."
         )
         return
-    but = ", but not with the pictures" if examined.has_film_errors else ""
+    but = " The masks do not match the images." if check_result.has_film_errors else ""
     console.info(
-        f"{examined.verdict}: body and masks agree by {examined.stored_iou:.2f} (0 to 1){but}."
+        f"{check_result.verdict}: IoU of body and masks: {check_result.stored_iou:.2f}.{but}"
     )
-    for cure in examined.diagnosis.corrections:
-        console.info(f"It looks as if {cure.description} ({cure.cause}).")
-    if examined.causes:
-        console.info(examined.expected_improvement)
-    elif examined.verdict != "good" and examined.stored_iou >= GOOD_IOU:
-        console.info("They fit in the frames that have both; the warnings above name the problem.")
-    elif examined.verdict != "good":
+    for correction in check_result.diagnosis.corrections:
+        console.info(f"Probable cause: {correction.description} ({correction.cause}).")
+    if check_result.causes:
+        console.info(check_result.expected_improvement)
+    elif check_result.verdict != "good" and check_result.stored_iou >= GOOD_IOU:
+        console.info("Poses and masks match where both exist; see the warnings above.")
+    elif check_result.verdict != "good":
         console.info(NO_KNOWN_MISTAKE)
 
 
-def _describe_without_masks(examined: CaptureValidation) -> str:
-    """What can be said of a capture whose masks ia-ingest will have to estimate."""
-    if examined.edge_ratio is None:
-        return "There are no masks, and no picture could be looked at."
-    fits = examined.edge_ratio >= GOOD_EDGE_RATIO
+def _describe_without_masks(check_result: CaptureValidation) -> str:
+    """Describe a capture without masks by the edges along the body's outline."""
+    if check_result.edge_ratio is None:
+        return "There are no masks, and no image could be decoded."
+    matches = check_result.edge_ratio >= GOOD_EDGE_RATIO
     return (
-        f"{examined.verdict}: there are no masks (ia-ingest estimates some from poses and "
-        f"pictures), so the pictures' own edges were compared with the body's outline: along it "
-        f"the picture changes {examined.edge_ratio:.1f} times as much as beside it. The poses "
+        f"{check_result.verdict}: there are no masks (ia-ingest estimates them from poses and "
+        "images), so image edges were compared with the body's outline: they are "
+        f"{check_result.edge_ratio:.1f} times as strong across it as beside it. The poses "
         + (
-            "fit (2 to 5 times where they do, about 1 where they do not)."
-            if fits
-            else "hardly fit (2 to 5 times was expected, about 1 is chance). Give --masks to find "
-            "out what is wrong."
+            "match the images (2 to 5 is usual; 1 is chance)."
+            if matches
+            else "do not match the images (expected a ratio of 2 to 5; 1 is chance). Pass --masks "
+            "for a diagnosis."
         )
     )
 

@@ -1,4 +1,4 @@
-"""ia-evaluate: how good an avatar is, by renderer and player, as a table."""
+"""ia-evaluate: score avatars, by renderer and player, as a table."""
 
 import sys
 import threading
@@ -23,16 +23,16 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     given = parse_arguments(EvaluateArguments, "ia-evaluate", argv)
     return run_command("ia-evaluate", lambda: evaluate(given, Console()))
 
 
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
-    """Does what the arguments say.
+    """Score avatars and print the table.
 
     Raises:
-        InputError: If something is missing, unreadable or does not fit together.
+        InputError: If an input is missing, unreadable or does not match the others.
         OSError: If the disk is full.
     """
     arguments.validate()
@@ -42,7 +42,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
         from capture.atomic_files import write_text_atomically
 
     found: list[AvatarEvaluation] = []
-    with stop_on_interrupt(console, "the table shows what was scored") as stop:
+    with stop_on_interrupt(console, "the table shows the frames scored by now") as stop:
         found += (
             evaluation
             for evaluation in _evaluate_all(arguments, console, stop)
@@ -51,15 +51,15 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     if not found:
         if stop.is_set():
             return INTERRUPTED
-        raise InputError("There was no frame with a person in it, so there is nothing to score.")
-    told = markdown_table(found)
-    print(told, end="")  # noqa: T201 - the table goes to stdout, for scripts
+        raise InputError("No frame shows the person, so there is nothing to score.")
+    table = markdown_table(found)
+    print(table, end="")  # noqa: T201 - the table goes to stdout, for scripts
     if arguments.json is not None:
         write_text_atomically(
             arguments.json, evaluations_to_json(found), replace=arguments.overwrite
         )
     if arguments.markdown is not None:
-        write_text_atomically(arguments.markdown, told, replace=arguments.overwrite)
+        write_text_atomically(arguments.markdown, table, replace=arguments.overwrite)
     return INTERRUPTED if stop.is_set() else DONE
 
 
@@ -78,9 +78,7 @@ def _evaluate_all(
             yield _evaluate_run(run, arguments, console, stop)
         elif subjects := find_subjects(path):
             if arguments.on is not None:
-                raise InputError(
-                    f"{path} is a dataset with test frames of its own; leave --on out."
-                )
+                raise InputError(f"{path} is a dataset with its own test frames; omit --on.")
             for subject, place in subjects:
                 run = _run_folder_of(subject, path, arguments)
                 if not stop.is_set() and _train_subject(subject, place, run, arguments, console):
@@ -89,22 +87,22 @@ def _evaluate_all(
                     stop.set()
         else:
             raise InputError(
-                f"{path} is no run (it has no checkpoint/), no .iavatar package, and holds no "
-                "subject of PeopleSnapshot (a folder named as male-3-casual)."
+                f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
+                "folder with subjects of PeopleSnapshot (such as male-3-casual)."
             )
 
 
 def _evaluate_package(
     path: Path, arguments: EvaluateArguments, console: Console, stop: threading.Event
 ) -> "AvatarEvaluation":
-    """The player alone, beside frames that have to be named."""
+    """Score the player alone, on the capture of --on."""
     from apps.evaluation.avatar_scorer import evaluate_avatar
     from apps.evaluation.evaluation_frames import capture_frames
 
     if arguments.on is None:
         raise InputError(
-            f"{path} is a package, which holds no frames: name a capture of the same person with "
-            "--on, or give the run's folder."
+            f"{path} is a package, which holds no frames: pass a capture of the same person with "
+            "--on, or the run's folder."
         )
     beside = RunFolder(path=path.parent).body_file
     person = beside if beside.is_file() else None
@@ -115,7 +113,7 @@ def _evaluate_package(
 def _evaluate_run(
     run: RunFolder, arguments: EvaluateArguments, console: Console, stop: threading.Event
 ) -> "AvatarEvaluation":
-    """Renderer and player beside the run's own held-out frames, or another capture's."""
+    """Score renderer and player on the run's held-out frames, or on the capture of --on."""
     from apps.evaluation.evaluation_frames import (
         capture_frames,
         held_out_frames,
@@ -137,7 +135,7 @@ def _evaluate_run(
 def _run_folder_of(
     subject: "DatasetSubject", dataset: Path, arguments: EvaluateArguments
 ) -> RunFolder:
-    """Where a subject is learnt."""
+    """Return the folder of a subject's run."""
     above = arguments.out or Path("runs") / dataset.resolve().name
     return RunFolder(path=above / subject.name)
 
@@ -150,16 +148,16 @@ def _evaluate_subject(
     console: Console,
     stop: threading.Event,
 ) -> "AvatarEvaluation":
-    """A subject of the dataset that was learnt, in the paper's frames."""
+    """Score a trained subject on the paper's test frames."""
     from apps.evaluation.evaluation_frames import capture_frames
     from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TEST_POSES, subject_poses
 
-    wanted = replace(
+    inputs = replace(
         arguments.capture_inputs(folder),
         poses=subject_poses(folder, TEST_POSES),
         frames=parse_frame_range(subject.test),
     )
-    frames = capture_frames(wanted, run.body_file, arguments.size or LONGER_SIDE_PX)
+    frames = capture_frames(inputs, run.body_file, arguments.size or LONGER_SIDE_PX)
     return replace(
         _evaluate_renderer_and_player(subject.name, run, frames, arguments, console, stop),
         paper=subject.paper,
@@ -173,10 +171,10 @@ def _train_subject(
     arguments: EvaluateArguments,
     console: Console,
 ) -> bool:
-    """Makes the subject's run as ia-ingest does, from all of the paper's training frames.
+    """Train a subject like ia-ingest, on all of the paper's training frames.
 
     Returns:
-        Whether it is whole; Ctrl-C leaves a part, with which the next evaluation goes on.
+        Whether training is complete; after Ctrl-C the next evaluation continues it.
     """
     from apps.evaluation.evaluation_frames import is_trained
     from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TRAIN_POSES, subject_poses
@@ -184,9 +182,9 @@ def _train_subject(
     from apps.run.ingest_arguments import IngestArguments
 
     if is_trained(run, seconds=arguments.seconds, steps=arguments.steps):
-        console.info(f"{subject.name} was learnt before, in {run.path}.")
+        console.info(f"{subject.name} was trained before, in {run.path}.")
         return True
-    console.info(f"Learning {subject.name}.")
+    console.info(f"Training {subject.name}.")
     words = IngestArguments(
         video=folder,
         poses=subject_poses(folder, TRAIN_POSES),
@@ -205,7 +203,7 @@ def _train_subject(
     except CommandExit as end:
         if end.code not in (NO_AVATAR, INTERRUPTED):
             raise
-        console.warning(str(end))  # a poor avatar is scored like any other
+        console.warning(str(end))  # a failed avatar is scored, too
         return end.code == NO_AVATAR
 
 

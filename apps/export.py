@@ -1,4 +1,4 @@
-"""ia-export: what a run has learnt so far, as a package or a mesh that others can use."""
+"""ia-export: write the current state of a run as a package, or an avatar as a mesh."""
 
 import shutil
 import sys
@@ -26,18 +26,20 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from avatar.deformation.rig import Rig
 
 CHECK_VIEWS = 4
+"""Synthetic views that validate a package without frames."""
 VIEW_PX = 256
+"""Width and height of a synthetic view."""
 DISTANCE_HEIGHTS = 3.5
-"""How far the camera stands, in heights of the person."""
+"""Distance of the camera, in heights of the person."""
 PERSON_HEIGHT_SHARE = 0.8
-"""Of the picture's height, how much the person takes."""
+"""Height of the person as a fraction of the image height."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportArguments:
-    """Makes a file of a run's newest checkpoint, at any second of the run, or of a package.
+    """Write the newest checkpoint of a run, or a package, to a file.
 
-    Try it, while ia-ingest is still learning or after it was killed:
+    Try it while ia-ingest is training, or after it was killed:
 
         ia-export run --out now.iavatar
 
@@ -47,58 +49,54 @@ class ExportArguments:
 
         ia-export run/avatar.iavatar --to glb --poses dance.npz --out dance.glb
 
-    The run goes on undisturbed; nothing in its folder is touched unless --out names it. A mesh is
-    opaque and its silhouette hard: ia-play shows more of the avatar than any other program can.
+    The run continues undisturbed; nothing in its folder is changed unless --out names it. A mesh is
+    opaque with a hard silhouette: ia-play renders the avatar in full quality.
 
-    Exit codes: 0 done; 1 nothing to draw so far; 2 bad input; 3 disk full; 130 Ctrl-C.
+    Exit codes: 0 done; 1 nothing to draw yet; 2 bad input; 3 disk full; 130 Ctrl-C.
     """
 
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
-    """Folder that ia-ingest wrote (--out), with a checkpoint/ in it; for meshes a package, too."""
+    """Folder written by ia-ingest (--out), with checkpoint/; for meshes also a package."""
     to: Literal["iavatar", "glb", "ply", "obj"] = "iavatar"
-    """Format: the package that ia-play plays; glTF 2.0 binary; or a still mesh with vertex colors,
-    as PLY or OBJ (canonical pose, no skeleton)."""
+    """Format: package for ia-play; binary glTF 2.0; or a static mesh with vertex colors as PLY or
+    OBJ (canonical pose, no skeleton)."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
-    """File to write; it appears whole or not at all."""
+    """File to write, whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """With --to glb: the motion that goes in, as ia-play reads it; without it, a turn."""
+    """Motion for --to glb, as in ia-play (default: a turn)."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
-    """Whose poses, where the file holds several people's; without it whoever has most."""
-
+    """Person ID in the pose file (default: the longest track)."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
-    """Replace the file that --out names, if there is one."""
+    """Replace the file that --out names, if it exists."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     given = parse_arguments(ExportArguments, "ia-export", argv)
     return run_command("ia-export", lambda: export(given, Console()))
 
 
 def export(arguments: ExportArguments, console: Console) -> int:
-    """Does what the arguments say.
+    """Write a package or a mesh.
 
     Raises:
-        InputError: If there is no checkpoint that can be read, or no folder to write to.
+        InputError: If there is no readable checkpoint, or no folder to write to.
         OSError: If the disk is full.
-        Stop: If there is nothing to draw.
+        CommandExit: If there is nothing to draw.
     """
     if arguments.out.suffix.lower() != f".{arguments.to}":
-        raise InputError(
-            f"--out is {arguments.out}; a name that ends in .{arguments.to} was expected."
-        )
+        raise InputError(f"--out is {arguments.out}, but must end in .{arguments.to}.")
     if not arguments.out.resolve().parent.is_dir():
         raise InputError(
-            f"--out: there is no folder {arguments.out.resolve().parent}. Make it first."
+            f"--out is {arguments.out}, but the folder {arguments.out.resolve().parent} does not "
+            "exist."
         )
     inputs = [
         path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()
     ]
     check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
     if arguments.poses is not None and arguments.to != "glb":
-        raise InputError(
-            f"--poses go into a .glb; a .{arguments.to} holds no motion. Leave them out."
-        )
+        raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
     if arguments.run.is_file() and arguments.to != "iavatar":
         _export_mesh(arguments, arguments.run, console)
     else:
@@ -118,23 +116,23 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
     from apps.animation.mesh_writer import write_mesh
 
     write_mesh(
-        package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem, person=arguments.person,
-        replace=arguments.overwrite,
+        package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem,
+        person=arguments.person, replace=arguments.overwrite,
     )  # fmt: skip
 
 
 def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: bool = True) -> None:
-    """A package of a run's checkpoint; one that nobody will play is not fine-tuned for players."""
+    """Write a package of a run's checkpoint, fine-tuned unless it only becomes a mesh."""
     if folder.is_file():
         raise InputError(
-            f"{folder} is a file; a package is made from the folder that ia-ingest wrote. From a "
-            "package come --to glb, --to ply and --to obj."
+            f"{folder} is a file, but must be a folder written by ia-ingest. A package can be "
+            "converted with --to glb, --to ply and --to obj."
         )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():
         raise InputError(
-            f"There is no checkpoint in {run.checkpoint}; a folder that ia-ingest wrote was "
-            "expected. It writes the first one five seconds after the first frame."
+            f"No checkpoint in {run.checkpoint}; expected a folder written by ia-ingest, which "
+            "saves the first checkpoint five seconds after the first frame."
         )
     with console.status("loading the checkpoint"):
         import torch
@@ -152,11 +150,11 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
         raise CommandExit(taken.refusal or "nothing was written.", NO_AVATAR)
     for warning in taken.export_report.warnings:
         console.warning(warning)
-    console.info(f"As learnt from {trainer.frames_seen} frames in {trainer.wall_seconds:.1f} s.")
+    console.info(f"Trained on {trainer.frames_seen} frames for {trainer.wall_seconds:.1f} s.")
 
 
 def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
-    """Poses of a little motion, each seen from the front: a checkpoint holds no frames."""
+    """Return poses of the built-in motion, seen from the front: a checkpoint holds no frames."""
     motion = demo_motion(frames=CHECK_VIEWS)
     low, high = rig.seeds.min(axis=0).astype(float), rig.seeds.max(axis=0).astype(float)
     distance = DISTANCE_HEIGHTS * (high[1] - low[1])

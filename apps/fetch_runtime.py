@@ -1,4 +1,4 @@
-"""make web: fetches onnxruntime-web through the machine's own npm, for `ia-play --web`."""
+"""make web: fetch onnxruntime-web with npm, for `ia-play --web`."""
 
 import shutil
 import subprocess
@@ -15,30 +15,31 @@ from capture.input_error import InputError
 from export.web import onnxruntime_web
 
 PROGRAM = "python -m apps.fetch_runtime"
+"""Name of the command in its --help."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FetchArguments:
-    """Fetches onnxruntime-web, pinned, which `ia-play --web` needs; `make web` calls it.
+    """Fetch the pinned release of onnxruntime-web that `ia-play --web` needs (`make web`).
 
-    It comes through this machine's npm (33 MB, once), is compared with the sum that we know, and
-    kept beside the page. Nothing is done if it is there already.
+    npm downloads it once (33 MB); its checksum is verified, and it is stored next to the page. An
+    existing copy is kept.
 
-    Exit codes: 0 done; 2 no npm, or it could not fetch; 3 disk full; 130 Ctrl-C.
+    Exit codes: 0 done; 2 npm is missing or failed; 3 disk full; 130 Ctrl-C.
     """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     parse_arguments(FetchArguments, PROGRAM, argv)
     return run_command("make web", lambda: fetch_runtime(Console()))
 
 
 def fetch_runtime(console: Console) -> int:
-    """Fetches, checks and keeps the pinned release, unless it is there.
+    """Fetch, verify and store the pinned release, unless it exists.
 
     Raises:
-        InputError: If npm is missing, cannot fetch it, or fetches something else.
+        InputError: If npm is missing or fails, or the checksum differs.
     """
     try:
         onnxruntime_web.runtime_files()
@@ -52,7 +53,7 @@ def fetch_runtime(console: Console) -> int:
 def _fetch_tarball() -> bytes:
     npm = shutil.which("npm")
     if npm is None:
-        raise InputError("npm was not found. Install Node.js, which brings it, and try again.")
+        raise InputError("npm was not found. Install Node.js, which includes it, and try again.")
     with tempfile.TemporaryDirectory() as folder:
         package = f"onnxruntime-web@{onnxruntime_web.ORT_WEB_VERSION}"
         command = [npm, "pack", package, "--ignore-scripts", "--pack-destination", folder]

@@ -1,4 +1,4 @@
-"""ia-play: an avatar in poses it was never filmed in, as a clip, a web page, or figures."""
+"""ia-play: render an avatar in any motion, as a clip or a web page; benchmark and verify it."""
 
 import sys
 import time
@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     words = fill_optional_port(sys.argv[1:] if argv is None else argv, "--web", WEB_PORT)
     words = fill_optional_number(words, "--turntable", DEFAULT_TURN_S)
     given = parse_arguments(PlayArguments, "ia-play", words)
@@ -26,10 +26,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def play(arguments: PlayArguments, console: Console) -> int:
-    """Does what the arguments say.
+    """Render a clip, serve or write a page, benchmark, or verify.
 
     Raises:
-        InputError: If something is missing, unreadable or does not fit together.
+        InputError: If an input is missing, unreadable or does not match the others.
         OSError: If the disk is full.
     """
     arguments.validate()
@@ -71,11 +71,11 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
         arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf
     )
     if arguments.fps is not None and shots.fps < arguments.fps:
-        console.info(f"note: a GIF shows {MAX_GIF_FPS:g} pictures a second at most.")
+        console.info(f"note: GIF output is limited to {MAX_GIF_FPS:g} fps.")
     total = len(shots)
     with (
-        stop_on_interrupt(console, "the pictures drawn so far are being kept") as stop,
-        console.progress(f"drawing {out.name}", float(total)) as bar,
+        stop_on_interrupt(console, "keeping the frames rendered by now") as stop,
+        console.progress(f"rendering {out.name}", float(total)) as bar,
     ):
 
         def pictures() -> Iterator[np.ndarray]:
@@ -83,7 +83,7 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
                 shots, workers=arguments.worker_count, samples=arguments.samples
             )
             for done, picture in enumerate(drawn):
-                bar.update(float(done), f"{done}/{total} pictures")
+                bar.update(float(done), f"{done}/{total} frames")
                 yield picture
                 if stop.is_set():
                     drawn.close()
@@ -98,10 +98,10 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
             replace=arguments.overwrite,
         )
     width, height = shots.cameras[0].size_px
-    pace = f" at {shots.fps:.4g} a second" if count > 1 else ""
-    what = "a picture" if count == 1 else f"{count} pictures"
+    rate = f" at {shots.fps:.4g} fps" if count > 1 else ""
     cut = f" of {total}" if count < total else ""
-    console.info(f"Drew {what}{cut} of {width}x{height} px{pace}; {encoder.description}:")
+    frames = "1 frame" if count == 1 else f"{count}{cut} frames"
+    console.info(f"Rendered {frames} of {width}x{height} px{rate}; {encoder.description}:")
     print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
 
@@ -135,17 +135,16 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     if arguments.json is not None:
         write_text_atomically(arguments.json, result.to_json(), replace=arguments.overwrite)
     console.info(
-        f"{result.cpu_ms_per_frame:.1f} CPU-ms a picture of {result.size} px, "
-        f"{result.pictures_per_second:.1f} pictures a second with "
-        f"{_format_workers(result.workers)} "
-        f"({result.frames} pictures, {result.pixels_covered:.0%} covered, {result.provider}); "
+        f"{result.cpu_ms_per_frame:.1f} CPU-ms per {result.size} px frame, "
+        f"{result.pictures_per_second:.1f} frames/s with {_format_workers(result.workers)} "
+        f"({result.frames} frames, {result.pixels_covered:.0%} covered, {result.provider}); "
         f"loaded in {result.load_ms:.0f} ms; reference graph {result.reference_ms:.1f} ms"
     )
     return DONE
 
 
 def _format_workers(workers: int) -> str:
-    return "one worker" if workers == 1 else f"{workers} workers"
+    return "1 worker" if workers == 1 else f"{workers} workers"
 
 
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
@@ -157,7 +156,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from export.web.player_page import build_page
 
     if not 0 < port < 1 << 16:
-        raise InputError(f"--web {port} is no port; 1 to 65535 were expected.")
+        raise InputError(f"--web is {port}, but must be a port from 1 to 65535.")
     runtime_files()
     if arguments.out is not None:
         check_output_folder(arguments.out, "--out", arguments.inputs)
@@ -182,7 +181,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
         return DONE
     write_site(files, arguments.out)
     megabytes = sum(map(len, files.values())) / 1e6
-    console.info(f"Wrote {len(files)} files, {megabytes:.1f} MB; any static host serves them:")
+    console.info(f"Wrote {len(files)} files, {megabytes:.1f} MB, for any static host:")
     print(arguments.out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE
 

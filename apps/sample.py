@@ -1,4 +1,4 @@
-"""ia-sample: films a synthetic person into a capture folder, with the truth beside it."""
+"""ia-sample: film a synthetic actor into a capture folder with ground truth."""
 
 import shlex
 import sys
@@ -18,34 +18,33 @@ from studio.shoot_config import ShootConfig
 
 @dataclass(frozen=True, kw_only=True)
 class SampleArguments:
-    """Films a synthetic person into a capture folder, with the truth beside it.
+    """Film a synthetic actor into a capture folder with ground truth.
 
     OUT then holds video.mp4 (lossless FFV1: VLC, mpv and ffmpeg play it), preview.webm (the same
-    film for browsers and phones), masks/, cameras.npz, poses.npz, dance.npz (a motion to drive the
-    avatar with, never filmed) and truth/: the exact poses, and twelve never-seen poses with their
-    true images. Try it:
+    video for browsers and phones), masks/, cameras.npz, poses.npz, dance.npz (a novel motion to
+    drive the avatar with) and truth/: the exact poses, and twelve novel poses with images. Try it:
 
         ia-sample demo/capture
 
         ia-ingest demo/capture/video.mp4 --poses demo/capture/poses.npz --out demo/run
 
-    With --motion walkaround a phone is carried around the actor in a furnished room. Like a
-    phone's video it comes without cameras: poses.npz is told in the camera of each frame, with K;
-    the true cameras lie in OUT/truth/cameras.npz, to compare with or to give as --cameras.
+    With --motion walkaround a phone is carried around the actor in a furnished room. Like a phone
+    video it comes without cameras: poses.npz is relative to the camera of each frame, with K; the
+    true cameras are in OUT/truth/cameras.npz, for comparison or for --cameras.
 
-    Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C. The folder is written whole or not
-    at all.
+    Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C. The folder is written whole or not at
+    all.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder to write."""
     shoot: Annotated[ShootConfig, tyro.conf.arg(name="")] = field(default_factory=ShootConfig)
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace a capture that is already there."""
+    """Replace an existing capture."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit code."""
+    """Run the command; return its exit code."""
     config = parse_arguments(SampleArguments, "ia-sample", argv)
     return run_command("ia-sample", lambda: _film(config, Console()))
 
@@ -54,11 +53,11 @@ def _film(config: SampleArguments, console: Console) -> int:
     try:
         _film_with_progress(config, console)
     except (OSError, KeyboardInterrupt) as error:
-        error.add_note("Nothing was left behind.")
+        error.add_note("Nothing was written.")
         raise
     video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
     console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
-    console.info(f"To look at in a browser: {config.out / 'preview.webm'}. Next:")
+    console.info(f"Preview for a browser: {config.out / 'preview.webm'}. Next:")
     console.info(f"  ia-ingest {video} --poses {poses}")
     return DONE
 
@@ -71,7 +70,7 @@ def _film_with_progress(config: SampleArguments, console: Console) -> None:
     with console.progress("filming", 1.0) as bar:
 
         def advance(done: int, total: int) -> None:
-            bar.update(done / total, f"{done}/{total} pictures")
+            bar.update(done / total, f"{done}/{total} frames")
 
         bar.update(0.0, "dressing the actor")
         film_capture(config.out, config.shoot, advance, overwrite=config.overwrite)

@@ -1,7 +1,4 @@
-"""What stands behind an avatar: a colour by its name, a picture, or nothing.
-
-Pictures to a clip, a moving picture, one picture or a folder of frames, whole or not at all.
-"""
+"""Clips, animations, images and folders of frames, over a background or with alpha."""
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
@@ -18,16 +15,25 @@ from capture.image_folder import read_image
 from capture.input_error import InputError
 from capture.video_encoder import ClipEncoder, video_encoder
 
-Compositor = Callable[[UInt8[np.ndarray, "height width 4"]], UInt8[np.ndarray, "height width 3"]]
 TRANSPARENT = "transparent"
+"""Value of --background that keeps alpha."""
+CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
+"""Suffixes of the files that can be written; a name without one is a folder of frames."""
+MAX_GIF_FPS = 50.0
+"""Frame rate above which browsers slow a GIF down."""
+
+Rgba = UInt8[np.ndarray, "height width 4"]
+Rgb = UInt8[np.ndarray, "height width 3"]
+BackgroundBlend = Callable[[Rgba], Rgb]
+"""Composites an image with straight alpha over a background."""
 
 
-def background_compositor(color_or_path: str) -> Compositor:
-    """A function that puts pictures with straight alpha on a background.
+def background_compositor(color_or_path: str) -> BackgroundBlend:
+    """Return a function that composites images with straight alpha over a background.
 
     Args:
-        wish: A colour ("white", "#203040", "rgb(10, 20, 30)") or the path of a picture, which is
-            cropped in the middle to the shape that is needed.
+        color_or_path: A color ("white", "#203040", "rgb(10, 20, 30)"), or the path of an image, of
+            which the center is shown.
 
     Raises:
         InputError: If it is neither.
@@ -41,17 +47,15 @@ def background_compositor(color_or_path: str) -> Compositor:
     path = Path(color_or_path)
     if not path.is_file():
         raise InputError(
-            f"--background {color_or_path} is neither a colour (white, #203040), nor {TRANSPARENT}, nor a "
-            "picture that is there."
+            f"--background {color_or_path} is neither a color (white, #203040), nor {TRANSPARENT}, "
+            "nor an existing image."
         )
     picture, _ = read_image(path)
     fitted = lru_cache(1)(lambda width, height: _crop_to_cover(picture, width, height))
     return lambda rgba: _composite_over(rgba, fitted(rgba.shape[1], rgba.shape[0]))
 
 
-def _composite_over(
-    rgba: UInt8[np.ndarray, "height width 4"], behind: UInt8[np.ndarray, "height width 3"]
-) -> UInt8[np.ndarray, "height width 3"]:
+def _composite_over(rgba: Rgba, behind: Rgb) -> Rgb:
     alpha = rgba[..., 3:].astype(np.uint16)
     mixed = rgba[..., :3] * alpha + behind * (255 - alpha) + 127
     return (mixed // 255).astype(np.uint8)
@@ -69,37 +73,29 @@ def _crop_to_cover(
     return scaled[top : top + height, left : left + width]
 
 
-CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
-MAX_GIF_FPS = 50.0
-"""Pictures a second of a GIF at most: browsers slow down what is faster."""
-
-Rgba = UInt8[np.ndarray, "height width 4"]
-Rgb = UInt8[np.ndarray, "height width 3"]
-BackgroundBlend = Callable[[Rgba], Rgb]
-"""Puts a picture with straight alpha on a background."""
-
-
 def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
-    """Whether something can be written there.
+    """Check that a clip can be written.
 
     Args:
-        path: A clip, a picture, or a folder for frames.
-        inputs: What is read and must not be written to.
-        overwrite: Whether a file that is there already may go.
+        path: A clip, an image, or a folder for frames.
+        inputs: Files that are read and must not be written to.
+        overwrite: Whether an existing file may be replaced.
 
     Raises:
-        InputError: If the suffix is unknown, or something is there that must stay.
+        InputError: If the suffix is unknown, or the path may not be written.
     """
     if path.suffix and path.suffix.lower() not in CLIP_SUFFIXES and not path.is_dir():
         raise InputError(
-            f"{path} ends in {path.suffix!r}; a clip ends in {', '.join(CLIP_SUFFIXES)}, and a name "
-            "without a suffix is a folder for PNG frames."
+            f"{path} ends in {path.suffix!r}, but a clip must end in {', '.join(CLIP_SUFFIXES)}; "
+            "a name without a suffix is a folder for PNG frames."
         )
     if path.is_dir():
         if path.suffix.lower() in CLIP_SUFFIXES:
-            raise InputError(f"{path} is a folder, but its name is that of a clip. Name another.")
+            raise InputError(
+                f"{path} is a folder, but its name is that of a clip. Choose another name."
+            )
     elif path.exists() and path.suffix.lower() not in CLIP_SUFFIXES:
-        raise InputError(f"{path} is a file; a folder for PNG frames was expected.")
+        raise InputError(f"{path} is a file, but must be a folder for PNG frames.")
     if path.suffix.lower() in CLIP_SUFFIXES:
         check_output_file(path, "--out", inputs, overwrite=overwrite)
     else:
@@ -107,23 +103,21 @@ def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> N
 
 
 def choose_encoder(path: Path, blend: BackgroundBlend | None) -> ClipEncoder:
-    """How a clip of that name is written here.
+    """Choose the encoder by the suffix of a path.
 
     Args:
-        path: Decides by its suffix.
+        path: Clip to write.
         blend: The background; None keeps alpha.
 
     Raises:
-        InputError: If alpha cannot be kept there.
+        InputError: If the format has no alpha.
     """
     suffix = path.suffix.lower()
     if suffix == ".gif":
-        hard = ", edges hard, for a GIF knows no half transparency" if blend is None else ""
-        return ClipEncoder(description=f"a GIF of 256 colours a picture{hard}", write=_write_gif)
+        hard = ", binary transparency" if blend is None else ""
+        return ClipEncoder(description=f"a GIF of 256 colors per frame{hard}", write=_write_gif)
     if suffix == ".webp":
-        return ClipEncoder(
-            description="WebP, which browsers show like a picture", write=_write_webp
-        )
+        return ClipEncoder(description="animated WebP", write=_write_webp)
     if suffix == ".png":
         return ClipEncoder(description="PNG", write=_write_png)
     if suffix not in CLIP_SUFFIXES:
@@ -140,18 +134,18 @@ def write_clip(
     encoder: ClipEncoder,
     replace: bool | None = None,
 ) -> int:
-    """Writes pictures as the encoder does.
+    """Encode images as a clip, whole or not at all.
 
     Args:
-        path: Where to.
-        pictures: With straight alpha, all of one size; at least one.
-        fps: Pictures a second.
+        path: File or folder to write.
+        images: With straight alpha, all of one size; at least one.
+        fps: Frames per second.
         blend: The background; None keeps alpha.
         encoder: From `choose_encoder`.
-        replace: Whether a file that is there already may go, as of `atomic_file`.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
 
     Returns:
-        How many pictures were written.
+        The number of frames written.
 
     Raises:
         OSError: If the disk is full; then nothing is written.
@@ -163,7 +157,7 @@ def write_clip(
 
 
 def _encode_png(picture: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    # OpenCV wants BGR(A), and its own writer does not say when the disk is full
+    # OpenCV expects BGR(A); its own file writer does not report a full disk
     code = cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR
     return cv2.imencode(".png", cv2.cvtColor(picture, code))[1].tobytes()
 
@@ -182,7 +176,7 @@ def _write_frames(folder: Path, pictures: Iterator[Rgba | Rgb], fps: float) -> i
 
 
 def _write_gif(path: Path, pictures: Iterator[Rgba | Rgb], fps: float) -> int:
-    """A palette a picture: 46 dB on white, where one palette for all has 38 dB."""
+    """Write a palette per frame: 46 dB on white, against 38 dB with one palette for all."""
     first, *others = [_binarize_alpha(picture) for picture in pictures]
     ends = np.round(
         100.0 * np.arange(2 + len(others)) / min(fps, MAX_GIF_FPS)

@@ -1,11 +1,4 @@
-"""How fast a motion goes by its own times.
-
-A little motion that no video has shown: the avatar turns round, waves and lifts its knees.
-
-Poses that an avatar is driven with, whoever wrote them.
-
-Which pose each picture of a clip shows, so that a motion keeps its own pace.
-"""
+"""Motions that drive an avatar: read from a file or built in, and resampled to a frame rate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,23 +16,24 @@ from preprocess.poses.root_placement import anchor_at_pelvis
 
 
 def pose_rate(motion: Motion) -> float:
-    """By the times of its poses; 30 if it has none that can be."""
+    """Return the poses per second of a motion, by its times; 30 without plausible times."""
     if motion.times_s is None or len(motion) < 2:
         return 30.0
     step = float(np.median(np.diff(motion.times_s)))
     return round(1.0 / step, 3) if 1.0 / 240.0 <= step <= 10.0 else 30.0
 
 
+# limbs that the built-in motion moves, and their SMPL joints
 L_HIP, R_HIP, L_KNEE, R_KNEE, L_SHOULDER, R_SHOULDER, L_ELBOW, R_ELBOW = range(8)
 _JOINTS = np.array([1, 2, 4, 5, 16, 17, 18, 19]) - 1
 
 
 def demo_motion(frames: int = 48, *, fps: float = 16.0) -> Motion:
-    """One turn at the world's origin; the last pose leads back to the first.
+    """Turn once at the world's origin, wave and lift the knees; the motion is a loop.
 
     Args:
-        frames: How many poses.
-        fps: Poses a second.
+        frames: Number of poses.
+        fps: Poses per second.
     """
     phase = np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
     steps = np.sin(2.0 * phase)
@@ -83,16 +77,16 @@ def load_driving_motion(
     *,
     person: str | None = None,
 ) -> Motion:
-    """The poses of a file, about the avatar's own pelvis.
+    """Read poses from a file and anchor them at the avatar's pelvis.
 
     Args:
-        path: Whatever `preprocess.poses` reads.
-        rest_joints: The avatar's, metres.
-        console: Hears what the user should know about the poses.
-        person: Whose poses; None: of whom there are most.
+        path: A pose file of any format that `preprocess.poses` reads.
+        rest_joints: Rest joints of the avatar, meters.
+        console: Shows notes and warnings about the poses.
+        person: Person ID in the file; None for the longest track.
 
     Raises:
-        InputError: If there are none, or the numbers cannot be poses in radians and metres.
+        InputError: If no pose is valid, or the numbers cannot be radians and meters.
     """
     read = require_plausible(read_poses(path, person=person, prefer_world=True), path)
     motion = anchor_at_pelvis(read, rest_joints)
@@ -104,41 +98,39 @@ def load_driving_motion(
     if lost == len(motion):
         raise InputError(f"None of the {len(motion)} poses in {path} is valid.")
     if lost:
-        console.warning(f"{lost} of {len(motion)} poses are not valid; left out.")
+        console.warning(f"{lost} of {len(motion)} poses are invalid and were skipped.")
     return motion
 
 
 MAX_FPS = 60.0
-"""Pictures a second if nobody says: motion capture of 120 poses a second shows every second one."""
+"""Largest default frame rate: of motion capture at 120 Hz every second pose is shown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResampledMotion:
-    """Pictures at an even pace, and where in the motion each of them lies.
+    """A motion sampled at a constant frame rate.
 
     Attributes:
-        motion: What is shown.
-        rows: The poses of it that are valid, in order.
-        fps: Pictures a second.
-        places: For each picture, how far it is along `rows`; between two where it is no integer.
+        motion: The motion.
+        valid_rows: Rows of its valid poses, in order.
+        fps: Frames per second.
+        positions: Position of each frame in `valid_rows`; fractional between two rows.
     """
 
     motion: Motion
     valid_rows: Int[np.ndarray, "valid"]
     fps: float
-    positions: Float[np.ndarray, "pictures"]
+    positions: Float[np.ndarray, "frames"]
 
     @classmethod
     def of(cls, motion: Motion, *, fps: float | None, speed: float = 1.0) -> "ResampledMotion":
-        """The pictures of a motion.
-
-        A motion without times is as fast as its pictures: one for each pose.
+        """Resample a motion; without times, it has one pose per frame.
 
         Args:
-            motion: With at least one valid pose.
-            fps: Pictures a second; the motion's own pace if None, if need be every second or third
-                pose of it.
-            speed: How many times faster than it was.
+            motion: Has at least one valid pose.
+            fps: Frames per second; None for the motion's own rate, divided by an integer to stay
+                within `MAX_FPS`.
+            speed: Factor on the speed of the motion.
         """
         rows, rate = np.flatnonzero(motion.valid), pose_rate(motion)
         pace = fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6))
@@ -148,11 +140,11 @@ class ResampledMotion:
         return cls(motion=motion, valid_rows=rows, fps=pace, positions=step * np.arange(count))
 
     def __len__(self) -> int:
-        """How many pictures there are."""
+        """Return the number of frames."""
         return len(self.positions)
 
     def pose(self, frame: int) -> BodyPose:
-        """The pose of a picture: slerp between neighbours, straight lines for the root's place."""
+        """Return the pose of a frame: slerp of rotations, linear root translation."""
         before, share = self._split_position(frame)
         first = self.motion[int(self.valid_rows[before])]
         if share < 1e-6:
@@ -167,7 +159,7 @@ class ResampledMotion:
         )
 
     def nearest_row(self, frame: int) -> int:
-        """The row of the motion that is nearest to a picture."""
+        """Return the row of the motion nearest to a frame."""
         before, share = self._split_position(frame)
         return int(self.valid_rows[before + (share >= 0.5)])
 

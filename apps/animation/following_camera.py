@@ -1,4 +1,4 @@
-"""The camera that nobody had to give: it follows the person and shows all of it."""
+"""Default camera: follows the person and shows the whole body."""
 
 from dataclasses import dataclass, replace
 
@@ -17,27 +17,28 @@ from preprocess.body.kinematics import (
 )
 
 PERSON_HEIGHT_SHARE = 0.8
-"""Of the picture's height, how much the standing person takes."""
+"""Height of the standing person as a fraction of the image height."""
 MAX_HEIGHT_OVER_WIDTH = 1.5
-"""Height over width of a picture beyond which the person is smaller, so that arms fit in."""
+"""Aspect ratio beyond which the person is shown smaller, so that arms fit in."""
 DISTANCE_HEIGHTS = 3.5
-"""How far the camera stands, in heights of the person."""
+"""Distance of the camera, in heights of the person."""
 MEASURING_PX = 192
+"""Size of the image in which the person is measured."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FollowingCamera:
-    """A picture in front of the first pose, upright as that pose is.
+    """A camera in front of the first pose of a motion, upright as that pose is.
 
-    Trackers do not know where up is; a body's first pose mostly does.
+    Trackers do not know the vertical; the first pose of a body mostly shows it.
 
     Attributes:
         size_px: Width and height.
-        axes: Rows: the right, down and forward of a level picture from the front, in the world.
-        player: Whose person it is.
-        height_m: Of the person standing.
-        middle_m: How far the person's middle is above the pelvis.
-        viewpoint: Where it stands.
+        level_axes: Rows: right, down and forward of a level image from the front, in the world.
+        player: Player of the avatar.
+        height_m: Height of the standing person.
+        center_above_pelvis_m: Height of the person's center above the pelvis.
+        viewpoint: Where the camera stands.
     """
 
     size_px: tuple[int, int]
@@ -55,13 +56,13 @@ class FollowingCamera:
         size_px: int | tuple[int, int],
         viewpoint: Viewpoint | None = None,
     ) -> "FollowingCamera":
-        """A camera for a motion; the person is measured in a small picture of a standing pose.
+        """Build the camera for a motion; measure the person in a small image of a standing pose.
 
         Args:
-            player: Draws that picture.
-            motion: Its first valid pose says where the front is, and where up.
+            player: Renders that image.
+            motion: Its first valid pose defines front and up.
             size_px: Width and height; one number for a square.
-            viewpoint: Before the person if None.
+            viewpoint: Where the camera stands; None for the front.
         """
         first = int(np.flatnonzero(motion.valid)[0])
         guess = cls(
@@ -76,7 +77,7 @@ class FollowingCamera:
         rows = np.flatnonzero(
             (player.render(standing, guess.camera_for(standing))[..., 3] > 127).any(1)
         )
-        if not len(rows):  # nothing to be seen: leave it at the guess
+        if not len(rows):  # nothing visible: keep the guess
             rows = np.array([0, MEASURING_PX - 1])
         metres = 2.2 / PERSON_HEIGHT_SHARE / MEASURING_PX
         return replace(
@@ -90,7 +91,7 @@ class FollowingCamera:
         )
 
     def camera_for(self, pose: BodyPose, seconds: float = 0.0) -> Camera:
-        """The camera for one pose, so many seconds after the first picture."""
+        """Return the camera for a pose, `seconds` after the first frame."""
         view, (width, height) = self.viewpoint, self.size_px
         away = DISTANCE_HEIGHTS * self.height_m
         focal = (
@@ -113,7 +114,7 @@ class FollowingCamera:
         )
 
     def _look_at_point(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
-        """What is in the middle of the picture, in the world."""
+        """Return the world point in the center of the image."""
         manifest, joint = self.player.manifest, self.viewpoint.joint
         pelvis = manifest.rest_joints[0]
         if joint is None:
@@ -125,7 +126,7 @@ class FollowingCamera:
 
 
 def canonical_pose_of(player: Player) -> BodyPose:
-    """The avatar in its canonical pose: upright, arms a little away."""
+    """Return the canonical pose of an avatar: upright, arms slightly away from the body."""
     return BodyPose(
         root_rotation=np.zeros(3),
         root_translation=np.zeros(3),

@@ -1,4 +1,4 @@
-"""An avatar's package as a mesh file: .glb with skeleton and motion, or a still .ply or .obj."""
+"""Mesh files from a package: .glb with skeleton and motion, or a static .ply or .obj."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,19 +26,19 @@ def write_mesh(
     person: str | None = None,
     replace: bool | None = None,
 ) -> None:
-    """Writes the mesh by the suffix of its name, whole or not at all.
+    """Write a mesh in the format of its suffix, whole or not at all.
 
     Args:
-        package: The avatar.
-        out: A .glb, a .ply or an .obj, in letters of either case.
-        console: Where it says how far it is.
-        poses: What the .glb does; without it, a turn.
-        name: Of the avatar.
-        person: Whose poses, where the file holds several people's.
-        replace: Whether a file that is there already may go, as of `atomic_file`.
+        package: The .iavatar file.
+        out: A .glb, .ply or .obj, in upper or lower case.
+        console: Shows progress.
+        poses: Motion of the .glb; None for a turn.
+        name: Name of the avatar in the .glb.
+        person: Person ID in the pose file; None for the longest track.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
 
     Raises:
-        InputError: If the package is not sound, or no pose is valid.
+        InputError: If the package is damaged, or no pose is valid.
         OSError: If the disk is full.
     """
     held = read_package(package)
@@ -51,7 +51,7 @@ def write_mesh(
         if suffix == ".glb"
         else _static_mesh_encoder(suffix)
     )
-    with console.status("taking the surface"):
+    with console.status("extracting the surface"):
         mesh = extract_mesh(held.tables["hq"])
         content = write(mesh)
     with atomic_file(out, replace=replace) as part:

@@ -84,8 +84,8 @@ def package_warnings(manifest: Manifest) -> list[str]:
     mark = manifest.metrics.get("held_out")
     if isinstance(mark, dict) and mark.get("verdict") == "failed":
         notes.append(
-            "This is no usable avatar of its person: when it was learnt, frames held out for "
-            f"scoring were drawn at {mark.get('psnr') or float('nan'):.1f} dB (failed)."
+            "This avatar failed validation: held-out PSNR was "
+            f"{mark.get('psnr') or float('nan'):.1f} dB (failed) when it was trained."
         )
     return notes
 

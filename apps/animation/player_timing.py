@@ -1,4 +1,4 @@
-"""How fast the player draws, beside a fixed little graph that says how fast the machine is."""
+"""Benchmark of the player, with a fixed reference graph that measures the machine."""
 
 import json
 import time
@@ -14,28 +14,30 @@ from export.player import Player
 from preprocess.body.body_pose import BodyPose
 
 REFERENCE_GRAPH = Path(__file__).with_name("reference.onnx")
-"""Made by tests/apps/animation/test_player_timing.py, which compares it with what `onnx` makes."""
+"""Written by tests/apps/animation/test_player_timing.py, which compares it with onnx's."""
 WARM_UP_IMAGES = 3
+"""Images rendered before timing, per worker."""
 MIN_IMAGES = 10
-"""Pictures that are timed at least; short motions are repeated."""
+"""Least number of timed images; short motions are repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlayerTiming:
-    """Cost of a picture: kinematics, graph and 8-bit output, without decoding or encoding.
+    """Cost of an image: kinematics, graph and 8-bit output, without encoding.
 
     Attributes:
-        tier: Of the package.
+        tier: Quality tier of the package.
         size: Longer side, pixels.
-        frames: How many were timed.
-        pixels_covered: Share of the picture with any alpha, mean.
-        cpu_ms_per_frame, wall_ms_per_frame: Mean.
-        load_ms: Opening the package, wall.
-        reference_ms: CPU time of one run of the reference graph, median.
+        frames: Number of timed images.
+        pixels_covered: Mean fraction of pixels with any alpha.
+        cpu_ms_per_frame: Mean CPU time per image.
+        wall_ms_per_frame: Mean wall time per image.
+        load_ms: Wall time of opening the package.
+        reference_ms: Median CPU time of the reference graph.
         provider: onnxruntime's execution provider.
-        workers: How many pictures were drawn at the same time.
-        pictures_per_second: Wall.
-        format: Of this record.
+        workers: Images rendered in parallel.
+        pictures_per_second: Images per second of wall time.
+        format: Version of this record.
     """
 
     tier: str
@@ -52,7 +54,7 @@ class PlayerTiming:
     format: int = 1
 
     def to_json(self) -> str:
-        """The figures, rounded."""
+        """Return the rounded values as JSON."""
         content = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
         return json.dumps({"format": content.pop("format"), **content}, indent=1) + "\n"
 
@@ -66,7 +68,7 @@ def benchmark_player(
     workers: int = 1,
     samples: int | None = None,
 ) -> PlayerTiming:
-    """Draws every shot, after a few to warm up."""
+    """Render a sequence after a warm-up and time it."""
     sequence = list(sequence) * -(-MIN_IMAGES // len(sequence))
     list(player.render_all(sequence[: WARM_UP_IMAGES * workers], workers=workers, samples=samples))
     covered = 0.0
@@ -92,7 +94,7 @@ def benchmark_player(
 def _reference_graph() -> onnxruntime.InferenceSession:
     """Load the reference graph: GatherElements, MatMul and ScatterElements of fixed sizes.
 
-    Its numbers are meaningless. It lies here as a file, so that a player needs no `onnx` package.
+    It is a file, so that the player does not need the `onnx` package.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -113,4 +115,4 @@ def _reference_ms(session: onnxruntime.InferenceSession, runs: int = 9) -> float
         started = time.process_time()
         session.run(None, inputs)
         times.append(time.process_time() - started)
-    return 1000.0 * float(np.median(times[1:]))  # the first one warms up
+    return 1000.0 * float(np.median(times[1:]))  # the first run warms up

@@ -1,4 +1,4 @@
-"""What ia-play draws: poses, each with the camera that sees it."""
+"""Sequence of poses and cameras that ia-play renders."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,16 +16,17 @@ from export.player import Player
 from preprocess.body.body_pose import BodyPose, Motion
 
 TURNTABLE_FPS = 30.0
-"""Pictures a second of a turntable about a still pose."""
+"""Frames per second of a turntable around a still pose."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderSequence:
-    """Pictures that are still to be drawn.
+    """Images to render.
 
     Attributes:
-        poses, cameras: One each for every picture.
-        fps: Pictures a second.
+        poses: Pose of each image.
+        cameras: Camera of each image.
+        fps: Frames per second.
     """
 
     poses: tuple[BodyPose, ...]
@@ -33,27 +34,27 @@ class RenderSequence:
     fps: float
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of images."""
         return len(self.poses)
 
     def __iter__(self) -> Iterator[tuple[BodyPose, Camera]]:
-        """Pose and camera, in order."""
+        """Iterate over pairs of pose and camera."""
         return zip(self.poses, self.cameras, strict=True)
 
 
 def plan_render(
     arguments: PlayArguments, player: Player, console: Console, *, max_fps: float = np.inf
 ) -> RenderSequence:
-    """The pictures that the arguments ask for.
+    """Plan the images that the arguments request.
 
     Args:
-        given: The arguments.
-        player: Of the avatar.
-        console: Hears what the user should know about the poses.
-        max_fps: Pictures a second that can be written.
+        arguments: Of ia-play.
+        player: Player of the avatar.
+        console: Shows notes and warnings about the poses.
+        max_fps: Largest frame rate of the output format.
 
     Raises:
-        InputError: If a file cannot be used, or the arguments do not fit it.
+        InputError: If a file cannot be used, or the arguments do not match it.
     """
     if arguments.poses is None and arguments.turntable is not None:
         motion = _single_pose_motion(canonical_pose_of(player))
@@ -68,8 +69,9 @@ def plan_render(
         row = arguments.still or 0
         if not (0 <= row < len(motion) and motion.valid[row]):
             raise InputError(
-                f"--still {row}: {arguments.poses} holds {len(motion)} poses, 0 to {len(motion) - 1}, "
-                f"{int(motion.valid.sum())} of them valid; this is none of them."
+                f"--still is {row}, but must be a valid pose: {arguments.poses} holds "
+                f"{len(motion)} poses, 0 to {len(motion) - 1}, {int(motion.valid.sum())} of them "
+                "valid."
             )
         return _plan_single_pose(arguments, player, motion, row, max_fps)
     fps = arguments.fps and min(arguments.fps, max_fps)
@@ -78,12 +80,12 @@ def plan_render(
         line = ResampledMotion.of(motion, fps=max_fps, speed=arguments.speed)
     poses = tuple(line.pose(picture) for picture in range(len(line)))
     rows = tuple(line.nearest_row(picture) for picture in range(len(line)))
-    return RenderSequence(poses=poses, cameras=_plan_cameras(arguments, player, motion, rows, poses, line.fps),
-                 fps=line.fps)  # fmt: skip
+    cameras = _plan_cameras(arguments, player, motion, rows, poses, line.fps)
+    return RenderSequence(poses=poses, cameras=cameras, fps=line.fps)
 
 
 def _single_pose_motion(pose: BodyPose) -> Motion:
-    """A motion of one pose."""
+    """Return a motion of one pose."""
     return Motion(
         root_rotations=pose.root_rotation[None],
         root_translations=pose.root_translation[None],
@@ -97,14 +99,14 @@ def _single_pose_motion(pose: BodyPose) -> Motion:
 def _plan_single_pose(
     arguments: PlayArguments, player: Player, motion: Motion, row: int, max_fps: float
 ) -> RenderSequence:
-    """One pose: a picture, or all round it."""
+    """Plan one image of a pose, or a turntable around it."""
     fps = min(arguments.fps or TURNTABLE_FPS, max_fps)
     count = 1
     if arguments.turntable is not None and arguments.output_path.suffix.lower() != ".png":
         count = max(1, round(abs(arguments.turntable) * fps))
     poses = (motion[row],) * count
     valid = np.arange(len(motion)) == row
-    held = replace(motion, valid=valid)  # so that the camera stands before this pose
+    held = replace(motion, valid=valid)  # the camera faces this pose
     return RenderSequence(
         poses=poses,
         cameras=_plan_cameras(arguments, player, held, (row,) * count, poses, fps),
@@ -131,16 +133,16 @@ def _plan_cameras(
 def load_cameras(
     path: Path, poses: int, rows: tuple[int, ...], size: int | tuple[int, int] | None
 ) -> tuple[Camera, ...]:
-    """Cameras of a file, one for each of some rows, as pinholes of a size.
+    """Read the cameras of some poses as pinhole cameras of a size.
 
     Args:
-        path: As ia-ingest takes it.
-        poses: How many poses there are.
-        rows: Those that are shown.
-        size: Longer side, or width and height, pixels; the file's own if None.
+        path: Camera file, as in ia-ingest.
+        poses: Number of poses of the motion.
+        rows: Poses that are shown.
+        size: Longer side, or width and height, pixels; None for the file's own.
 
     Raises:
-        InputError: If it cannot be read, or does not match poses or size.
+        InputError: If the file cannot be read, or does not match poses or size.
     """
     from preprocess.cameras.camera_file import read_cameras, resolve_camera_path
 
@@ -148,14 +150,14 @@ def load_cameras(
     track = read_cameras(path, _camera_image_size(path))
     if track.is_moving and len(track.cameras) != poses:
         raise InputError(
-            f"{path} holds {len(track.cameras)} cameras for {poses} poses; expected one, or one "
-            "for each pose."
+            f"{path} holds {len(track.cameras)} cameras for {poses} poses, but must hold one, or "
+            "one per pose."
         )
     return tuple(_resize_camera(track[row], size) for row in rows)
 
 
 def _camera_image_size(path: Path) -> tuple[int, int]:
-    """Width and height that a camera file belongs to; twice its principal point if it is silent."""
+    """Return the image size of a camera file; twice its principal point if it names none."""
     from preprocess.cameras.camera_registry import read_named_cameras
     from preprocess.cameras.multi_view_cameras import (
         find_multi_view_cameras,
@@ -177,19 +179,21 @@ def _camera_image_size(path: Path) -> tuple[int, int]:
     else:
         raise InputError(f"{path} holds no camera: expected intrinsic (3, 3), height and width.")
     if not (1.0 <= width <= 16384.0 and 1.0 <= height <= 16384.0):
-        raise InputError(f"{path} belongs to pictures of {width:.0f}x{height:.0f} px; up to 16384.")
+        raise InputError(
+            f"{path} is for images of {width:.0f}x{height:.0f} px, but at most 16384 is supported."
+        )
     return round(width), round(height)
 
 
 def _resize_camera(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """The camera as a pinhole of the size."""
+    """Return the camera as a pinhole camera of a size."""
     pinhole = replace(camera, distortion=())
     if not isinstance(size, tuple):
         return pinhole.resize_longer_side(size or max(camera.size_px))
     (width, height), (wide, high) = size, camera.size_px
     if abs(width * high - height * wide) > max(wide, high):
         raise InputError(
-            f"--size is {width}x{height}, but --camera takes pictures of {wide}x{high}: another "
-            "shape. Give the longer side alone."
+            f"--size is {width}x{height}, but --camera has images of {wide}x{high}, another aspect "
+            "ratio. Give the longer side alone."
         )
     return pinhole.resize(size)

@@ -1,4 +1,4 @@
-"""From where an avatar is looked at: round it, from above, near by, and turning."""
+"""Viewpoint of the camera relative to the person: orbit, elevation, distance, zoom, turntable."""
 
 from dataclasses import dataclass
 
@@ -9,24 +9,26 @@ from capture.input_error import InputError
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 
 CLOSE_UP_ZOOM = 3.5
-"""How much larger than the whole person a joint and what is about it are shown."""
+"""Default --zoom with --close-up."""
 MIN_DISTANCE_M, MAX_DISTANCE_M = 0.3, 100.0
+"""Limits of --distance, meters."""
 MAX_ZOOM = 50.0
+"""Limit of --zoom, and of its inverse."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """Where the camera stands, seen from the person, who faces it at 0°.
+    """Position of the camera relative to the person, who faces it at 0°.
 
     Attributes:
-        orbit_deg: Round the person; at 90° it stands at the person's left hand.
-        elevation_deg: Above the person's middle; 90° is straight down.
-        zoom: How many times larger the person is than when all of it is shown.
-        distance_m: How far it stands from what it looks at; None: 3.5 heights of the person.
-            The lens stays, so that a nearer camera shows the person larger.
-        joint: What it looks at (see `JOINT_NAMES`); None: the person's middle.
-        turn_period_s: How long the camera takes for one turn about the person; negative: the other way;
-            None: it does not turn.
+        orbit_deg: Azimuth around the person; 90° is at the person's left hand.
+        elevation_deg: Elevation above the person's center; 90° looks straight down.
+        zoom: Magnification relative to a view of the whole person.
+        distance_m: Distance to the target; None for 3.5 heights of the person. The focal length is
+            kept, so that a closer camera shows the person larger.
+        joint: Target of the camera (see `JOINT_NAMES`); None for the person's center.
+        turn_period_s: Seconds per turn around the person; negative for the other direction, None
+            for no turntable.
     """
 
     orbit_deg: float = 0.0
@@ -37,41 +39,40 @@ class Viewpoint:
     turn_period_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Checks it.
+        """Check ranges.
 
         Raises:
-            InputError: If one of them cannot be.
+            InputError: If a value is out of its range.
         """
         if not np.isfinite(self.orbit_deg):
-            raise InputError(f"--orbit is {self.orbit_deg}; an angle in degrees was expected.")
+            raise InputError(f"--orbit is {self.orbit_deg}, but must be an angle in degrees.")
         if not -90.0 <= self.elevation_deg <= 90.0:
             raise InputError(
-                f"--elevation is {self.elevation_deg:g}; -90 (from below) to 90 degrees (from "
-                "above) were expected."
+                f"--elevation is {self.elevation_deg:g}, but must lie between -90 (from below) and "
+                "90 degrees (from above)."
             )
         if not 1.0 / MAX_ZOOM <= self.zoom <= MAX_ZOOM:
-            raise InputError(f"--zoom is {self.zoom:g}; up to {MAX_ZOOM:g} times were expected.")
+            raise InputError(f"--zoom is {self.zoom:g}, but must be at most {MAX_ZOOM:g}.")
         if self.distance_m is not None and not MIN_DISTANCE_M <= self.distance_m <= MAX_DISTANCE_M:
             raise InputError(
-                f"--distance is {self.distance_m:g}; {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g} metres were "
-                "expected. --zoom comes closer than that."
+                f"--distance is {self.distance_m:g}, but must lie between {MIN_DISTANCE_M} and "
+                f"{MAX_DISTANCE_M:g} m. For a closer view use --zoom."
             )
         if self.joint is not None and self.joint not in JOINT_NAMES:
             raise InputError(
-                f"--close-up {self.joint}: there is no such joint; there are "
-                f"{', '.join(JOINT_NAMES)}."
+                f"--close-up is {self.joint}, but must be one of {', '.join(JOINT_NAMES)}."
             )
         if self.turn_period_s is not None and not 0.1 <= abs(self.turn_period_s) <= 3600.0:
             raise InputError(
-                f"--turntable is {self.turn_period_s:g}; a turn takes 0.1 to 3600 seconds (negative: the "
-                "other way)."
+                f"--turntable is {self.turn_period_s:g}, but must lie between 0.1 and 3600 seconds "
+                "(negative reverses)."
             )
 
     def rotation_at(self, seconds: float) -> Float[np.ndarray, "3 3"]:
-        """Camera from a camera that stands in front, level; its axes are right, down, forward.
+        """Return the rotation from a level camera in front of the person to this viewpoint.
 
         Args:
-            seconds: Since the first picture.
+            seconds: Time since the first frame.
         """
         turns = 0.0 if self.turn_period_s is None else seconds / self.turn_period_s
         round_it = np.array([0.0, np.deg2rad(self.orbit_deg) + 2.0 * np.pi * turns, 0.0])

@@ -1,4 +1,4 @@
-"""ia-play --web: the avatar's page on this machine's own address, or as a folder for any host."""
+"""ia-play --web: the player page, served on the loopback address or written as a folder."""
 
 import errno
 import threading
@@ -19,8 +19,9 @@ from export.web.player_page import PageMotion, StartView, flatten_pose
 from preprocess.body.body_pose import Motion
 
 HOST = "127.0.0.1"
+"""Loopback address: only browsers of this machine reach the page."""
 PORTS_TRIED = 20
-"""So many ports are tried, one after the other."""
+"""Consecutive ports to try."""
 MIME_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -29,10 +30,11 @@ MIME_TYPES = {
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
 }
+"""MIME type by suffix."""
 
 
 def web_clip(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -> PageMotion:
-    """The valid poses of a motion, and a camera before the first of them."""
+    """Return poses of a motion and a start view in front of the first valid one."""
     camera = FollowingCamera.of(player, motion, 540)
     return PageMotion(
         poses=np.stack([flatten_pose(motion[row]) for row in rows]),
@@ -44,7 +46,7 @@ def web_clip(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) 
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:
-    """The page as a folder, whole or not at all.
+    """Write the page as a folder, whole or not at all.
 
     Raises:
         OSError: If the disk is full; then nothing is written.
@@ -57,12 +59,12 @@ def write_site(files: Mapping[str, bytes], path: Path) -> None:
 
 
 def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
-    """Serves the page to this machine's own browsers until Ctrl-C.
+    """Serve the page on the loopback address until Ctrl-C.
 
     Args:
-        files: By relative path.
-        port: Tried first.
-        console: Where the address is said; stdout hears it, too.
+        files: Content by relative path.
+        port: First port to try.
+        console: Shows a hint; the address goes to stdout.
 
     Raises:
         InputError: If no port is free.
@@ -71,7 +73,7 @@ def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
     address = f"http://{HOST}:{server.server_port}"
     with interrupt_event() as ended:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        console.info("The avatar plays in a browser on this machine; Ctrl-C ends it:")
+        console.info("Open this address in a browser of this machine; Ctrl-C stops the server:")
         print(address, flush=True)  # noqa: T201 - the address goes to stdout, for scripts
         ended.wait()
     server.shutdown()
@@ -79,10 +81,10 @@ def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
 
 
 def make_server(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
-    """A server of these files on this machine's own address, not running yet.
+    """Return a server of the files on the loopback address, not running yet.
 
     Raises:
-        InputError: If neither this port nor one of the next ones is free.
+        InputError: If none of the ports is free.
     """
     for tried in range(port, min(port + PORTS_TRIED, 1 << 16)):
         try:
@@ -91,26 +93,26 @@ def make_server(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
             if error.errno != errno.EADDRINUSE:
                 raise
     raise InputError(
-        f"Ports {port} to {port + PORTS_TRIED - 1} are all taken. Give --web another one."
+        f"Ports {port} to {port + PORTS_TRIED - 1} are all in use. Pass another one to --web."
     )
 
 
 class _QuietHttpServer(ThreadingHTTPServer):
     def handle_error(self, *_: object) -> None:
-        """A browser that goes away in the middle is no error."""
+        """Ignore browsers that disconnect."""
 
 
 def _handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        """Answers with the page's files and nothing else."""
+        """Serves the page's files and nothing else."""
 
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
-            """One file."""
+            """Answer with one file."""
             host = self.headers.get("Host", "").rsplit(":", 1)[0]
             name = self.path.split("?", 1)[0].removeprefix("/") or "index.html"
-            if host not in (HOST, "localhost"):  # another site's name that was bent to here
+            if host not in (HOST, "localhost"):  # DNS rebinding
                 self._answer(HTTPStatus.FORBIDDEN, b"not here\n", ".txt")
             elif name not in files:
                 self._answer(HTTPStatus.NOT_FOUND, b"there is no such file\n", ".txt")
@@ -127,6 +129,6 @@ def _handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
             self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
-            """Says nothing: the console is for people."""
+            """Log nothing: the console is for the user."""
 
     return Handler

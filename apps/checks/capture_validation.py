@@ -1,4 +1,4 @@
-"""A capture examined: what is odd in its numbers, how body and masks agree, what would mend it."""
+"""Validation of a capture: sanity of its numbers, IoU of body and masks, corrections."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -39,33 +39,34 @@ from preprocess.open_capture import open_capture
 from preprocess.poses.plausibility import implausibility_reason
 
 QUICK_FRAMES = 8
-"""Frames that are looked at before a run begins."""
+"""Frames checked before a run starts."""
 QUICK_FILM_FRAMES = 96
-"""Frames of the film's beginning among which its pictures are then looked at."""
+"""Frames at the start of the video from which its checked images are taken."""
 GOOD_EDGE_RATIO = 2.0
-"""Least ratio of the edges across the body's outline to those beside it, if poses fit."""
+"""Least ratio of edge strength across and beside the body's outline where poses match."""
 NO_KNOWN_MISTAKE = (
-    "None of the usual mistakes explains it. Are the poses or the masks of another video or "
-    "person, or did the tracker lose the person? Make them again from this video."
+    "No known mistake explains this. Poses or masks may belong to another video or person, or "
+    "tracking may have failed. Recompute them from this video."
 )
+"""Diagnosis if no correction helps."""
 QUICK_OFFSETS = (1, 2)
-"""Offsets of the poses, in frames, that are tried even where all seems well."""
+"""Delays of the poses, in frames, that are tested even if poses and masks match."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaptureValidation:
-    """What the doctor found.
+    """Outcome of validating a capture.
 
     Attributes:
         recording: The capture.
-        claim: Its poses and cameras as they are.
-        evidence: Masks of some frames; None where there are no masks to hold a body against.
-        diagnosis: What was tried; None without masks.
-        refused: Why a run would not even begin, if it would not.
-        odd: Sentences about what is strange in the numbers.
-        agreed: Mean agreement as a run would read the files; None without masks.
-        edges: Without masks: how many times as strong the pictures' edges are across the body's
-            outline as beside it; None with masks, or if no picture can be looked at.
+        hypothesis: Its poses and cameras as stored.
+        sampled_masks: Masks of some frames; None without masks.
+        diagnosis: Corrections tested and found; None without masks.
+        refusal: Why ia-ingest would refuse the capture; None if it would not.
+        anomalies: Sentences about implausible numbers.
+        mask_iou: Mean IoU of body and masks as ia-ingest would read them; None without masks.
+        edge_ratio: Ratio of edge strength across and beside the body's outline; None with masks, or
+            if no image can be decoded.
     """
 
     recording: Capture
@@ -79,13 +80,13 @@ class CaptureValidation:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Names of the mistakes found, the one that matters most first."""
+        """Names of the mistakes found, most important first."""
         cures = self.diagnosis.corrections if self.diagnosis else ()
         return tuple(dict.fromkeys(cure.cause for cure in cures))
 
     @property
     def verdict(self) -> str:
-        """`good`, `warning`, or `unusable`."""
+        """Verdict: `good`, `warn` or `unusable`."""
         if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
             return "unusable"
         well = self.mask_iou is not None and self.mask_iou >= GOOD_IOU
@@ -95,48 +96,47 @@ class CaptureValidation:
 
     @property
     def is_auto_corrected(self) -> bool:
-        """Whether all that is wrong is what ia-ingest corrects without being asked."""
+        """Whether ia-ingest corrects everything that is wrong automatically."""
         masks = self.recording.masks
         return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
     @property
     def has_film_errors(self) -> bool:
-        """Whether a mistake was found that concerns the pictures alone."""
+        """Whether a mistake was found in the images alone."""
         return any(cause.startswith("video_") for cause in self.causes)
 
     @property
     def expected_improvement(self) -> str:
-        """What correcting the named mistakes would bring, for people; empty without masks."""
+        """Sentence on the scores after correction; empty without causes."""
         if self.diagnosis is None or not self.causes:
             return ""
-        told = []
+        scores = []
         if not all(cause.startswith("video_") for cause in self.causes):
-            told.append(f"body and masks would agree by {self.corrected_iou:.2f}")
+            scores.append(f"IoU after correction: {self.corrected_iou:.2f}")
         if self.has_film_errors and self.diagnosis.video is not None:
             film = self.diagnosis.video
             before = f" instead of {film.score_before:.2f}" if film.score_before > 0.0 else ""
-            told.append(
-                f"the masks' outlines would score {film.score_after:.2f}{before} on the pictures' edges "
-                "(0.5 is chance)"
+            scores.append(
+                f"Mask outlines on image edges: {film.score_after:.2f}{before} (0.5 is chance)"
             )
-        return f"Once corrected, {', and '.join(told)}."
+        return f"{'. '.join(scores)}."
 
     @property
     def stored_iou(self) -> float:
-        """Agreement of the files as they are stored; NaN without masks."""
+        """IoU of body and masks as stored; NaN without masks."""
         return self.diagnosis.iou_before if self.diagnosis else float("nan")
 
     @property
     def corrected_iou(self) -> float:
-        """Agreement with all cures; NaN without masks."""
+        """IoU of body and masks after all corrections; NaN without masks."""
         return self.diagnosis.iou_after if self.diagnosis else float("nan")
 
 
 def check_capture(inputs: CaptureInputs) -> CaptureValidation:
-    """Opens a capture and looks at it; nothing is trained and hardly a frame is decoded.
+    """Open a capture and validate it; few frames are decoded.
 
     Raises:
-        InputError: If a part is missing or unreadable, so that there is nothing to examine.
+        InputError: If a part is missing or unreadable.
     """
     try:
         return check_opened_capture(*_open_inputs(inputs))
@@ -148,7 +148,7 @@ def check_capture(inputs: CaptureInputs) -> CaptureValidation:
 
 
 def _check_transposed(inputs: CaptureInputs, refusal: str) -> CaptureValidation | None:
-    """What is found if the film was rotated by a quarter turn; None if that explains nothing."""
+    """Validate the capture with its video rotated; None if that explains nothing."""
     try:
         recording = open_capture(replace(inputs, transposed=True), skip_checks=True)
         found = check_opened_capture(recording, refusal)
@@ -160,16 +160,16 @@ def _check_transposed(inputs: CaptureInputs, refusal: str) -> CaptureValidation 
 def check_opened_capture(
     recording: Capture, polarity_error: str | None = None
 ) -> CaptureValidation:
-    """The same for a capture that is open already.
+    """Validate an opened capture.
 
     Args:
         recording: The capture.
-        undecided: Why nobody knows which side of the masks is the person, if so.
+        polarity_error: Why the masks' polarity is unknown; None if it is known.
 
     Raises:
-        InputError: If a part is unreadable, so that there is nothing to examine.
+        InputError: If a part is unreadable.
     """
-    claim, refused = (
+    hypothesis, refused = (
         _stored_hypothesis(recording),
         implausibility_reason(recording.motion) or polarity_error,
     )
@@ -184,31 +184,31 @@ def check_opened_capture(
     frames = [selection.start + selection.step * number for number in range(count)]
     diagnosis = agreed = None
     if evidence is not None:
-        diagnosis = find_corrections(claim, evidence, count, _sample_film(recording, evidence))
-        agreed = mean_score(evidence.frame_scores(replace(claim, masks_inverted=False)))
-    odd = sanity_warnings(claim, frames, evidence, recording.source.size_px[1])
+        diagnosis = find_corrections(hypothesis, evidence, count, _sample_film(recording, evidence))
+        agreed = mean_score(evidence.frame_scores(replace(hypothesis, masks_inverted=False)))
+    odd = sanity_warnings(hypothesis, frames, evidence, recording.source.size_px[1])
     return CaptureValidation(
-        recording=recording, hypothesis=claim, sampled_masks=evidence, diagnosis=diagnosis,
+        recording=recording, hypothesis=hypothesis, sampled_masks=evidence, diagnosis=diagnosis,
         refusal=refused, anomalies=tuple(odd), mask_iou=agreed,
-        edge_ratio=None if masked or refused else _edge_ratio(recording, claim),
+        edge_ratio=None if masked or refused else _edge_ratio(recording, hypothesis),
     )  # fmt: skip
 
 
 def passes_quick_check(recording: Capture) -> bool:
-    """A glance at a few masks, in a few hundredths of a second: whether there is nothing to say.
+    """Check a few masks and images within a few hundredths of a second.
 
-    Poses that are a frame or two late are noticed, too.
+    Poses that are one or two frames late are detected as well.
     """
     if recording.live is not None or not (recording.masks or recording.source.has_alpha):
-        return True  # what is not there cannot be looked at
+        return True  # nothing to compare with
     try:
         evidence = _sample_masks(recording, QUICK_FRAMES)
-    except InputError:  # nobody in these few; whoever reads all of them will say so
+    except InputError:  # these masks are empty; reading all of them reports that
         return True
-    claim = replace(_stored_hypothesis(recording), masks_inverted=False)
-    now = mean_score(evidence.frame_scores(claim))
+    hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
+    now = mean_score(evidence.frame_scores(hypothesis))
     shifts = [
-        mean_score(evidence.frame_scores(undo_pose_delay(k).apply(claim)))
+        mean_score(evidence.frame_scores(undo_pose_delay(k).apply(hypothesis)))
         for n in QUICK_OFFSETS
         for k in (n, -n)
     ]
@@ -220,16 +220,16 @@ def passes_quick_check(recording: Capture) -> bool:
         else _sample_film(recording, evidence, QUICK_FRAMES, QUICK_FILM_FRAMES)
     )
     return film is None or not needs_video_correction(
-        claim, film, recording.source.frame_count or 1
+        hypothesis, film, recording.source.frame_count or 1
     )
 
 
-def _edge_ratio(recording: Capture, claim: CaptureGeometry) -> float | None:
-    """How the body's outline runs along the pictures' edges; None if none can be looked at."""
+def _edge_ratio(recording: Capture, hypothesis: CaptureGeometry) -> float | None:
+    """Return the edge ratio along the body's outline; None if no image can be decoded."""
     skin = SkinPoints.of(recording.shaped)
     try:
         return edge_contrast(
-            claim, skin, sample_video(claim, skin, recording.cameras, recording.source)
+            hypothesis, skin, sample_video(hypothesis, skin, recording.cameras, recording.source)
         )
     except InputError:
         return None
@@ -241,7 +241,7 @@ def _sample_film(
     count: int = SAMPLED_IMAGES,
     within: int = MAX_DECODED_FRAMES,
 ) -> EdgeObjective | None:
-    """Some pictures and all masks; None where the masks lie in the pictures themselves."""
+    """Sample images with all masks; None if the masks are the images' alpha."""
     masks = recording.masks
     if masks is None:
         return None
@@ -254,9 +254,9 @@ def _sample_film(
 def mask_lookup(
     recording: Capture, masks: Masks, size_px: tuple[int, int]
 ) -> Callable[[int], Float32[np.ndarray, "height width"]]:
-    """From a frame's number, which may be beyond the film's, to its mask of a given size.
+    """Return a function from a frame number, also beyond the video's, to its mask.
 
-    What is returned raises InputError where there is no such mask.
+    The function raises InputError where there is no such mask.
     """
     row_of = _mask_row_lookup(recording)
 
@@ -270,10 +270,10 @@ def mask_lookup(
 
 
 def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
-    """From a frame's number to its mask; in order where there is not one mask for each frame.
+    """Return a function from a frame number to its mask; in order if counts differ.
 
     Raises:
-        InputError: If they are of another shape.
+        InputError: If masks and video have different aspect ratios.
     """
     try:
         return associate_masks(recording.masks, recording.source)
@@ -301,14 +301,14 @@ def _sample_masks(recording: Capture, count: int = SAMPLED_FRAMES) -> Silhouette
 
 
 def _stored_hypothesis(recording: Capture) -> CaptureGeometry:
-    """As the files say; masks that are turned while they are read were claimed the other way."""
-    claim = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
+    """Return poses, cameras and mask polarity as stored in the files."""
+    hypothesis = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
     turned = recording.masks is not None and recording.masks.inverted
-    return replace(claim, masks_inverted=turned)
+    return replace(hypothesis, masks_inverted=turned)
 
 
 def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
-    """The capture, and why a run would refuse its masks if it cannot tell which side is whom."""
+    """Open the capture; also return why the masks' polarity is unknown, if it is."""
     try:
         return open_capture(inputs, skip_checks=True), None
     except InputError as error:
@@ -319,5 +319,5 @@ def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
 
 
 def json_number(value: float | None) -> float | None:
-    """A number for JSON, which knows no NaN."""
+    """Round a number for JSON; NaN and infinity become null."""
     return None if value is None or not np.isfinite(value) else round(float(value), 4)

@@ -1,4 +1,4 @@
-"""A sheet of pictures to look at: mask and body drawn over frames, as they are and corrected."""
+"""Contact sheet: outlines of mask and body over frames, as stored and corrected."""
 
 import time
 from collections.abc import Sequence
@@ -18,16 +18,20 @@ from preprocess.alignment.silhouette_objective import mean_score, spaced_indices
 from preprocess.body.silhouette import SkinPoints, splat_silhouette
 
 COLUMNS = 6
+"""Frames per row."""
 CELL_PX = 300
+"""Height of a frame on the sheet."""
 DECODE_BUDGET_S = 4.0
-"""Seconds for which frames are decoded for the sheet; of a long video it shows the beginning."""
+"""Decoding time for the sheet, seconds; a long video is shown up to where that ends."""
 MASK_COLOR, BODY_COLOR, PAPER_COLOR, INK_COLOR = (
     (255, 255, 255),
     (255, 120, 0),
     (245, 245, 245),
     (40, 40, 40),
 )
+"""RGB colors of the sheet."""
 LABEL_PX = 26
+"""Height of a row's label."""
 
 Rgb = UInt8[np.ndarray, "height width 3"]
 
@@ -35,29 +39,29 @@ Rgb = UInt8[np.ndarray, "height width 3"]
 def write_contact_sheet(
     path: Path, check: CaptureValidation, *, replace: bool | None = None, listed: bool = False
 ) -> bool:
-    """Draws a few frames: white the mask's outline, orange the body's, and their agreement.
+    """Draw a few frames with the outlines of mask (white) and body (orange) and their IoU.
 
-    The second row, if there is one, is what the named cures would make of it. Without masks only
-    the body's outline is drawn.
+    A second row shows the corrected capture, if there are corrections. Without masks only the
+    body's outline is drawn.
 
     Args:
-        path: Where to.
-        examined: What is drawn.
-        replace: Whether a file that is there already may go, as of `atomic_file`.
-        listed: Whether the folder gets a list, by which a later sheet may replace this one.
+        path: Image to write.
+        check: The validated capture.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
+        listed: Whether to list the sheet in its folder, so that a later one may replace it.
 
     Returns:
-        Whether there was anything to draw.
+        Whether any frame could be drawn.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the image cannot be written.
     """
     numbers, diagnosis = _choose_frames(check), check.diagnosis
     healed = diagnosis.corrected if diagnosis and diagnosis.corrections else None
-    # A cured film shows the masks' frames under numbers of its own.
+    # a corrected video has its own frame numbers
     also = [healed.video_transform.video_frame(number) for number in numbers] if healed else []
     frames = _decode_frames(check, {*numbers, *also})
-    rows = [_draw_row(check, numbers, frames, check.hypothesis, "as it is")]
+    rows = [_draw_row(check, numbers, frames, check.hypothesis, "as stored")]
     if healed is not None:
         rows.append(_draw_row(check, numbers, frames, healed, "corrected"))
     rows = [row for row in rows if row is not None]
@@ -77,7 +81,7 @@ def write_contact_sheet(
 
 
 def _choose_frames(check: CaptureValidation) -> list[int]:
-    """Numbers of the frames that are shown: those of masks, else of poses."""
+    """Choose frames that have masks, else poses."""
     if check.sampled_masks is not None:
         return [witness.index for witness in check.sampled_masks.subset(COLUMNS).samples]
     source = check.recording.source
@@ -91,7 +95,7 @@ def _choose_frames(check: CaptureValidation) -> list[int]:
 
 
 def _decode_frames(check: CaptureValidation, frame_numbers: set[int]) -> dict[int, Frame]:
-    """The wanted frames by their numbers, as far as they are decoded in a few seconds."""
+    """Decode the frames by number, as far as the time budget allows."""
     began, found = time.perf_counter(), {}
     for frame in check.recording.source.frames():
         if frame.index in frame_numbers:
@@ -108,35 +112,35 @@ def _draw_row(
     hypothesis: CaptureGeometry,
     title: str,
 ) -> Rgb | None:
-    """A row of the frames that are there; None if none is."""
+    """Draw a row of the decoded frames; None if there are none."""
     shown = [(n, frames.get(hypothesis.video_transform.video_frame(n))) for n in numbers]
     cells = [_draw_cell(frame, n, check, hypothesis) for n, frame in shown if frame is not None]
     if not cells:
         return None
     label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER_COLOR, np.uint8)
     if check.sampled_masks is None:
-        _draw_text(label, f"{title}: the body's outline; there are no masks", 6)
+        _draw_text(label, f"{title}: body outline (no masks)", 6)
     else:
         scores = check.sampled_masks.subset(COLUMNS).frame_scores(hypothesis)
-        _draw_text(label, f"{title}: agreement {mean_score(scores):.2f}", 6)
+        _draw_text(label, f"{title}: IoU {mean_score(scores):.2f}", 6)
     return np.concatenate([label, np.concatenate(cells, axis=1)])
 
 
 def _pad_row(row: Rgb, width: int) -> UInt8[np.ndarray, "rows columns 3"]:
-    """A row with paper on its right."""
+    """Pad a row on its right."""
     return np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=PAPER_COLOR[0])
 
 
 def _draw_cell(
     frame: Frame, number: int, check: CaptureValidation, hypothesis: CaptureGeometry
 ) -> Rgb:
-    """One frame with both outlines.
+    """Draw one frame with both outlines.
 
     Args:
-        frame: The film's picture.
-        number: The frame number that its mask and pose have.
-        examined: The masks.
-        claim: Poses, cameras and film.
+        frame: The decoded frame.
+        number: Frame number of its mask and pose.
+        check: Holds the masks.
+        hypothesis: Poses, cameras and video transform.
     """
     picture, _ = hypothesis.video_transform.warp_to_mask(frame.rgb)
     height, width = picture.shape[:2]
@@ -146,7 +150,7 @@ def _draw_cell(
     evidence, row = check.sampled_masks, hypothesis.row_for_frame(number)
     score = "" if row is not None else ": no pose"
     if not same_aspect_ratio((width, height), check.recording.source.size_px):
-        score = ""  # rotated by a quarter turn: outlines belong to pictures of another shape
+        score = ""  # rotated by a quarter turn: the IoU would be that of another shape
     elif evidence is None:
         if row is not None:
             skin, camera = SkinPoints.of(check.recording.shaped), hypothesis.camera_at(number, size)

@@ -1,4 +1,4 @@
-"""A copy of a capture with the named mistakes corrected."""
+"""Corrected copy of a capture."""
 
 import os
 import shutil
@@ -30,35 +30,34 @@ from preprocess.masks.mask_files import Masks
 from preprocess.poses.pose_file import write_motion
 
 INTEGER_TOLERANCE = 1e-6
-"""Frame numbers this close to whole ones are whole."""
+"""Deviation from an integer up to which a frame number counts as one."""
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-"""Of a video's pictures, which have lost what compression takes already; colors unsampled."""
+"""JPEG options for images of a lossy video: high quality, colors at full resolution."""
 
 
 def check_new_or_empty(out: Path) -> None:
-    """Whether a capture can be written there.
+    """Check that a capture can be written to a folder.
 
     Raises:
-        InputError: If something is there already, or nothing can be.
+        InputError: If the folder has content, or cannot be written to.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--fix {out} is there already; name a folder that is new or empty.")
+        raise InputError(f"--fix {out} already exists; choose a new or empty folder.")
     check_writable(out, "--fix")
 
 
 def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
-    """Writes a native capture folder: video or pictures as they are, the rest with the cures.
+    """Write a native capture folder with all corrections applied.
 
-    Files that stay as they are become hard links where that is possible. Pictures that must be
-    rotated or mirrored are written as images; for a crop or an offset, masks, poses and cameras
-    are changed instead.
+    Unchanged files become hard links where possible. Images that must be rotated or mirrored are
+    written as images; for a crop or an offset, masks, poses and cameras are changed instead.
 
     Raises:
-        InputError: If nothing was found that could be mended.
+        InputError: If no correctable mistake was found.
         OSError: If the disk is full; then nothing is written.
     """
     if check.diagnosis is None or not check.diagnosis.corrections:
-        raise InputError("No mistake was found that could be mended, so --fix writes nothing.")
+        raise InputError("No correctable mistake was found; --fix wrote nothing.")
     check_new_or_empty(out)
     source, healed = check.recording.source, check.diagnosis.corrected
     frames = source.frames_in_file
@@ -75,7 +74,7 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
 
 
 def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[int]:
-    """The film, rotated and mirrored if it must be; the frames that have no picture then."""
+    """Write the video, reoriented if necessary; return the frames without an image."""
     if not film.reorients:
         if source.path.is_dir():
             _link_all(list_images(source.path), folder / "images")
@@ -92,7 +91,7 @@ def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[
         code = cv2.imencode(suffix, np.ascontiguousarray(picture), options)[1].tobytes()
         (folder / "images" / f"{frame.index:06d}{suffix}").write_bytes(code)
         missing -= set() if "corrupt" in frame.flags else {frame.index}
-    for index in range(source.frames_in_file):  # numbers count the files: none may be missing
+    for index in range(source.frames_in_file):  # frame numbers count files: none may be missing
         place = folder / "images" / f"{index:06d}{'.png' if png else '.jpg'}"
         if not place.exists():
             place.write_bytes(code)
@@ -100,11 +99,11 @@ def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[
 
 
 def _to_film_frames(hypothesis: CaptureGeometry, frames: int) -> CaptureGeometry:
-    """Poses and cameras with the film's own frame numbers and its own window.
+    """Convert poses and cameras to the video's own frame numbers and window.
 
     Args:
-        claim: After all cures.
-        frames: How many frames the film has.
+        hypothesis: After all corrections.
+        frames: Number of frames of the video.
     """
     film = hypothesis.video_transform
     left, top, right, bottom = film.window
@@ -131,14 +130,13 @@ def _to_film_frames(hypothesis: CaptureGeometry, frames: int) -> CaptureGeometry
 
 
 def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
-    """The poses with the numbers of the frames they belong to.
+    """Assign frame numbers to poses.
 
     Args:
-        claim: After all cures.
-        frames: How many frames there are.
-        resampled: Whether poses were made at another rate than frames. Then, and where rows fall
-            between frames, each frame gets its pose by spherical interpolation between the rows
-            around it.
+        hypothesis: After all corrections.
+        frames: Number of frames of the video.
+        resampled: Whether poses have another rate than the video. Then, and where rows fall between
+            frames, each frame's pose is interpolated spherically between neighboring rows.
     """
     if (
         not resampled
@@ -181,7 +179,7 @@ def _interpolate_motion(hypothesis: CaptureGeometry, frames: int) -> Motion:
 
 def _write_masks(check: CaptureValidation, corrected: CaptureGeometry, folder: Path) -> None:
     masks = check.recording.masks
-    if masks is None:  # in the pictures themselves
+    if masks is None:  # masks are the images' alpha
         return
     if (
         corrected.video_transform.renumbers_frames
@@ -213,11 +211,11 @@ def _write_mask_images(
 def _stored_masks(
     masks: Masks, corrected: CaptureGeometry
 ) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
-    """Name and content of each mask that can be read, under its own name."""
+    """Yield name and content of each readable mask, under its own name."""
     for row in range(masks.count):
         try:
             alpha = masks.alpha(row, masks.size_px)
-        except InputError:  # one of many; its frame will be without
+        except InputError:  # this frame has no mask then
             continue
         alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
         yield f"{row:06d}" if masks.names is None else masks.names[row], alpha
@@ -226,7 +224,7 @@ def _stored_masks(
 def _transformed_masks(
     check: CaptureValidation, masks: Masks, corrected: CaptureGeometry
 ) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
-    """Name and content of the mask of each of the film's frames; empty where there is none."""
+    """Yield name and content of the mask of each video frame; empty where there is none."""
     source, film, evidence = check.recording.source, corrected.video_transform, check.sampled_masks
     folder = source.path.is_dir() and not film.reorients
     names = [file.stem for file in list_images(source.path)] if folder else []
@@ -236,7 +234,7 @@ def _transformed_masks(
         alpha, number = np.zeros((height, width), dtype=np.float32), film.mask_frame(frame)
         try:
             alpha = stored(number)
-        except InputError:  # one of many; its frame will be left out
+        except InputError:  # this frame is skipped then
             pass
         else:
             alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
@@ -267,7 +265,7 @@ def _link_all(files: Iterable[Path], folder: Path) -> None:
 
 
 def _link(file: Path, target: Path) -> None:
-    """A hard link where the file system has them, else a copy."""
+    """Create a hard link where the file system supports them, else a copy."""
     try:
         os.link(file.resolve(), target)
     except OSError:

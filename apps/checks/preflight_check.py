@@ -1,7 +1,4 @@
-"""The ia-check command line that corrects a capture, complete enough to be pasted into a shell.
-
-The check before a run begins: silent, a warning, or the reason why it should not begin.
-"""
+"""Check of a capture before a run starts, with the ia-check command line that corrects it."""
 
 import shlex
 from pathlib import Path
@@ -21,11 +18,11 @@ from preprocess.capture_session import Capture, CaptureInputs
 
 
 def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
-    """The command line with the user's own inputs.
+    """Return the ia-check command line for the user's inputs, ready for a shell.
 
     Args:
-        wanted: What the user named.
-        fix: Whether it writes a corrected copy, to a folder that is not there yet.
+        inputs: Inputs as the user named them.
+        fix: Whether to write a corrected copy to a new folder.
     """
     words = ["ia-check", str(inputs.video)]
     named = {
@@ -44,7 +41,7 @@ def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
 
 
 def unused_corrected_folder(video: Path) -> Path:
-    """A folder beside a capture that is not there yet, named after it."""
+    """Return an unused folder next to a capture, named after it."""
     place = video if video.name else video.resolve()
     stem = place.name if place.is_dir() else place.stem
     number, folder = 1, place.parent / f"{stem}-corrected"
@@ -57,40 +54,40 @@ def unused_corrected_folder(video: Path) -> Path:
 def preflight_check(
     recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
 ) -> None:
-    """Checks a few masks and pictures; only where they disagree, looks for the reason.
+    """Check a few masks and images; diagnose the capture only if they disagree.
 
     Args:
-        recording: What is to be learnt from; live sources are not touched.
-        wanted: What the user named, for the command that corrects it.
-        console: Where warnings go.
-        force: Whether an unusable capture is warned of instead of refused.
+        recording: The capture; live sources are not checked.
+        inputs: Inputs as the user named them, for the suggested command.
+        console: Shows warnings.
+        force: Whether to warn of an unusable capture instead of refusing it.
 
     Raises:
-        InputError: If body and masks disagree so much that nothing could be learnt.
+        InputError: If the capture is unusable.
     """
     if passes_quick_check(recording):
         return
-    with console.status("poses, masks and pictures disagree; looking for the reason"):
+    with console.status("poses, masks and images disagree; diagnosing"):
         found = check_opened_capture(recording)
     causes = [cause for cause in found.causes if cause != "mask_polarity"]
     if found.verdict == "unusable":
         message = (
-            f"Body and masks agree by {found.mask_iou:.2f} only (0 to 1; {GOOD_IOU} or more was "
-            f"expected). {_explain(found)} {_suggest_command(found, inputs)}"
+            f"IoU of body and masks: {found.mask_iou:.2f} ({GOOD_IOU} or more expected). "
+            f"{_explain(found)} {_suggest_command(found, inputs)}"
         )
         if not force:
-            raise InputError(f"{message} Or go on all the same with --force.")
+            raise InputError(f"{message} To train anyway, pass --force.")
         console.warning(message)
     elif causes:
-        but = ", but not with the pictures" if found.has_film_errors else ""
+        but = " The masks do not match the images." if found.has_film_errors else ""
         console.warning(
-            f"Body and masks agree by {found.mask_iou:.2f}{but}. {_explain(found)} "
+            f"IoU of body and masks: {found.mask_iou:.2f}.{but} {_explain(found)} "
             f"{_suggest_command(found, inputs)}"
         )
 
 
 def correction_hint(inputs: CaptureInputs) -> str:
-    """What might mend a capture that was refused for other reasons; empty if that is unknown."""
+    """Suggest a correction for a capture that could not be opened; empty if none is known."""
     if inputs.live or camera_address(inputs.video) is not None:
         return ""
     try:
@@ -103,12 +100,12 @@ def correction_hint(inputs: CaptureInputs) -> str:
 def _explain(check: CaptureValidation) -> str:
     if check.diagnosis is None or not check.diagnosis.corrections:
         return NO_KNOWN_MISTAKE
-    words = "; and ".join(cure.description for cure in check.diagnosis.corrections)
-    return f"It looks as if {words}. {check.expected_improvement}".strip()
+    words = "; and ".join(each.description for each in check.diagnosis.corrections)
+    return f"Probable cause: {words}. {check.expected_improvement}".strip()
 
 
 def _suggest_command(check: CaptureValidation, inputs: CaptureInputs) -> str:
-    """The command that corrects it, or that shows it."""
+    """Suggest the command that corrects the capture, or that shows it."""
     if check.causes:
         return f"To correct it: {check_command(inputs)}"
-    return f"To look at it: {check_command(inputs, fix=False)}"
+    return f"To inspect it: {check_command(inputs, fix=False)}"

@@ -1,7 +1,4 @@
-"""A command line as a record: what every command answers besides its own arguments.
-
-Flags whose value may be left out: --view, --web and their ports, --turntable and its seconds.
-"""
+"""Command lines parsed into records, with --help, --version and flags with optional values."""
 
 import io
 import re
@@ -17,33 +14,35 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 DISTRIBUTION = "instant-avatar-stream"
+"""Name of the installed package."""
 
 HELP_FLAGS = frozenset({"-h", "--help"})
+"""Flags that print the help."""
 
 Arguments = TypeVar("Arguments")
 Flag = Annotated[
     bool,
     tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(help="Say which version this is, and exit.", help_behavior_hint=""),
+    tyro.conf.arg(help="Print the version and exit.", help_behavior_hint=""),
 ]
 
 
 def parse_arguments(
     arguments_type: type[Arguments], program: str, argv: Sequence[str] | None = None
 ) -> Arguments:
-    """The arguments of a command; --help and --version are answered, and end it.
+    """Parse the arguments of a command; --help and --version print and exit.
 
     Args:
-        kind: A dataclass; its docstrings are the --help.
-        program: The command's name.
-        words: What was typed; None for what the process was called with.
+        arguments_type: A dataclass; its docstrings are the --help.
+        program: Name of the command.
+        argv: Words of the command line; None for those of the process.
 
     Raises:
-        SystemExit: With 0 once --help or --version was answered, 2 if the words make no sense.
+        SystemExit: With 0 after --help or --version, with 2 if the words cannot be parsed.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     if "--version" in argv:
-        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer to --version and --help
+        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer to --version
         raise SystemExit(0)
     own: list[tuple[str, Any, Any]] = [("version", Flag, field(default=False))]
     both: Any = make_dataclass(
@@ -51,34 +50,34 @@ def parse_arguments(
     )
     both.__doc__ = arguments_type.__doc__
     if HELP_FLAGS.isdisjoint(argv):
-        told = tyro.cli(both, prog=program, args=argv)
+        parsed = tyro.cli(both, prog=program, args=argv)
     else:
-        told = _parse_with_wrapped_help(both, program, argv)
-    given = {each.name: getattr(told, each.name) for each in fields(both)}
+        parsed = _parse_with_wrapped_help(both, program, argv)
+    given = {each.name: getattr(parsed, each.name) for each in fields(both)}
     del given["version"]
     return arguments_type(**given)
 
 
 def _parse_with_wrapped_help(arguments_type: Any, program: str, argv: Sequence[str]) -> Any:
-    """As tyro does it, but paragraphs are lines that fit the terminal."""
-    held = _CapturedStdout()
+    """Parse like tyro, but wrap the paragraphs of --help to the terminal."""
+    captured = _CapturedStdout()
     try:
-        with redirect_stdout(held):
+        with redirect_stdout(captured):
             return tyro.cli(arguments_type, prog=program, args=argv)
     finally:
-        print(_wrap_paragraphs(held.getvalue()), end="")  # noqa: T201 - the answer to --version and --help
+        print(_wrap_paragraphs(captured.getvalue()), end="")  # noqa: T201 - the answer to --help
 
 
 def _installed_version() -> str:
-    """Of the installed distribution."""
+    """Return the version of the installed package."""
     try:
         return version(DISTRIBUTION)
     except PackageNotFoundError:
-        return "(a checkout that is not installed)"
+        return "(checkout, not installed)"
 
 
 class _CapturedStdout(io.StringIO):
-    """What is printed, held back; with the colours and the letters that stdout can show."""
+    """Captures what is printed, with the colors and the encoding of stdout."""
 
     encoding = property(lambda self: getattr(sys.__stdout__, "encoding", "utf-8"))  # type: ignore[assignment]
 
@@ -87,7 +86,7 @@ class _CapturedStdout(io.StringIO):
 
 
 def _wrap_paragraphs(text: str) -> str:
-    """Paragraphs, which tyro makes one line each, in lines of the terminal's width."""
+    """Wrap paragraphs, each of which tyro prints as one line, to the terminal's width."""
     width = shutil.get_terminal_size().columns
     lines = [
         textwrap.fill(line, width) if line[:1].isalpha() or line[:1].isdigit() else line
@@ -97,12 +96,12 @@ def _wrap_paragraphs(text: str) -> str:
 
 
 def fill_optional_port(argv: Sequence[str], flag: str, port: int) -> list[str]:
-    """The command line with the port that may be left out after a flag."""
+    """Insert a default port after a flag that has none."""
     return _fill_optional(argv, flag, str(port), lambda word: word.isdecimal())
 
 
 def fill_optional_number(argv: Sequence[str], flag: str, value: float) -> list[str]:
-    """The command line with the number that may be left out after a flag."""
+    """Insert a default number after a flag that has none."""
     return _fill_optional(argv, flag, f"{value:g}", _is_number)
 
 
@@ -117,7 +116,7 @@ def _is_number(word: str) -> bool:
 def _fill_optional(
     argv: Sequence[str], flag: str, value: str, is_value: Callable[[str], bool]
 ) -> list[str]:
-    """argparse would take the next word for the value, whatever that is."""
+    """Insert a value after a flag unless one follows; argparse would take any next word."""
     filled: list[str] = []
     for place, word in enumerate(argv):
         filled.append(word)

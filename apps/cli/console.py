@@ -1,4 +1,4 @@
-"""What a command says while it works: a live line on a terminal, plain lines in a log."""
+"""Console output of a command: a live line on a terminal, plain lines in a log."""
 
 import os
 import time
@@ -13,19 +13,21 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
 MAX_PRINTED_WARNINGS = 5
-"""Warnings that are printed; the rest are counted, and all stand in the report."""
+"""Warnings that are printed; the rest are counted, and the report lists all of them."""
 MAX_KEPT_WARNINGS = 500
-"""Warnings that are kept, so that memory stays bounded however long a video lasts."""
+"""Warnings that are kept, so that memory stays bounded for any length of video."""
 LOG_INTERVAL_S = 10.0
+"""Seconds between two progress lines in a log."""
 MIN_BAR_WIDTH = 8
-"""Characters of a bar beside a long note."""
-MIN_ELAPSED_FOR_ESTIMATE_S, MIN_SHARE_FOR_ESTIMATE = 2.0, 0.15
-"""Before that time, and before that share is done, too little is known to say how long the rest
-takes."""
+"""Least width of a bar next to a long note, characters."""
+MIN_ELAPSED_FOR_ESTIMATE_S = 2.0
+"""Elapsed time before which the remaining time is not estimated, seconds."""
+MIN_SHARE_FOR_ESTIMATE = 0.15
+"""Fraction done before which the remaining time is not estimated."""
 
 
 def format_duration(seconds: float) -> str:
-    """A duration as people say it: "5 s", "40 s", "2 min"; above ten seconds in steps of five."""
+    """Format a duration: "5 s", "40 s", "2 min"; above ten seconds in steps of five."""
     if seconds > 90.0:
         return f"{seconds / 60.0:.0f} min"
     return f"{5 * round(seconds / 5.0) if seconds > 10.0 else max(1, round(seconds))} s"
@@ -33,52 +35,52 @@ def format_duration(seconds: float) -> str:
 
 @final
 class StderrConsole(RichConsole):
-    """What people read; once nobody does (`… 2>&1 | head`), the work goes on in silence."""
+    """Writes to stderr; goes silent, instead of failing, once its reader closes the pipe."""
 
     def __init__(self) -> None:
-        """Lines are as long as they are."""
+        """Write to stderr without wrapping lines."""
         super().__init__(stderr=True, soft_wrap=True)
 
     def on_broken_pipe(self) -> None:
-        """The reader has gone; rich would end the process."""
+        """Go silent; rich would exit."""
         self.quiet = True
 
 
 @final
 class Console:
-    """Messages on stderr, so that stdout stays free for what was made.
+    """Messages on stderr; stdout is reserved for results.
 
     Attributes:
-        warnings: Every warning so far; of very many the first `MOST_KEPT`.
+        warnings: The first `MAX_KEPT_WARNINGS` warnings.
     """
 
     def __init__(self, console: RichConsole | None = None) -> None:
-        """A console on stderr, unless another is given."""
+        """Write to stderr, unless another console is given."""
         self._rich = console or StderrConsole()
         self.warnings: list[str] = []
         self._discarded_warnings = 0
 
     @property
     def is_terminal(self) -> bool:
-        """Whether somebody watches."""
+        """Whether stderr is a terminal."""
         return self._rich.is_terminal
 
     def info(self, message: str) -> None:
-        """A line."""
+        """Print a line."""
         self._rich.print(escape(message), highlight=False)
 
     def info_before_exit(self, message: str) -> None:
-        """A line, from wherever the command is; the terminal gets its cursor back."""
+        """Print a line from a signal handler, and show the terminal's cursor again."""
         self._rich.show_cursor(True)
         with suppress(BrokenPipeError):
             os.write(2, f"\n{message}\n".encode() if self.is_terminal else f"{message}\n".encode())
 
     def print_artifact(self, what: str, path: object) -> None:
-        """A line that names a file that is there now."""
+        """Print a line with the path of a written file."""
         self._rich.print(f"  [green]{escape(what):<12}[/] {escape(str(path))}", highlight=False)
 
     def warning(self, message: str) -> None:
-        """Something the user should know; the same is never said twice."""
+        """Print and keep a warning, once."""
         if message in self.warnings:
             return
         if len(self.warnings) == MAX_KEPT_WARNINGS:
@@ -89,19 +91,19 @@ class Console:
             self._rich.print(f"[yellow]warning:[/] {escape(message)}", highlight=False)
 
     def summarize_warnings(self) -> None:
-        """Says how many warnings were kept back."""
+        """Print how many warnings were not printed."""
         rest = len(self.warnings) - MAX_PRINTED_WARNINGS
         if rest > 0:
-            beyond = (
-                f", and {self._discarded_warnings} that are not" if self._discarded_warnings else ""
-            )
+            lost = self._discarded_warnings
+            beyond = f", and {lost} that are not" if lost else ""
             self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report{beyond}")
 
     @contextmanager
     def status(self, message: str) -> Iterator[Callable[[str], None]]:
-        """Something that takes a moment: a spinner on a terminal, a line in a log.
+        """Show a spinner on a terminal, or a line in a log, during a block.
 
-        What is yielded says beside the spinner how far it is.
+        Yields:
+            A function that shows progress next to the spinner.
         """
         if not self.is_terminal:
             self.info(message)
@@ -111,21 +113,21 @@ class Console:
             yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
 
     def progress(self, label: str, total: float) -> "ProgressBar":
-        """A progress bar; use it in a `with` block. A log gets a line at its beginning."""
+        """Return a progress bar for a `with` block."""
         return ProgressBar(self._rich, label, total)
 
 
 def _min_width_column(width: int) -> Column:
-    """A column that keeps this many characters in a narrow terminal."""
+    """Return a column that keeps this width in a narrow terminal."""
     return Column(min_width=width, no_wrap=True)
 
 
 @final
 class ProgressBar:
-    """How far something has come: a bar on a terminal, now and then a line in a log."""
+    """Progress: a bar on a terminal, a line every `LOG_INTERVAL_S` in a log."""
 
     def __init__(self, console: RichConsole, label: str, total: float) -> None:
-        """Called by `Console.bar`."""
+        """Called by `Console.progress`."""
         self._console, self._label, self._total = console, label, total
         self._progress: Progress | None = None
         self._task = TaskID(0)
@@ -133,7 +135,7 @@ class ProgressBar:
         self._drawn_at = 0.0
 
     def __enter__(self) -> "ProgressBar":
-        """Shows it."""
+        """Show the bar."""
         if self._console.is_terminal:
             self._progress = Progress(
                 TextColumn(
@@ -156,16 +158,16 @@ class ProgressBar:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Takes it away."""
+        """Remove the bar."""
         if self._progress is not None:
             self._progress.stop()
 
     def set_count(self, done: int) -> None:
-        """This number of the total is done; says how long the rest takes."""
+        """Set the number done of the total, and show the remaining time."""
         self.update(float(done), f"{done} of {self._total:.0f}{self._remaining_text(float(done))}")
 
     def set_share(self, done: float) -> None:
-        """This share of the total is done; says how long the rest takes."""
+        """Set the amount done of the total in percent, and show the remaining time."""
         self.update(done, f"{done / self._total:.0%}{self._remaining_text(done)}")
 
     def _remaining_text(self, done: float) -> str:
@@ -176,7 +178,7 @@ class ProgressBar:
         return f", about {format_duration(took * (self._total - done) / done)} left"
 
     def update(self, done: float, note: str) -> None:
-        """So far, and a few words; cheap enough to call at every step."""
+        """Set the amount done and a note; cheap enough to call at every step."""
         now = time.perf_counter()
         if self._progress is not None:
             if now - self._drawn_at > 0.1:

@@ -1,7 +1,4 @@
-"""The device that trains and renders.
-
-How many threads the trainer has.
-"""
+"""Device and threads for training and rendering."""
 
 import os
 
@@ -12,33 +9,34 @@ from capture.input_error import InputError
 
 CUDA_SLOW_WARNING = (
     "--device cuda runs the plain-torch reference, which is slower than the CPU: there are no CUDA "
-    "kernels yet. Leave --device out to train on the CPU."
+    "kernels yet. Omit --device to train on the CPU."
 )
+"""Warning for --device cuda."""
 
 
 def resolve_device(name: str) -> torch.device:
-    """Returns the device for --device.
+    """Return the device for --device.
 
     Args:
         name: "cpu", "cuda", or "auto". Auto is the CPU, which is faster until there are CUDA
             kernels.
 
     Raises:
-        InputError: If CUDA was asked for, and torch sees no GPU.
+        InputError: If CUDA is requested, but torch finds no GPU.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            "--device cuda was asked for, but torch sees no GPU here. Leave --device out, or "
-            "install torch with CUDA and check nvidia-smi."
+            "--device cuda requires a GPU, but torch finds none. Omit --device, or install torch "
+            "with CUDA and check nvidia-smi."
         )
     return torch.device("cuda" if name == "cuda" else "cpu")
 
 
 def set_threads(requested: int | None) -> int:
-    """Sets torch's and numba's threads: what was asked for, else one for each core we may use.
+    """Set the threads of torch and numba: as requested, else one per usable core.
 
     Returns:
-        How many there are now; numba cannot have more than it started with.
+        The number of threads; numba cannot exceed the number it started with.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     threads = max(1, min(requested or cores or 1, numba.get_num_threads()))

@@ -1,7 +1,4 @@
-"""Packages that an installation may lack, and the command that brings each.
-
-How a command ends: one number for each kind of end, one message for each kind of failure.
-"""
+"""Exit codes of the commands, and one message for each kind of failure."""
 
 import errno
 from collections.abc import Callable
@@ -15,61 +12,57 @@ from apps.cli.interrupt import record_interrupt
 from capture.input_error import InputError
 
 LEARN_PACKAGES = frozenset({"torch", "numba", "onnx"})
-"""What the extra [learn] brings besides `SMALL`: hundreds of megabytes that a player is spared."""
+"""Large packages of the extra [learn], which playing does not need."""
 SMALL_PACKAGES = frozenset({"trimesh", "pycolmap"})
-"""What it brings, too, but is soon installed alone."""
+"""Small packages of the extra [learn], which can be installed alone."""
 
 
 def install_advice(error: ModuleNotFoundError) -> str | None:
-    """Say what to install for a package that is missing; None if the module is our own mistake.
-
-    Args:
-        error: What an import raised.
-    """
+    """Return what to install for a missing package; None if the module is not an optional one."""
     package = (error.name or "").split(".")[0]
     if package in LEARN_PACKAGES:
         return (
-            f"{package} is not installed here: this is an installation that plays avatars, checks "
-            "captures and exports meshes, but does not learn. For the rest: "
-            f"pip install '{DISTRIBUTION}[learn]'"
+            f"{package} is not installed: this installation plays avatars, checks captures and "
+            f"exports meshes, but cannot train. To train: pip install '{DISTRIBUTION}[learn]'"
         )
     if package in SMALL_PACKAGES:
-        return f"{package} is not installed here. Install it: pip install {package}"
+        return f"{package} is not installed. Install it: pip install {package}"
     return None
 
 
 DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE = 0, 1, 2, 3
-"""1: learnt, and the result is no usable avatar (verdict "failed", or nothing to draw)."""
+"""Exit codes; 1: trained, but the avatar is not usable (failed, or nothing to draw)."""
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""The disk, the quota, or the largest size that a file may have."""
+"""Disk full, quota exceeded, or file too large."""
 PERMISSION_ERRNOS = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+"""Missing permission to read or write."""
 PATH_ERRNOS = frozenset(
     {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
 )
-"""Names that nothing can be read from or written to."""
+"""Paths that cannot be read or written."""
 DEVICE_BUSY_PHRASES = ("out of memory", "busy or unavailable", "not enough memory")
-"""What torch says of a device that cannot be used now."""
+"""Phrases of torch for a device without memory or in use."""
 
 
 class CommandExit(Exception):  # noqa: N818 - an exit, not always an error
     """Ends the command with a message and an exit code."""
 
     def __init__(self, message: str, code: int) -> None:
-        """An end that is known and said."""
+        """Set the message for the user and the exit code."""
         super().__init__(message)
         self.code = code
 
 
 def run_command(program: str, work: Callable[[], int]) -> int:
-    """Runs a command's work; what a user or a machine can cause becomes one message and a number.
+    """Run a command; turn failures of user and machine into one message and an exit code.
 
-    No usable avatar is 1, bad input or a package that is not installed 2, a full disk or a busy
-    device 3, Ctrl-C 130. Our own bugs keep their traceback.
+    No usable avatar is 1, bad input or a missing package 2, a full disk or a busy device 3, Ctrl-C
+    130. Bugs keep their traceback.
 
     Args:
-        program: The command's name, in front of the message.
-        work: Returns its own exit code.
+        program: Name of the command, in front of the message.
+        work: Returns the exit code of a command that does not fail.
     """
     with record_interrupt() as interrupted:
         try:
@@ -105,12 +98,12 @@ def _run_translating_errors(program: str, work: Callable[[], int]) -> int:
 
 
 def print_error(program: str, message: str) -> None:
-    """One message on stderr."""
+    """Print one message to stderr."""
     StderrConsole().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
 
 
 def is_disk_full(error: OSError) -> bool:
-    """Whether a write failed for want of room."""
+    """Whether a write failed because the disk is full."""
     return error.errno in DISK_FULL_ERRNOS
 
 
@@ -119,20 +112,23 @@ def _machine_failure(error: OSError | RuntimeError | MemoryError) -> tuple[int, 
     if isinstance(error, OSError):
         why = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
         if is_disk_full(error):
-            return RESOURCE_UNAVAILABLE, f"the disk is full ({why}). Make room, or write elsewhere."
+            return (
+                RESOURCE_UNAVAILABLE,
+                f"the disk is full ({why}). Free some space.",
+            )
         if error.errno == errno.EBUSY:
             return RESOURCE_UNAVAILABLE, f"a device is busy ({why})."
         if error.errno in PERMISSION_ERRNOS | PATH_ERRNOS:
-            return BAD_INPUT, f"cannot read or write there ({why}). Name another place."
+            return BAD_INPUT, f"cannot read or write ({why}). Choose another path."
         return None
-    said = str(error).strip() or "out of memory"
+    message = str(error).strip() or "out of memory"
     if isinstance(error, MemoryError) or any(
-        words in said.lower() for words in DEVICE_BUSY_PHRASES
+        words in message.lower() for words in DEVICE_BUSY_PHRASES
     ):
-        first = said.splitlines()[0]
+        first = message.splitlines()[0]
         return (
             RESOURCE_UNAVAILABLE,
-            f"the device has no room or is busy ({first}). Try a smaller --size.",
+            f"the device is out of memory or busy ({first}). Try a smaller --size.",
         )
     return None
 

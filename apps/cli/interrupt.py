@@ -1,4 +1,4 @@
-"""Ctrl-C that lets the work be saved: the first asks to stop, the second stops."""
+"""Handling of Ctrl-C: the first one requests a stop, the second one quits."""
 
 import os
 import signal
@@ -14,15 +14,15 @@ INTERRUPTED = 130
 
 @contextmanager
 def stop_on_interrupt(
-    console: Console, saving_message: str = "what was learnt is being saved"
+    console: Console, saving_message: str = "saving the checkpoint"
 ) -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second raises KeyboardInterrupt as always.
+    """Yield an event that the first Ctrl-C sets; the second raises KeyboardInterrupt.
 
-    Off the main thread, where signals do not arrive, it is never set.
+    Signals reach the main thread only; on other threads the event is never set.
 
     Args:
-        console: Hears that it is stopping.
-        kept: What happens to the work done so far.
+        console: Shows that the work is stopping.
+        saving_message: What happens to the work done.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -32,7 +32,7 @@ def stop_on_interrupt(
     def first(signal_number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop.set()
-        console.info(f"Stopping; {saving_message}. Ctrl-C again quits at once.")
+        console.info(f"Stopping; {saving_message}. Press Ctrl-C again to quit immediately.")
 
     before = signal.signal(signal.SIGINT, first)
     try:
@@ -45,15 +45,15 @@ def stop_on_interrupt(
 def exit_on_interrupt(
     console: Console, program: str, cleanup: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
-    """Ctrl-C ends the process where it stands.
+    """Exit the process immediately on Ctrl-C during this block.
 
-    For the time in which libraries are loaded, kernels compiled and trees searched by threads of
-    their own: there an exception in the main thread ends in others, or in a crash.
+    For imports, kernel compilation and native threads, where an exception in the main thread would
+    turn into other errors or a crash.
 
     Args:
-        console: Gives the terminal back.
-        program: The command's name, in front of the message.
-        tidy: Called before the process ends.
+        console: Restores the terminal.
+        program: Name of the command, in front of the message.
+        cleanup: Called before the process exits.
     """
 
     def leave(signal_number: int, frame: object) -> None:
@@ -73,10 +73,10 @@ def exit_on_interrupt(
 
 @contextmanager
 def record_interrupt() -> Iterator[threading.Event]:
-    """An event that is set by Ctrl-C, which raises KeyboardInterrupt as always.
+    """Yield an event that Ctrl-C sets; KeyboardInterrupt is still raised.
 
-    What is being imported may turn that into an error of its own; the event still knows. Off the
-    main thread it is never set. SIGTERM, by which machines ask for an end, is taken as Ctrl-C.
+    A module being imported may turn the exception into its own error; the event remains set.
+    SIGTERM is treated like Ctrl-C. On other threads than the main one the event is never set.
     """
     came = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -98,10 +98,10 @@ def record_interrupt() -> Iterator[threading.Event]:
 
 @contextmanager
 def interrupt_event() -> Iterator[threading.Event]:
-    """An event that every Ctrl-C sets, and that none of them can miss.
+    """Yield an event that Ctrl-C sets without raising an exception.
 
-    A KeyboardInterrupt may be raised in a callback that swallows it, and then nothing ends. Off the
-    main thread the event is never set.
+    A KeyboardInterrupt could be swallowed by the callback that it is raised in. On other threads
+    than the main one the event is never set.
     """
     ended = threading.Event()
     if threading.current_thread() is not threading.main_thread():

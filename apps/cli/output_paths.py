@@ -1,4 +1,4 @@
-"""Where a command may write: asked before any work is done for what goes there."""
+"""Checks of output paths, before any work is done for them."""
 
 import os
 import shlex
@@ -12,54 +12,54 @@ from capture.output_file_list import RESERVED_PREFIX
 
 
 def check_writable(path: Path, flag: str) -> None:
-    """Whether something can be written there; tried out, and nothing is left behind.
+    """Check by trial that a path can be written; nothing is left behind.
 
     Args:
-        path: A file or a folder; it and folders above it need not be there yet.
-        flag: Which argument named it.
+        path: A file or a folder; it and its parents need not exist yet.
+        flag: The argument that names the path.
 
     Raises:
-        InputError: If that cannot be.
+        InputError: If the path cannot be written.
     """
     place = Path(os.path.abspath(path))
     while not place.exists() and place != place.parent:
         place = place.parent
     if place.is_file() and place.absolute() != Path(os.path.abspath(path)):
-        raise InputError(f"{flag} is {path}, but {place} is a file and holds nothing.")
+        raise InputError(f"{flag} is {path}, but {place} is a file.")
     folder = place.parent if place.is_file() else place  # a file is replaced, not written into
     try:
         os.rmdir(tempfile.mkdtemp(prefix=RESERVED_PREFIX, dir=folder))
     except OSError as error:
         raise InputError(
-            f"{flag} is {path}, but {folder} cannot be written to ({error.strerror}). Name another "
-            "place."
+            f"{flag} is {path}, but {folder} is not writable ({error.strerror}). Choose another "
+            "path."
         ) from None
 
 
 def check_output_file(
     path: Path, flag: str, inputs: Iterable[Path] = (), *, overwrite: bool | None = None
 ) -> None:
-    """Whether a file may be written there.
+    """Check that an output file may be written.
 
     Args:
-        path: Where to.
-        flag: Which argument named it.
-        inputs: What the command reads; no output is one of them, nor lies in one.
-        overwrite: Whether a file that is there already may go; None: where no list of the folder
-            says otherwise.
+        path: The file to write.
+        flag: The argument that names the file.
+        inputs: Files and folders that the command reads; an output may not lie in one of them.
+        overwrite: Whether an existing file may be replaced; None: unless the folder's list of
+            written files forbids it.
 
     Raises:
-        InputError: If not.
+        InputError: If the file may not be written.
     """
     if path.is_dir():
-        raise InputError(f"{flag} is {path}, which is a folder; the name of a file was expected.")
+        raise InputError(f"{flag} is {path}, which is a folder, but must be a file.")
     if is_stream(path):
         return
     for given in inputs:
         if _is_same_file(path, given):
             raise InputError(
                 f"{flag} is {path}, which is an input of this command ({given}); inputs are never "
-                f"written to. Name another file: {flag} {shlex.quote(str(unused_path(path)))}"
+                f"written to. Choose another file: {flag} {shlex.quote(str(unused_path(path)))}"
             )
         if _is_same_file(path.parent, given):
             other = (
@@ -67,28 +67,28 @@ def check_output_file(
                 / f"{_resolved_name(given)}-{path.name}"
             )
             raise InputError(
-                f"{flag} is {path}, which lies in an input of this command ({given}): what lies "
-                f"there is read as a part of it. Name another file: {flag} "
+                f"{flag} is {path}, which lies in an input of this command ({given}), where it "
+                f"would be read as part of it. Choose another file: {flag} "
                 f"{shlex.quote(str(unused_path(other)))}"
             )
     if not is_replaceable(path, overwrite):
         raise InputError(
-            f"{flag} is {path}, which is there already. Replace it with --overwrite, or name "
-            f"another file: {flag} {shlex.quote(str(unused_path(path)))}"
+            f"{flag} {path} already exists. Pass --overwrite to replace it, or choose another "
+            f"file: {flag} {shlex.quote(str(unused_path(path)))}"
         )
     check_writable(path, flag)
 
 
 def check_output_folder(path: Path, flag: str, inputs: Iterable[Path] = ()) -> None:
-    """Whether a folder may be written there; an older one gives way if all of it is ours.
+    """Check that an output folder may be written; an older one is replaced if all of it is ours.
 
     Args:
-        path: Where to.
-        flag: Which argument named it.
-        inputs: What the command reads.
+        path: The folder to write.
+        flag: The argument that names the folder.
+        inputs: Files and folders that the command reads.
 
     Raises:
-        InputError: If not.
+        InputError: If the folder may not be written.
     """
     check_disjoint_from_inputs(path, flag, inputs)
     check_replaceable_folder(path)
@@ -96,15 +96,15 @@ def check_output_folder(path: Path, flag: str, inputs: Iterable[Path] = ()) -> N
 
 
 def check_disjoint_from_inputs(folder: Path, flag: str, inputs: Iterable[Path]) -> None:
-    """Refuses an output folder that is an input, holds one, or lies in one.
+    """Refuse an output folder that is an input, contains one, or lies in one.
 
     Args:
-        folder: Where a command will write.
-        flag: Which argument named it.
-        inputs: What it reads: files and folders.
+        folder: The folder to write.
+        flag: The argument that names the folder.
+        inputs: Files and folders that the command reads.
 
     Raises:
-        InputError: With the name of a folder that may be used.
+        InputError: With a suggestion for another folder.
     """
     inputs = list(inputs)
     for given in inputs:
@@ -112,13 +112,13 @@ def check_disjoint_from_inputs(folder: Path, flag: str, inputs: Iterable[Path]) 
         if clash is not None:
             raise InputError(
                 f"{flag} {folder} {clash} an input of this command ({given.absolute()}): nothing "
-                "is written where inputs lie. Name a folder of its own: "
+                "is written next to inputs. Choose a separate folder: "
                 f"{flag} {shlex.quote(str(_suggest_disjoint_folder(given, inputs)))}"
             )
 
 
 def unused_path(path: Path) -> Path:
-    """The path, or one with a number behind its name: the first that is not taken."""
+    """Return the path, or its first numbered variant that does not exist."""
     number, free = 1, path
     while os.path.lexists(free):
         number += 1
@@ -127,18 +127,18 @@ def unused_path(path: Path) -> Path:
 
 
 def _describe_overlap(folder: Path, given: Path) -> str | None:
-    """How an output folder and an input get in each other's way."""
+    """Return how an output folder overlaps an input; None if it does not."""
     if _is_same_file(folder, given):
         return "is"
     if given.is_dir() and any(_is_same_file(above, given) for above in _real_path(folder).parents):
         return "lies in"
     if any(_is_same_file(above, folder) for above in _real_path(given).parents):
-        return "holds"
+        return "contains"
     return None
 
 
 def _suggest_disjoint_folder(given: Path, inputs: list[Path]) -> Path:
-    """A folder that is not there yet, beside an input and outside of all."""
+    """Return an unused folder next to an input and outside of all inputs."""
     place = _real_path(given)
     while True:
         free = unused_path(place.with_name(f"{place.stem}-run"))
@@ -148,12 +148,12 @@ def _suggest_disjoint_folder(given: Path, inputs: list[Path]) -> Path:
 
 
 def _is_same_file(one: Path, other: Path) -> bool:
-    """Whether two paths are one file, also by a link, or in another case where case is nothing."""
+    """Whether two paths are one file, also by links, or on case-insensitive file systems."""
     if _real_path(one) == _real_path(other):
         return True
     try:
         return one.samefile(other)
-    except OSError:  # one is not there
+    except OSError:  # one does not exist
         return False
 
 

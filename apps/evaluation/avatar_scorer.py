@@ -1,4 +1,4 @@
-"""Draws an avatar for each frame in every way that it can be drawn, and scores it."""
+"""Score an avatar on frames: volume renderer, fitted poses, and each tier of the player."""
 
 import threading
 from collections.abc import Iterable, Sequence
@@ -19,29 +19,29 @@ from export.player import Player
 from preprocess.observation import Observation
 
 BEST_TIER = "hq"
-"""The tier that every package has."""
+"""Tier that every package has."""
 FIT_BATCH_FRAMES = 25
-"""Frames that poses are fitted to at a time."""
+"""Number of frames whose poses are fitted together."""
 
 
 @final
 class AvatarScorer:
-    """One avatar, to be compared with frames.
+    """Scores one avatar.
 
     Attributes:
-        rows: What was found so far.
-        size_px: Of the pictures, width and height; None before the first.
+        rows: Scores by renderer and poses.
+        size_px: Width and height of the images; None before the first.
     """
 
     def __init__(
         self, trainer: Trainer | None, players: dict[str, Player], *, fit_poses: bool
     ) -> None:
-        """Nothing is drawn yet.
+        """Prepare the rows of the table.
 
         Args:
-            trainer: With the avatar, for the volume renderer; None for the player alone.
-            players: By tier.
-            fits: Whether poses are fitted to the frames, too.
+            trainer: Holds the avatar for the volume renderer; None for the player alone.
+            players: Players by tier.
+            fit_poses: Whether to score fitted poses as well.
         """
         self._trainer, self._players = trainer, players
         self._given = ScoreRow(renderer="renderer", poses="given")
@@ -58,7 +58,7 @@ class AvatarScorer:
     def score_frames(
         self, frames: Iterable[Observation], bar: ProgressBar, stop: threading.Event
     ) -> None:
-        """Scores frame after frame, until there is none left or somebody stops it."""
+        """Score all frames, or those before `stop` is set."""
         done = 0
         rest = iter(frames)
         while some := list(islice(rest, FIT_BATCH_FRAMES)):
@@ -103,16 +103,16 @@ def evaluate_avatar(
     *,
     fit_poses: bool,
 ) -> AvatarEvaluation:
-    """An avatar's rows.
+    """Score an avatar.
 
     Args:
-        name: By which the table calls it.
-        frames: What it is compared with.
-        trainer: With the avatar, for the volume renderer.
-        package: For the player.
-        console: Where progress is shown.
-        stop: Ends it before all frames were scored.
-        fits: Whether poses are fitted to the frames, too.
+        name: Name of the avatar in the table.
+        frames: Frames to compare with.
+        trainer: Holds the avatar for the volume renderer; None for the player alone.
+        package: Package for the player; None without one.
+        console: Shows progress.
+        stop: Ends scoring early.
+        fit_poses: Whether to score fitted poses as well.
 
     Raises:
         InputError: If the package is damaged.
@@ -131,11 +131,13 @@ def _render_with_player(player: Player, observation: Observation) -> Premultipli
 def _load_players(
     package: Path | None, frames: EvaluationFrames, console: Console
 ) -> dict[str, Player]:
-    """A player for each tier; none for pictures that a lens has bent."""
+    """Load a player per tier; none for images with lens distortion."""
     if package is None:
         return {}
     if frames.recording.cameras[0].distortion:
-        console.warning("The player draws pinhole pictures; this lens bends, so it is not scored.")
+        console.warning(
+            "The player renders pinhole images; this lens has distortion, so it is not scored."
+        )
         return {}
     best = Player.load(package)
     rest = [tier for tier in best.manifest.tiers if tier != BEST_TIER]

@@ -1,4 +1,4 @@
-"""The frames that an avatar is compared with: its own held-out ones, or another capture's."""
+"""Frames to evaluate an avatar on: held-out frames of its run, or another capture."""
 
 import json
 import os
@@ -15,15 +15,16 @@ from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 
 PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
+"""Arguments of ia-ingest that are paths in report.json."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvaluationFrames:
-    """Frames of a recording.
+    """Frames of a capture.
 
     Attributes:
-        recording: Where they come from.
-        numbers: Which of them count; None for all.
+        recording: The capture.
+        frame_indices: Numbers of the frames to score; None for all.
     """
 
     recording: Capture
@@ -31,7 +32,7 @@ class EvaluationFrames:
 
     @property
     def count(self) -> int | None:
-        """How many there are, if that is known."""
+        """Number of frames; None if unknown."""
         return (
             self.recording.source.frame_count
             if self.frame_indices is None
@@ -39,12 +40,12 @@ class EvaluationFrames:
         )
 
     def __iter__(self) -> Iterator[Observation]:
-        """Those in which the person was found, in order; what is no longer needed is not read."""
+        """Yield the frames that show the person; reading ends after the last one needed."""
         recording, wanted = self.recording, self.frame_indices
         observe, last = recording.observation_builder(), max(wanted, default=-1) if wanted else None
         for frame in recording.source.frames():
             counts = wanted is None or frame.index in wanted
-            if counts or recording.segment is not None:  # masks are estimated frame after frame
+            if counts or recording.segment is not None:  # masks are estimated sequentially
                 seen = observe(frame)
                 if counts and isinstance(seen, Observation):
                     yield seen
@@ -55,43 +56,42 @@ class EvaluationFrames:
 def capture_frames(
     inputs: CaptureInputs, body_file: Path | None, size_px: int | None
 ) -> EvaluationFrames:
-    """All frames of a capture.
+    """Open all frames of a capture.
 
     Args:
-        wanted: What the user named.
-        person: The body of the avatar, as a file, to which the poses are brought.
-        size_px: Longer side; None for their own.
+        inputs: Inputs as the user named them.
+        body_file: Body of the avatar, to which poses are retargeted.
+        size_px: Longer side; None for the original size.
 
     Raises:
-        InputError: If a part is missing or does not fit.
+        InputError: If a part is missing or does not match the others.
     """
     return EvaluationFrames(recording=open_capture(inputs, size_px=size_px, avatar_body=body_file))
 
 
 def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
-    """The frames that a run has kept for scores, read again from where it read them.
+    """Open the held-out frames of a run from its original capture.
 
     Raises:
-        InputError: If its report, or what it read, is not there any more.
+        InputError: If its report or its capture is missing.
     """
     report = read_report(run)
     given = _run_arguments(report, run)
     if given.live or str(given.video).startswith("camera:"):
         raise InputError(
-            f"{run.path} was learnt from a live source, which nobody kept. Name another capture of "
-            "the same person with --on."
+            f"{run.path} was trained from a live source, which was not recorded. Pass another "
+            "capture of the same person with --on."
         )
-    wanted = given.capture_inputs()
+    inputs = given.capture_inputs()
     if given.cameras == "solve" and run.cameras.is_file():
-        wanted = replace(wanted, cameras=str(run.cameras), poses=run.poses)
+        inputs = replace(inputs, cameras=str(run.cameras), poses=run.poses)
     person = run.body_file if run.body_file.is_file() else None
-    recording = open_capture(wanted, avatar_body=person)
+    recording = open_capture(inputs, avatar_body=person)
     own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
     numbers = report["held_out"]["frames"]
     if not numbers:
         raise InputError(
-            f"{run.path} has held out no frame, so there is nothing to score it on. Name another "
-            "capture of the same person with --on."
+            f"{run.path} has no held-out frames. Pass another capture of the same person with --on."
         )
     return EvaluationFrames(
         recording=replace(recording, size_px=size_px or own_px), frame_indices=frozenset(numbers)
@@ -99,13 +99,13 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
 
 
 def trained_longer_side_px(run: RunFolder) -> int | None:
-    """Longer side of the pictures that a run has learnt from; None if nobody knows."""
+    """Return the longer side of a run's training images; None if unknown."""
     size = read_report(run)["held_out"].get("size") if run.report_json.is_file() else None
     return max(size) if size else None
 
 
 def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
-    """Whether a run's report says that it was trained for the steps, or else the seconds."""
+    """Whether a run was trained for the steps, or else for the seconds, by its report."""
     if not (run.has_checkpoint() and run.report_json.is_file()):
         return False
     training = read_report(run)["training"]
@@ -113,10 +113,10 @@ def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
 
 
 def read_report(run: RunFolder) -> dict[str, Any]:
-    """A run's report.json.
+    """Read a run's report.json.
 
     Raises:
-        InputError: If there is none, or it is damaged.
+        InputError: If it is missing or damaged.
     """
     try:
         report = json.loads(run.report_json.read_text(encoding="utf-8"))
@@ -125,18 +125,18 @@ def read_report(run: RunFolder) -> dict[str, Any]:
         raise KeyError("command")
     except FileNotFoundError as error:
         raise InputError(
-            f"{run.path} holds no {run.report_json.name}, which says what it was learnt from: finish "
-            "the run (ia-ingest … --resume), or name a capture with --on."
+            f"{run.path} holds no {run.report_json.name}, which names its capture: finish the run "
+            "(ia-ingest … --resume), or pass a capture with --on."
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{run.report_json} is no report that ia-ingest wrote ({type(error).__name__}: {error}). "
-            "Let the run write it again (ia-ingest … --resume), or give both --on and --size."
+            f"{run.report_json} is not a report of ia-ingest ({type(error).__name__}: {error}). "
+            "Rewrite it (ia-ingest … --resume), or pass both --on and --size."
         ) from error
 
 
 def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
-    """The arguments of the run; paths that were relative are looked for near it, too."""
+    """Restore the arguments of the run; relative paths are searched for near it as well."""
     known = {item.name for item in fields(IngestArguments)}
     words = {key: value for key, value in report["command"].items() if key in known}
     try:
@@ -144,7 +144,7 @@ def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
         given = IngestArguments(**words)
     except TypeError as error:
         raise InputError(
-            f"{run.report_json} does not say what was learnt from; name a capture with --on."
+            f"{run.report_json} does not name the capture; pass one with --on."
         ) from error
     base = _original_working_folder(given, run)
     near = {key: base / words[key] for key in PATH_ARGUMENTS if words.get(key) is not None}
@@ -154,7 +154,7 @@ def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
 
 
 def _original_working_folder(arguments: IngestArguments, run: RunFolder) -> Path:
-    """Where the command was run: here, or where its --out was this folder."""
+    """Return the folder that the command was run in: here, or where --out is this folder."""
     if arguments.video.exists() or arguments.out is None or arguments.out.is_absolute():
         return Path()
     above = Path(os.path.abspath(run.path))

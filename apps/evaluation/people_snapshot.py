@@ -1,8 +1,8 @@
-"""The paper's protocol on PeopleSnapshot: which frames are learnt, which are scored, what came out.
+"""PeopleSnapshot protocol of InstantAvatar: training and test frames, and the paper's scores.
 
-InstantAvatar (Jiang et al. 2023), Tab. 1, which follows Anim-NeRF (Chen et al. 2021): frames of one
-turn are learnt from for a minute, frames of another are scored, whole and on white, in poses that
-are fitted to them with the avatar frozen. The data has to be asked for from its makers.
+InstantAvatar (Jiang et al. 2023), Tab. 1, follows Anim-NeRF (Chen et al. 2021): train on frames of
+one turn for a minute, score whole frames of another turn on white, in poses fitted to them with the
+avatar frozen. The data set is available from its authors on request.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,13 @@ from pathlib import Path
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSubject:
-    """A subject of the dataset.
+    """A subject of the data set.
 
     Attributes:
-        name: Of its folder.
-        train, test: Frames, START:STOP:STEP counted from 0.
-        paper: InstantAvatar's own figures after a minute, at 540 px.
+        name: Name of its folder.
+        train: Training frames, START:STOP:STEP counted from 0.
+        test: Test frames, START:STOP:STEP counted from 0.
+        paper: InstantAvatar's scores after a minute, at 540 px.
     """
 
     name: str
@@ -51,13 +52,15 @@ SUBJECTS = (
         paper={"psnr": 27.97, "ssim": 0.9649},
     ),
 )
+"""Subjects of the paper's table."""
 LONGER_SIDE_PX = 540
+"""Longer side of the paper's images."""
 TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_nerf_test.npz")
-"""Anim-NeRF's poses, a row for each frame of the list; where they are not, poses.npz serves."""
+"""Anim-NeRF's poses, one row per listed frame; poses.npz replaces missing ones."""
 
 
 def find_subjects(folder: Path) -> list[tuple[DatasetSubject, Path]]:
-    """The subjects that lie in a folder, or the one that it is."""
+    """Find the subjects in a folder, which may be a subject itself."""
     found = []
     for subject in SUBJECTS:
         for place in (folder / subject.name, folder):
@@ -68,5 +71,5 @@ def find_subjects(folder: Path) -> list[tuple[DatasetSubject, Path]]:
 
 
 def subject_poses(folder: Path, relative_path: Path) -> Path | None:
-    """Poses of one list of frames, if they lie there; None leaves it to the capture folder."""
+    """Return the poses of a list of frames; None to use those of the capture folder."""
     return folder / relative_path if (folder / relative_path).is_file() else None

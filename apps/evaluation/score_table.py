@@ -1,7 +1,4 @@
-"""Pictures of an avatar beside the frames that they should show: one row of a table each way.
-
-Evaluations as a table: aligned for the eye, and Markdown as it stands.
-"""
+"""Scores of an avatar by renderer and poses, as an aligned Markdown table and as JSON."""
 
 import json
 import time
@@ -18,21 +15,22 @@ from avatar.evaluation.sharpness import SharpnessVerdict, overall_verdict
 from preprocess.observation import Observation
 
 PremultipliedImage = Float32[np.ndarray, "height width 4"]
+"""RGBA with premultiplied alpha."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameScore:
-    """How close one picture comes to its frame, both on white.
+    """Scores of one rendering against its frame, both on white.
 
     Attributes:
-        frame: Its number in the video.
-        psnr: Of the whole picture, dB.
-        psnr_mask: Where alpha > 0.5, dB.
-        psnr_box: In the smallest upright box around that, dB.
-        ssim: Of the whole picture (Wang et al. 2004), in [-1, 1].
-        blur: Equivalent blur, as a share of the person's height (`avatar.evaluation.sharpness`).
-        overlap: Of the drawn alpha with the mask, in [0, 1].
-        cpu_ms: What the picture took, of all the process's threads.
+        frame: Frame number in the video.
+        psnr: PSNR of the whole image, dB.
+        psnr_mask: PSNR where alpha > 0.5, dB.
+        psnr_box: PSNR in the bounding box of the mask, dB.
+        ssim: SSIM of the whole image (Wang et al. 2004), in [-1, 1].
+        blur: Equivalent blur, as a fraction of body height (`avatar.evaluation.sharpness`).
+        overlap: Soft IoU of rendered alpha and mask, in [0, 1].
+        cpu_ms: CPU time of rendering, over all threads.
     """
 
     frame: int
@@ -46,16 +44,17 @@ class FrameScore:
 
 
 METRICS = ("psnr", "psnr_box", "psnr_mask", "ssim", "cpu_ms")
+"""Fields of `FrameScore` that are averaged."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRow:
-    """One way to draw an avatar, scored.
+    """Scores of one renderer with one kind of poses.
 
     Attributes:
         renderer: "renderer", "player hq" or "player lite".
         poses: "given" or "fitted".
-        scores: One for each frame.
+        scores: Scores of each frame.
     """
 
     renderer: str
@@ -63,16 +62,16 @@ class ScoreRow:
     scores: list[FrameScore] = field(default_factory=list)
 
     def mean_of(self, name: str) -> float | None:
-        """The mean of one of `METRICS` over the frames; None if no frame has it."""
+        """Return the mean of one of `METRICS` over the frames; None without finite values."""
         return finite_mean([getattr(score, name) for score in self.scores])
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
-        """What the figures mean, in a word; None without a silhouette to look at."""
+        """Verdict on the frames; None without a silhouette."""
         return overall_verdict(self.scores)
 
     def as_json(self) -> dict[str, object]:
-        """Means, then every frame."""
+        """Return means, then the scores of every frame."""
         return {
             "renderer": self.renderer,
             "poses": self.poses,
@@ -87,14 +86,14 @@ class ScoreRow:
 
 @dataclass(frozen=True, kw_only=True)
 class AvatarEvaluation:
-    """An avatar's rows.
+    """Scores of an avatar on a capture.
 
     Attributes:
-        name: By which the table calls it.
-        capture: What it was compared with.
-        size: Of the pictures, width and height; None if there was none.
-        rows: At least one.
-        paper: The same figures as the paper has them, where it does.
+        name: Name of the avatar in the table.
+        capture: Path of the video.
+        size: Width and height of the images; None without any.
+        rows: Scores by renderer and poses, at least one.
+        paper: Scores in the paper, if the subject is in it.
     """
 
     name: str
@@ -104,7 +103,7 @@ class AvatarEvaluation:
     paper: dict[str, float] | None = None
 
     def as_json(self) -> dict[str, object]:
-        """For machines."""
+        """Return the scores as JSON."""
         return {
             "avatar": self.name,
             "capture": self.capture,
@@ -118,11 +117,11 @@ class AvatarEvaluation:
 def score_frame(
     observation: Observation, render_image: Callable[[], PremultipliedImage]
 ) -> FrameScore:
-    """Draws a picture and compares it with the frame.
+    """Render a frame's pose and compare the image with the frame.
 
     Args:
-        seen: The frame.
-        draw: Makes the picture, premultiplied.
+        observation: The frame.
+        render_image: Renders with premultiplied alpha.
     """
     started = time.process_time()
     picture = render_image()
@@ -141,13 +140,13 @@ def score_frame(
 
 
 def evaluations_to_json(evaluations: Iterable[AvatarEvaluation]) -> str:
-    """The text of the file that --json names."""
+    """Return the content of the file for --json."""
     content = {"format": 1, "avatars": [each.as_json() for each in evaluations]}
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 def _bounding_box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """Rows and columns of the smallest box around it; empty around nothing."""
+    """Return rows and columns of the bounding box; empty for an empty silhouette."""
     spans = []
     for axis in (1, 0):
         where = np.flatnonzero(silhouette.any(axis=axis))
@@ -164,13 +163,15 @@ HEADER = (
     "looks",
 )  # fmt: skip
 LEFT_ALIGNED_COLUMNS = (0, 2, 3, 9)
-"""Columns that are aligned to the left."""
+"""Columns of the table that are left-aligned."""
 FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f", "cpu_ms": ".0f"}
+"""Format of each metric in the table."""
 PAPER_ROW_NAME = "InstantAvatar (paper)"
+"""Renderer of the rows with the paper's scores."""
 
 
 def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
-    """All rows of all avatars, and their means where several were evaluated alike."""
+    """Return all rows of all avatars, and their means over several avatars, as Markdown."""
     lines = [HEADER]
     for each in evaluations:
         lines += [_row_cells(each.name, row) for row in each.rows]
@@ -201,14 +202,14 @@ def _row_cells(name: str, row: ScoreRow) -> tuple[str, ...]:
 
 
 def _paper_cells(each: AvatarEvaluation) -> tuple[str, ...]:
-    """The paper's own row, beside ours."""
+    """Return the cells of the paper's scores."""
     assert each.paper is not None
     figures = (_format_cell(each.paper.get(figure), form) for figure, form in FORMATS.items())
     return (each.name, "", PAPER_ROW_NAME, "fitted", *figures, "")
 
 
 def _mean_rows(evaluations: Sequence[AvatarEvaluation]) -> list[tuple[str, ...]]:
-    """For each way to draw that all avatars have, the mean of their means."""
+    """Return the mean over avatars for each renderer and kind of poses that all of them have."""
     ways = [(row.renderer, row.poses) for row in evaluations[0].rows]
     lines = []
     for way in ways:

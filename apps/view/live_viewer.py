@@ -1,4 +1,4 @@
-"""Tends the page between steps: draws the avatar for whoever looks, holds still, saves packages."""
+"""Live viewer: renders the avatar between training steps, pauses training, saves packages."""
 
 import time
 from typing import final
@@ -24,30 +24,40 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 
-RENDER_TIME_SHARE, IDLE_RENDER_TIME_SHARE = 0.1, 0.9
-"""Of the time, how much the page may take: while the avatar learns, and while it does not."""
-MOVING_HEIGHT_PX, RESTING_HEIGHT_PX, IDLE_HEIGHT_PX = 160, 360, 720
-"""Height of the picture: while something moves, at rest, and at rest while nothing is learnt."""
+RENDER_TIME_SHARE = 0.1
+"""Fraction of the time that the page may take during training."""
+IDLE_RENDER_TIME_SHARE = 0.9
+"""Fraction of the time that the page may take while training is paused or done."""
+MOVING_HEIGHT_PX = 160
+"""Height of the image while camera or pose move."""
+RESTING_HEIGHT_PX = 360
+"""Height of the image at rest, during training."""
+IDLE_HEIGHT_PX = 720
+"""Height of the image at rest while training is paused or done."""
 REST_DELAY_S = 0.4
-PANEL_INTERVAL_S, MAP_INTERVAL_S = 0.25, 1.0
+"""Time without motion after which the image counts as at rest, seconds."""
+PANEL_INTERVAL_S = 0.25
+"""Interval of updates of the panel, seconds."""
+MAP_INTERVAL_S = 1.0
+"""Interval of updates of the coverage map, seconds."""
 
 
 @final
 class LiveViewer:
-    """Looks on for a browser; a `TrainingObserver`.
+    """A `TrainingObserver` that shows training in browsers.
 
     Attributes:
-        page: What it looks after.
+        page: The page in the browsers.
     """
 
     def __init__(self, recording: Capture, run: RunFolder, console: Console, port: int) -> None:
-        """Opens the page and says where.
+        """Open the page and print its address.
 
         Args:
-            recording: What is learnt from.
-            run: Where packages go.
-            console: Where it says what it does.
-            port: Tried first.
+            recording: Capture that is trained on.
+            run: Folder for packages.
+            console: Shows messages.
+            port: First port to try.
         """
         self._recording, self._run, self._console = recording, run, console
         self._poser = PreviewPoses(recording)
@@ -61,21 +71,21 @@ class LiveViewer:
         self._posed_at = 0.0
         self._shown_observation: Observation | None = None
         self._finished, self._note = False, ""
-        console.info(f"Watch it learn: {self.page.address}")
+        console.info(f"Live viewer: {self.page.address}")
 
     def on_frame(self, observation: Observation, *, held_out: bool) -> None:
-        """Shows it, soon."""
+        """Keep the newest frame for the next update."""
         self._newest_observation = observation
 
     def on_event(self, event: TrainEvent) -> None:
-        """Scores are shown at once, and the end; all else can wait for its turn."""
+        """Update the panel at once for scores and for the end of training."""
         if isinstance(event, Evaluated | Finished):
             self._next_panel = 0.0
         self._finished = isinstance(event, Finished)
 
     def between_steps(self, session: ObservableSession) -> None:
-        """Takes a tenth of the time at most, except while somebody has paused or saves."""
-        what = "Writing the package, after" if self._finished else "Learning,"
+        """Update the page within its share of the time; pause or save if requested."""
+        what = "Writing the package, after" if self._finished else "Training,"
         self._update_page(session, f"{what} {self._progress_text(session)}", idle=False)
         if self.page.save_requested:
             with session.trainer.paused():
@@ -85,7 +95,7 @@ class LiveViewer:
                 self._wait_while_paused(session)
 
     def serve_until_interrupt(self, session: ObservableSession) -> None:
-        """Keeps the page after the end, until Ctrl-C."""
+        """Keep the page open after training, until Ctrl-C."""
         self.page.disable_controls()
         status = f"Done after {session.trainer.wall_seconds:.0f} s"
         self._note = f"The avatar: {self._run.package}"
@@ -95,7 +105,7 @@ class LiveViewer:
                 self._update_page(session, status, idle=True)
 
     def close(self) -> None:
-        """Takes the page down."""
+        """Close the page."""
         self.page.close()
 
     def _progress_text(self, session: ObservableSession) -> str:
@@ -103,7 +113,7 @@ class LiveViewer:
         return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
 
     def _wait_while_paused(self, session: ObservableSession) -> None:
-        """Nothing is learnt until somebody resumes, or Ctrl-C ends everything."""
+        """Wait until the user resumes training, or presses Ctrl-C."""
         self._next_panel = 0.0
         status = f"Paused after {self._progress_text(session)}"
         while self.page.paused and not session.stop_requested:
@@ -114,11 +124,11 @@ class LiveViewer:
         self._next_panel = 0.0
 
     def _save_package(self, session: ObservableSession) -> None:
-        """Writes the package as the avatar stands."""
+        """Write the avatar in its current state as a package."""
         self.page.save_requested = False
         trainer, mark = session.trainer, session.curve[-1] if session.curve else None
         if not trainer.steps:
-            self.page.notify("Not yet", "Nothing has been learnt so far.")
+            self.page.notify("Not yet", "Training has not started.")
             return
         try:
             views = validation_views(session.held_out, self._recording)
@@ -131,13 +141,14 @@ class LiveViewer:
         if taken.export_report is None:
             self.page.notify("No package yet", taken.refusal or "")
             return
-        size = f"{taken.export_report.bytes / 1e6:.1f} MB after {trainer.wall_seconds:.0f} s of training"
-        notes = " ".join([f"{self._run.package}: {size}.", *taken.export_report.warnings])
+        exported = taken.export_report
+        size = f"{exported.bytes / 1e6:.1f} MB after {trainer.wall_seconds:.0f} s of training"
+        notes = " ".join([f"{self._run.package}: {size}.", *exported.warnings])
         self.page.notify("Package saved", notes)
-        self._console.info(f"Saved from the page: {self._run.package}, {size}.")
+        self._console.info(f"Saved from the live viewer: {self._run.package}, {size}.")
 
     def _update_page(self, session: ObservableSession, status: str, *, idle: bool) -> None:
-        """Brings the page up to date, as far as it is time to."""
+        """Update the parts of the page that are due."""
         now = time.perf_counter()
         if now >= self._next_panel:
             self._next_panel = now + PANEL_INTERVAL_S
@@ -157,20 +168,20 @@ class LiveViewer:
         last = session.curve[-1] if session.curve else None
         psnr = None if last is None else last.psnr
         word = provisional_verdict(None if last is None else last.verdict)
-        held_out = f"held out: {word}" if word else "held out"
+        held_out = f"held-out PSNR: {word}" if word else "held-out PSNR"
         self.page.show_status(
             status,
             [
                 (f"{trainer.frames_seen}", "frames"),
                 (f"{trainer.steps:,}", "steps"),
-                (format_percent(session.coverage.seen_share), "seen"),
+                (format_percent(session.coverage.seen_share), "coverage"),
                 ("none yet" if psnr is None else f"{psnr:.1f} dB", held_out),
             ],
             note=self._note,
         )
         self.page.show_curve(session.curve)
         if self.page.pose_choice != NEWEST or not trainer.steps:
-            self._show_frame(self._newest_observation)  # else it comes with its picture
+            self._show_frame(self._newest_observation)  # otherwise shown with its rendering
 
     def _show_frame(self, newest: Observation | None) -> None:
         if newest is not None and newest is not self._shown_observation:
@@ -187,7 +198,7 @@ class LiveViewer:
         self.page.show_coverage(coverage_advice(coverage), self._body_map.svg())
 
     def _render_next_view(self, session: ObservableSession, *, idle: bool) -> bool:
-        """Draws for the browser that has waited longest; whether any needed it."""
+        """Render for the browser that has waited longest; return whether any needed it."""
         now = time.perf_counter()
         looks = self.page.browser_cameras()
         for gone in self._shown.keys() - looks.keys():
@@ -221,7 +232,7 @@ class LiveViewer:
     def _correspondence_grid(
         self, session: ObservableSession, pose: BodyPose, now: float
     ) -> CorrespondenceGrid:
-        """The pose's warp; solved anew only if the pose has changed."""
+        """Return the pose's correspondence grid; solved again only if the pose has changed."""
         if self._cells is None or not np.array_equal(
             self._cells[0].joint_rotations, pose.joint_rotations
         ):
@@ -231,7 +242,7 @@ class LiveViewer:
 
 
 def _letterbox(rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-    """A frame in the middle of a strip that is as wide as the panel."""
+    """Center a frame in a strip as wide as the panel."""
     width, height = FRAME_PX
     scale = min(height / rgb.shape[0], width / rgb.shape[1])
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR

@@ -1,7 +1,7 @@
-"""Which pose the page shows: the newest frame's, standing still, the filmed motion, or a dance.
+"""Poses of the live viewer: the newest frame's, standing, the filmed motion, or a dance.
 
-All poses are brought to the page's world: the pelvis at its origin, y up, and the camera that
-filmed looks along -z. So the browser's first look shows the person as the video does.
+All poses are in the page's world: pelvis at the origin, y up, and the filming camera looks along
+-z, so that the initial view shows the person as the video does.
 """
 
 from typing import final
@@ -17,29 +17,31 @@ from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 
 NEWEST, STANDING, FILMED, DANCE = "Newest", "Standing", "Filmed", "Dance"
+"""Labels of the buttons."""
 POSE_CHOICES = (NEWEST, STANDING, FILMED, DANCE)
+"""Buttons in order."""
 DEFAULT_FPS = 30.0
-"""Of a motion that does not say how fast it is."""
+"""Frame rate of a motion without times."""
 
 
 @final
 class PreviewPoses:
-    """Poses for the page, by choice and time."""
+    """Poses by the user's choice and by time."""
 
     def __init__(self, recording: Capture) -> None:
-        """For one person and the motion that was filmed."""
+        """Take body and filmed motion from a capture."""
         self._pelvis = recording.shaped.joints[0]
         self._cameras = recording.cameras
         self._filmed, self._dance = recording.motion, demo_motion()
         self._valid = np.flatnonzero(recording.motion.valid)
 
     def pose_at(self, choice: str, seconds: float, newest: Observation | None) -> BodyPose:
-        """The pose to show.
+        """Return the pose to show.
 
         Args:
             choice: One of `POSE_CHOICES`.
-            seconds: Since the motion began; motions start again at their end.
-            newest: The frame that came last.
+            seconds: Time since the motion started; motions are looped.
+            newest: The newest frame; None before the first.
         """
         if choice == FILMED:
             place = np.searchsorted(self._valid, _row_at(self._filmed, seconds))
@@ -58,13 +60,13 @@ class PreviewPoses:
         return self._center_on_pelvis(standing.root_rotation, standing)
 
     def _camera_of_row(self, row: int) -> Camera:
-        """The camera that filmed a row of the motion."""
+        """Return the camera that filmed a row of the motion."""
         frames, track = self._filmed.frames, self._cameras
         frame = row if frames is None else int(frames[row])
         return track[min(frame, len(track.cameras) - 1)]
 
     def _align_to_camera(self, pose: BodyPose, camera: Camera) -> BodyPose:
-        """Turned so that the page's camera sees what this camera saw."""
+        """Rotate a pose so that the page's camera sees what the filming camera saw."""
         page_from_camera = np.diag([1.0, -1.0, -1.0])
         turned = page_from_camera @ camera.camera_from_world[:3, :3]
         return self._center_on_pelvis(
@@ -72,7 +74,7 @@ class PreviewPoses:
         )
 
     def _center_on_pelvis(self, root_rotation: np.ndarray, pose: BodyPose) -> BodyPose:
-        """The pelvis at the origin: the root turns about its rest place J0."""
+        """Move the pelvis to the origin: the root rotates about its rest position J0."""
         return BodyPose(
             root_rotation=root_rotation,
             root_translation=-self._pelvis,
@@ -81,7 +83,7 @@ class PreviewPoses:
 
 
 def _row_at(motion: Motion, seconds: float) -> int:
-    """The row of a motion that is shown after so many seconds."""
+    """Return the row of a motion that is shown after `seconds`."""
     times = motion.times_s
     if times is None or len(times) < 2 or not np.isfinite(times).all() or times[-1] <= times[0]:
         return int(seconds * DEFAULT_FPS) % len(motion)
@@ -90,7 +92,7 @@ def _row_at(motion: Motion, seconds: float) -> int:
 
 
 def _axis_angle(rotation: np.ndarray) -> np.ndarray:
-    """The axis-angle of a rotation matrix."""
+    """Convert a rotation matrix to axis-angle."""
     import cv2
 
     vector, _ = cv2.Rodrigues(rotation)

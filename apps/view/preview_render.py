@@ -1,4 +1,4 @@
-"""What a browser's camera sees: its pose as a Camera, and the avatar drawn for it on paper."""
+"""Rendering of the avatar for a browser's camera."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
 BACKGROUND_RGB = (251, 250, 247)
-"""The colour that everything stands on; report.html's."""
+"""Background color of the page, as in report.html."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BrowserCamera:
-    """Where a browser's camera is, as viser says it (OpenCV axes).
+    """Camera of a browser, as viser reports it (OpenCV axes).
 
     Attributes:
         world_from_camera: Rotation.
-        position: In the world, metres.
-        fov: From the picture's top to its bottom, radians.
+        position: Position in the world, meters.
+        fov: Vertical field of view, radians.
         aspect: Width over height.
-        moved_at: When it moved last, on `time.perf_counter`'s clock.
+        moved_at: Time of its last motion, on `time.perf_counter`'s clock.
     """
 
     world_from_camera: Float[np.ndarray, "3 3"]
@@ -34,7 +34,7 @@ class BrowserCamera:
     moved_at: float
 
     def to_camera(self, height_px: int) -> Camera:
-        """The same as a camera whose picture is so high."""
+        """Convert to a camera with this image height."""
         width_px = max(1, round(height_px * self.aspect))
         focal = 0.5 * height_px / np.tan(0.5 * self.fov)
         camera_from_world = np.eye(4)
@@ -51,13 +51,13 @@ class BrowserCamera:
 def render_preview(
     avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The avatar, as learnt so far, on paper.
+    """Render the avatar in its current state over the page's background.
 
     Args:
-        avatar: Who.
-        pose: In the camera's world.
-        camera: Also says how large the picture is.
-        cells: The pose's warp.
+        avatar: The avatar.
+        pose: Pose in the camera's world.
+        camera: Also defines the image size.
+        cells: Correspondence grid of the pose.
     """
     rgba = render(avatar, pose, camera, cells=cells)
     mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(

@@ -1,4 +1,4 @@
-"""The page itself: a picture that a browser's camera looks at, and a panel beside it (viser)."""
+"""Page of the live viewer (viser): the rendered avatar and a panel."""
 
 import io
 import logging
@@ -20,52 +20,54 @@ if TYPE_CHECKING:  # an optional extra, loaded when the page is opened
     import viser  # pyright: ignore[reportMissingImports]
 
 HOST = "127.0.0.1"
+"""Loopback address: only browsers of this machine reach the page."""
 PANEL_PX = 380
+"""Width of the panel."""
 FRAME_PX = (720, 440)
-"""Width and height that a frame in the panel must fit into; it is shown at half of that."""
+"""Largest width and height of a frame in the panel, which shows it at half the size."""
 TEAL, ORANGE = "#1f6f8b", "#c8742b"
+"""Colors of the curves: whole image, and inside the mask."""
 CURVE_TITLE = (
-    "<h2>Frames it never trains on: mean of those so far, dB over seconds</h2>"
-    f'<p class="legend"><i style="background:{TEAL}"></i>whole picture'
+    "<h2>Held-out PSNR (dB) over training time (s)</h2>"
+    f'<p class="legend"><i style="background:{TEAL}"></i>whole image'
     f'<i style="background:{ORANGE}"></i>inside the mask</p>'
 )
+"""Title and legend of the learning curve."""
 INITIAL_FOV_RAD, INITIAL_DISTANCE_M = 0.6, 3.7
-"""Of the first look: a standing person fills four fifths of the picture's height."""
+"""Initial field of view and distance: a standing person fills 80 % of the image height."""
 CENTER_ABOVE_PELVIS_M = -0.08
-"""How far a person's middle is above the pelvis."""
+"""Height of a person's center above the pelvis."""
 
 
 @final
 class ViserPage:
-    """What is on the page, and what those who look at it have asked for.
+    """Content of the page, and requests of its users.
 
-    Buttons are pressed on viser's own threads; here that only sets a field, which whoever tends
-    the page reads when it suits.
+    Buttons are handled on viser's threads, where they only set fields that `LiveViewer` reads.
 
     Attributes:
-        paused: Whether training should hold still.
-        saving: Whether somebody has asked for the package.
-        choice: Which poses are to be shown (`POSE_CHOICES`).
-        chosen_at: When that was chosen, on `time.perf_counter`'s clock.
+        paused: Whether training should pause.
+        save_requested: Whether the user has requested a package.
+        pose_choice: Poses to show, one of `POSE_CHOICES`.
+        chosen_at: Time of that choice, on `time.perf_counter`'s clock.
     """
 
     def __init__(self, name: str, port: int) -> None:
-        """Opens the page, on this machine alone.
+        """Serve the page on the loopback address.
 
         Args:
-            name: Of what is learnt.
-            port: Tried first; the next free one is taken. 0 for any.
+            name: Name of the capture.
+            port: First port to try; the next free one is used. 0 for any.
         """
         from viser import ViserServer  # pyright: ignore[reportMissingImports]
 
         self.paused = self.save_requested = False
         self.pose_choice, self.chosen_at = NEWEST, time.perf_counter()
         self._browser_cameras: dict[int, BrowserCamera] = {}
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # who hangs up is no error
-        with redirect_stdout(io.StringIO()):  # viser greets there
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # connections may close
+        with redirect_stdout(io.StringIO()):  # viser prints a banner
             self._server = ViserServer(host=HOST, port=port, label=name, verbose=False)
-        # no button asks for a public tunnel, and nobody else may: any page that a browser has
-        # open can talk to this machine
+        # never open a public tunnel: any page in the browser could request it
         self._server.request_share_url = lambda verbose=True: None
         self._configure_theme()
         self._build_panel(name)
@@ -74,15 +76,15 @@ class ViserPage:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """Address for a browser."""
         return f"http://{HOST}:{self._server.get_port()}"
 
     def browser_cameras(self) -> dict[int, BrowserCamera]:
-        """Where the camera of each browser is, by the browser's number."""
+        """Return the camera of each browser, by client number."""
         return dict(self._browser_cameras)
 
     def show_render(self, browser: int, image: UInt8[np.ndarray, "height width 3"]) -> None:
-        """What one browser's camera sees."""
+        """Show a rendering in one browser."""
         client = self._server.get_clients().get(browser)
         if client is not None:
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=88)
@@ -90,7 +92,7 @@ class ViserPage:
     def show_status(
         self, status: str, figures: Sequence[tuple[str, str]], *, note: str = ""
     ) -> None:
-        """What is going on, in a few words, a few figures with their names, and a line besides."""
+        """Show the state of training, values with their names, and a note."""
         cells = "".join(
             f"<div><b>{escape(v)}</b><span>{escape(n)}</span></div>" for v, n in figures
         )
@@ -100,12 +102,12 @@ class ViserPage:
         )
 
     def show_frame(self, picture: UInt8[np.ndarray, "height width 3"]) -> None:
-        """The newest frame."""
+        """Show the newest frame."""
         self._frame.image = picture
         self._frame.visible = True
 
     def show_curve(self, curve: Sequence[CurvePoint]) -> None:
-        """Scores of held-out frames so far."""
+        """Show the learning curve."""
         points = [(p.wall_seconds, p.psnr, p.psnr_mask) for p in curve if p.psnr is not None]
         if points:
             table = np.array([[np.nan if v is None else v for v in row] for row in points])
@@ -113,21 +115,21 @@ class ViserPage:
             self._curve.visible = self._curve_title.visible = True
 
     def show_coverage(self, sentence: str, body_map: str) -> None:
-        """What has been seen, and what to do about it."""
+        """Show the coverage map with its advice."""
         self._coverage.content = _html(f'<p class="advice">{escape(sentence)}</p>{body_map}')
 
     def notify(self, title: str, message: str) -> None:
-        """A note that goes away by itself."""
+        """Show a notification for a few seconds."""
         for client in self._server.get_clients().values():
             client.add_notification(title, message, auto_close_seconds=6.0)
 
     def disable_controls(self) -> None:
-        """Nothing is learnt any more: what no longer does anything is taken away."""
+        """Hide the controls of training after its end."""
         self.paused = self.save_requested = False
         self._pause.visible = self._save.visible = False
 
     def close(self) -> None:
-        """Takes the page down."""
+        """Close the page."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -169,7 +171,7 @@ class ViserPage:
             data=(np.zeros(1), np.zeros(1), np.zeros(1)),
             series=(
                 {"label": "s"},
-                {"label": "whole picture", "stroke": TEAL, "width": 2},
+                {"label": "whole image", "stroke": TEAL, "width": 2},
                 {"label": "inside the mask", "stroke": ORANGE, "width": 2},
             ),
             scales={"x": {"time": False}},
@@ -186,7 +188,7 @@ class ViserPage:
             self._update_browser_camera(client)
 
         def moved(event: object) -> None:
-            """The first looks are from where viser puts a camera that knows no better."""
+            """Ignore updates until the camera has left viser's default position."""
             if client.client_id in self._browser_cameras or not np.allclose(
                 client.camera.position, begins_at
             ):
@@ -221,6 +223,6 @@ class ViserPage:
 
 
 def _html(content: str) -> str:
-    """Content in the page's own style."""
+    """Wrap content with the style of the page."""
     style = (files("apps") / "view" / "page.css").read_text(encoding="utf-8")
     return f'<style>{style}</style><div class="ia">{content}</div>'

@@ -47,7 +47,7 @@ def test_the_whole_person_is_in_the_views(rig):
         (lambda run, out: (out.parent, out), "checkpoint"),
         (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
         (lambda run, out: (run / "avatar.iavatar", out), "--to glb"),
-        (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "no folder"),
+        (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "does not exist"),
     ],
 )
 def test_what_cannot_be_done_is_said_and_nothing_is_written(

@@ -98,7 +98,7 @@ def test_without_poses_it_moves_all_the_same(call_play, package):
     outcome = call_play(package, "--size", 32, "--tier", "lite")
     assert outcome.code == 0
     assert outcome.out.strip() == str(package.parent / "avatar.webm")
-    assert "48 pictures" in outcome.err
+    assert "48 frames" in outcome.err
     (package.parent / "avatar.webm").unlink()
 
 
@@ -162,7 +162,7 @@ def test_ctrl_c_leaves_a_clip_that_plays(call_play, package, novel, tmp_path, mo
     assert outcome.code == 130
     with Image.open(out) as clip:
         assert 1 <= clip.n_frames < 12
-        assert f"Drew {clip.n_frames} pictures of 12" in outcome.err
+        assert f"Rendered {clip.n_frames} of 12 frames" in outcome.err
     assert [file.name for file in tmp_path.iterdir()] == ["clip.webp"]
 
 

@@ -29,7 +29,7 @@ def following(player):
 
 def middle(following, pose):
     """Where the camera looks at, in the world."""
-    camera = following.at(pose)
+    camera = following.camera_for(pose)
     away = following.viewpoint.distance_m or DISTANCE_HEIGHTS * following.height_m
     return camera.center_world + away * camera.camera_from_world[2, :3]
 
@@ -49,8 +49,8 @@ def middle(following, pose):
 def test_the_camera_stands_where_its_angles_say(player, following, wishes, direction):
     pose, camera = canonical_pose_of(player), following(**wishes, distance_m=2.0)
     pelvis = player.manifest.rest_joints[0]
-    at = pelvis + camera.middle_m * np.array([0.0, 1.0, 0.0])
-    place = camera.at(pose).center_world
+    at = pelvis + camera.center_above_pelvis_m * np.array([0.0, 1.0, 0.0])
+    place = camera.camera_for(pose).center_world
     np.testing.assert_allclose(place - at, 2.0 * np.array(direction), atol=1e-9)
 
 
@@ -59,7 +59,7 @@ def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player
     at = middle(following(), pose)
     for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}, {"orbit_deg": 9.0, "zoom": 3.0}):
         np.testing.assert_allclose(middle(following(**wishes), pose), at, atol=1e-9)
-        assert following(**wishes).at(pose).project(at) == pytest.approx([48.0, 48.0])
+        assert following(**wishes).camera_for(pose).project(at) == pytest.approx([48.0, 48.0])
 
 
 def test_a_turntable_goes_round_once_in_its_time(player, following):
@@ -67,14 +67,14 @@ def test_a_turntable_goes_round_once_in_its_time(player, following):
     turning = following(turn_period_s=8.0)
     for seconds, degrees in ((0.0, 0.0), (2.0, 90.0), (5.0, 225.0), (8.0, 0.0)):
         np.testing.assert_allclose(
-            turning.at(pose, seconds).camera_from_world,
-            following(orbit_deg=degrees).at(pose).camera_from_world,
+            turning.camera_for(pose, seconds).camera_from_world,
+            following(orbit_deg=degrees).camera_for(pose).camera_from_world,
             atol=1e-9,
         )
-    backwards = following(turn_period_s=-8.0).at(pose, 2.0)
+    backwards = following(turn_period_s=-8.0).camera_for(pose, 2.0)
     np.testing.assert_allclose(
         backwards.camera_from_world,
-        following(orbit_deg=-90.0).at(pose).camera_from_world,
+        following(orbit_deg=-90.0).camera_for(pose).camera_from_world,
         atol=1e-9,
     )
 
@@ -87,7 +87,7 @@ def test_a_close_up_keeps_its_joint_in_the_middle(player, following, bent_arm):
     assert at - elbow == pytest.approx(
         rotation_matrices(bent_arm.joint_rotations[17]) @ (rest[22] - rest[18]), abs=1e-9
     )
-    whole, close = following().at(bent_arm), left.at(bent_arm)
+    whole, close = following().camera_for(bent_arm), left.camera_for(bent_arm)
     assert close.focal_px[0] == pytest.approx(3.0 * whole.focal_px[0])
 
 
@@ -107,10 +107,12 @@ def test_a_zoom_and_a_shorter_way_make_the_person_larger(player, following):
     pose = canonical_pose_of(player)
 
     def height(camera):
-        rows = np.flatnonzero((player.render(pose, camera.at(pose))[..., 3] > 127).any(axis=1))
+        rows = np.flatnonzero(
+            (player.render(pose, camera.camera_for(pose))[..., 3] > 127).any(axis=1)
+        )
         return rows[-1] + 1 - rows[0]
 
-    usual, far = height(following(256)), following(256).at(pose).camera_from_world[2, 3]
+    usual, far = height(following(256)), following(256).camera_for(pose).camera_from_world[2, 3]
     assert height(following(256, zoom=0.5)) == pytest.approx(usual / 2, abs=2)
     assert height(following(256, distance_m=2.0 * far)) == pytest.approx(usual / 2, abs=3)
 
@@ -118,7 +120,7 @@ def test_a_zoom_and_a_shorter_way_make_the_person_larger(player, following):
 @pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])
 def test_the_whole_person_fits_into_every_shape(player, following, size):
     pose = canonical_pose_of(player)
-    alpha = player.render(pose, following(size).at(pose))[..., 3]
+    alpha = player.render(pose, following(size).camera_for(pose))[..., 3]
     assert alpha.shape == size[::-1]
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     assert not border.any()

@@ -325,7 +325,7 @@ def test_without_the_runtime_it_says_how_to_get_it(call_play, package, tmp_path,
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--web", "0"], "no port"),
+        (["--web", "0"], "but must be a port"),
         (["--web", "--bench"], "--bench"),
         (["--web", "--tier", "lite"], "--tier"),
         (["--web", "--size", "200"], "--size"),

@@ -116,7 +116,7 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
 def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
     _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
     assert (found["verdict"], found["cause"]) == ("good", "mask_polarity")
-    assert f"agree by {found['iou']['after_fix']:.2f}" in said
+    assert f"IoU of body and masks: {found['iou']['after_fix']:.2f}" in said
     assert "nothing needs to be done" in said
     assert "To correct it" not in said
 
@@ -137,12 +137,12 @@ def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_p
     assert [cure["cause"] for cure in found["corrections"]] == [cause]
     assert found["iou"]["now"] > 0.75
     assert found["film"]["now"] + 0.05 < found["film"]["after_fix"] > 0.7
-    assert "but not with the pictures" in said
+    assert "do not match the images" in said
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
     recording = open_capture(CaptureInputs(video=out))
     examined_again = check_opened_capture(recording)
     assert examined_again.causes == ()
-    assert examined_again.diagnosis.video.now > found["film"]["after_fix"] - 0.03
+    assert examined_again.diagnosis.video.score_before > found["film"]["after_fix"] - 0.03
     assert recording.source.frames_in_file == (36 if cause == "video_offset" else 40)
 
 
@@ -206,7 +206,7 @@ def test_without_masks_the_sheet_shows_the_body(spoilt, call_check, tmp_path):
     folder = spoilt(lambda folder: shutil.rmtree(folder / "masks"))
     _, said, found = call_check(folder)
     assert found["iou"]["now"] is None
-    assert "times as much as beside it" in said
+    assert "times as strong across it as beside it" in said
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
     orange = (sheet[..., 2] > 200) & (sheet[..., 0] < 60)
@@ -224,7 +224,7 @@ def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call
     _, said, found = call_check(folder)
     assert found["verdict"] == "warn"
     assert "12 of" in said
-    assert "They fit in the frames that have both" in said
+    assert "Poses and masks match where both exist" in said
 
 
 @pytest.mark.slow
@@ -264,7 +264,7 @@ def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
 def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check):
     code, said, _ = call_check(dancing, "--fix", tmp_path / "mended")
     assert code == 2
-    assert "No mistake" in said
+    assert "No correctable mistake" in said
     assert not (tmp_path / "mended").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("keep")

@@ -36,7 +36,7 @@ def raising(error):
         (RuntimeError("CUDA error: out of memory\nat line 3"), 3, "out of memory"),
         (PermissionError(errno.EACCES, "Permission denied", "/out"), 2, "/out"),
         (OSError(errno.ENAMETOOLONG, "File name too long", "xxx"), 2, "too long: xxx"),
-        (OSError(errno.ELOOP, "Too many levels of symbolic links", "a"), 2, "Name another place"),
+        (OSError(errno.ELOOP, "Too many levels of symbolic links", "a"), 2, "Choose another path"),
         (MemoryError(), 3, "memory"),
         (KeyboardInterrupt(), 130, "Ctrl-C"),
         (CommandExit("too [blurred]", 1), 1, "too [blurred]"),

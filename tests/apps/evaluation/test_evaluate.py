@@ -218,9 +218,9 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
     [
         (["{run}", "--frames", "0:5"], "--on"),
         (["{run}/avatar.iavatar"], "--on"),
-        (["{tmp}"], "no run"),
+        (["{tmp}"], "neither a run"),
         (["{tmp}/nothing"], "does not exist"),
-        (["{data}", "--on", "{film}"], "leave --on out"),
+        (["{data}", "--on", "{film}"], "omit --on"),
         (["{run}", "--size", "4"], "16 pixels"),
         (["{run}", "--on", "{film}", "--frames", "500:"], "frames"),
         (["{lost}"], "report.json"),

@@ -98,7 +98,7 @@ def test_an_added_video_of_another_body_is_refused(
     changed(other / "poses.npz", betas=np.full(10, 2.0))
     outcome = call_ingest(other, "--out", out, "--resume", *FEW)
     assert outcome.code == 2
-    assert "another body than these poses" in outcome.complaint()
+    assert "a different body than the avatar" in outcome.complaint()
     assert (out / "avatar.iavatar").exists()
 
 

@@ -57,16 +57,16 @@ def test_a_folder_where_a_file_should_be_is_named_before_any_work(tmp_path):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_for_reading_alone_is_named_before_any_work(tmp_path):
     tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match="cannot be written to"):
+    with pytest.raises(InputError, match="is not writable"):
         check_writable(tmp_path / "new" / "run", "--out")
     tmp_path.chmod(0o700)
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="there is no /proc here")
 def test_a_folder_that_cannot_be_made_is_found_before_any_work():
-    with pytest.raises(InputError, match="cannot be written to"):
+    with pytest.raises(InputError, match="is not writable"):
         RunFolder(path=Path("/proc/run")).check_usable([], resume=False, overwrite=False)
-    with pytest.raises(InputError, match="cannot be written to"):
+    with pytest.raises(InputError, match="is not writable"):
         check_output_file(Path("/proc/a.json"), "--json")
 
 
@@ -74,7 +74,8 @@ def test_a_folder_that_cannot_be_made_is_found_before_any_work():
     ("out", "clash"),
     [
         ("capture", "is"), ("capture/.", "is"), ("link", "is"), ("capture/run", "lies in"),
-        ("link/deep/run", "lies in"), ("capture/masks", "lies in"), (".", "holds"), ("", "holds"),
+        ("link/deep/run", "lies in"), ("capture/masks", "lies in"), (".", "contains"),
+        ("", "contains"),
     ],
 )  # fmt: skip
 def test_an_output_folder_is_no_input_and_none_lies_in_the_other(tmp_path, out, clash):
@@ -99,7 +100,7 @@ def test_what_is_advised_can_be_pasted_where_one_stands(tmp_path, monkeypatch):
 def test_a_folder_beside_an_input_file_is_apart(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"film")
     check_disjoint_from_inputs(tmp_path / "run", "--out", [tmp_path / "video.mp4"])
-    with pytest.raises(InputError, match="holds an input"):
+    with pytest.raises(InputError, match="contains an input"):
         check_disjoint_from_inputs(tmp_path, "--out", [tmp_path / "video.mp4"])
 
 

@@ -68,7 +68,7 @@ def test_somebody_watches_pauses_saves_and_lets_it_dance(film, tmp_path):
     with log.open("w") as file:
         process = subprocess.Popen([*command, "--seconds", "45", "--view", "0"], stderr=file)
     try:
-        until(lambda: "Watch it learn" in log.read_text(), 240.0)
+        until(lambda: "Live viewer" in log.read_text(), 240.0)
         address = re.search(r"http://127\.0\.0\.1:(\d+)", log.read_text())
         only_this_machine(int(address.group(1)))
         with Browser(tmp_path / "browser") as browser:
