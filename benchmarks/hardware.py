@@ -22,7 +22,7 @@ class Hardware:
         processor: As the machine calls it.
         cores: That this process may use.
         load: How many processes wanted a core in the last minute, before the measurement; above
-            a few tenths of `cores`, wall times are somebody else's, too.
+            a few tenths of `cores`, wall times include other programs.
         memory_gb: Of the machine.
         software: Versions.
     """

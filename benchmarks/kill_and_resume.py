@@ -59,7 +59,7 @@ def run_to_end(capture: Path, run: Path, *more: str) -> tuple[int, float, float]
 
 
 def kill_and_resume(capture: Path, run: Path, after_s: float) -> ResumedRun:
-    """Kills a run after so many seconds, reads what it left, and resumes it."""
+    """Kill a run after some seconds, read what it left, and resume it."""
     with subprocess.Popen(
         ingest_command(capture, run), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:

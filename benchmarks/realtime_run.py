@@ -64,7 +64,8 @@ def measure_realtime(capture: Path, run: Path) -> Iterator[Measurement]:
         context=f"in the mask {held['psnr_mask']:.2f}; {report['training']['steps']:,} steps, "
         f"{report['training']['rays_per_second'] / 1000:.0f} k rays/s; "
         f"{report['frames']['used']} frames trained on, {len(report['frames']['dropped'])} left "
-        f"out; {report['frames']['near_duplicates']} near-duplicates, {report['frames']['not_replayed']} not kept",
+        f"out; {report['frames']['near_duplicates']} near-duplicates, "
+        f"{report['frames']['not_replayed']} not kept",
     )
     yield Measurement(
         name="preparing a frame, p95, ms",

@@ -34,7 +34,7 @@ STEPS = 500
 
 
 def main(folder: Path) -> None:
-    # A film of somebody who does not exist; yours would be a video with poses and masks.
+    # Film a synthetic actor; your capture would be a video with poses and masks.
     film_capture(folder / "capture", ShootConfig(frames=48, size=96), overwrite=True)
 
     # Everything that is known about it, checked before a frame is read.

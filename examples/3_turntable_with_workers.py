@@ -52,7 +52,7 @@ def main(package: Path, moving: Path) -> None:
     shots = [(standing, camera_at(float(angle), middle)) for angle in angles]
 
     began = time.perf_counter()
-    pictures = list(player.render_all(shots, workers=2))  # in order, whoever draws them
+    pictures = list(player.render_all(shots, workers=2))  # in order
     seconds = time.perf_counter() - began
     print(f"{len(pictures)} pictures of {SIZE} px, {len(pictures) / seconds:.0f} a second")
 

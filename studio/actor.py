@@ -30,12 +30,13 @@ class Actor:
         betas: Its shape coefficients.
         shaped: The body underneath; `poses.npz` is about this one.
         outfit: What it wears.
-        rest: Vertices of all layers at rest, metres.
-        place: Where each vertex lies on the undressed template.
-        source: The body vertex that each vertex hangs from.
-        faces, kinds: Triangles, and what each is made of.
-        light: Painted light on each vertex.
-        palette: The outfit's colours, tinted by the seed.
+        rest_vertices: Vertices of all layers at rest, metres.
+        template_points: Where each vertex lies on the undressed template.
+        body_vertices: The body vertex that each vertex hangs from.
+        faces: Triangles.
+        materials: Material of each triangle.
+        baked_light: Painted light on each vertex.
+        palette: The outfit's colors, tinted by the seed.
     """
 
     betas: Float[np.ndarray, "10"]
@@ -47,11 +48,11 @@ class Actor:
     faces: Int32[np.ndarray, "faces 3"]
     materials: Int32[np.ndarray, "faces"]
     baked_light: Float32[np.ndarray, "vertices 3"]
-    palette: Float32[np.ndarray, "colours 3"]
+    palette: Float32[np.ndarray, "colors 3"]
 
     @classmethod
     def of(cls, subject: int = 1, seed: int = 0) -> "Actor":
-        """Subject 1 or 2; the seed varies shape and colours a little (0: as designed)."""
+        """Subject 1 or 2; the seed varies shape and colors a little (0: as designed)."""
         body, outfit = load_body_model(), OUTFITS[subject]
         generator = np.random.default_rng([seed, subject])
         spread = 0.0 if seed == 0 else 1.0

@@ -39,7 +39,7 @@ def _turning_gesture(share: float, turns: float, phases: Float[np.ndarray, "8"])
 
 
 def gesturing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
-    """Gestures on the spot while somebody walks around: arms, knees, a slow turn, small shifts."""
+    """Gesture on the spot for a moving camera: arms, knees, a slow turn, small shifts."""
     phases = np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * np.pi, 12)
     return _motion_from_gestures(
         actor, [_waving_gesture(i / frames, turns, phases) for i in range(frames)], fps

@@ -21,11 +21,11 @@ class ClothingLayer:
     """One surface of the dressed person.
 
     Attributes:
-        kind: What it is made of (`cut.SKIN` …).
-        rest: Vertices on the template, metres.
-        place: Where each vertex lies on the undressed template: the place that colours and borders
-            are functions of, so that they stick.
-        source: The body vertex that each vertex hangs from; it lends its weights and its shape.
+        material: Material of the layer (`outfit.SKIN` …).
+        rest_vertices: Vertices on the template, metres.
+        template_points: Position of each vertex on the undressed template, of which colors and
+            borders are functions, so that they stick to the body.
+        body_vertices: The body vertex of each vertex, from which it takes weights and shape.
         faces: Triangles.
     """
 

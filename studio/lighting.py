@@ -3,7 +3,7 @@
 It is baked once and moves with the skin, because the field that is to learn it knows neither pose
 nor view. Visibility comes from the z-buffer, seen from each direction far away.
 
-From what the subsamples see to colours: the mean over a pixel's covered subsamples.
+From what the subsamples see to colors: the mean over a pixel's covered subsamples.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ def bake_light(
     measures: Float32[np.ndarray, "cuts"],
     directions: int = 32,
 ) -> Float32[np.ndarray, "vertices 3"]:
-    """Light on each vertex as a factor of its colour, about 0.45 in folds to 1.15 in the lamp."""
+    """Light on each vertex as a factor of its color, about 0.45 in folds to 1.15 in the lamp."""
     sky = np.zeros((len(points), 3))
     lamp = np.zeros(len(points))
     weight = lamp_weight = 0.0
@@ -113,7 +113,7 @@ def shade_pixels(
     materials: Int32[np.ndarray, "faces"],
     template_points: Float32[np.ndarray, "vertices 3"],
     light: Float32[np.ndarray, "vertices 3"],
-    palette: Float32[np.ndarray, "colours 3"],
+    palette: Float32[np.ndarray, "colors 3"],
     measures: Float32[np.ndarray, "cuts"],
     checked: bool,
 ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
@@ -132,8 +132,8 @@ def shade_pixels(
     rgb = np.zeros((height, width, 3), dtype=np.float32)
     alpha = np.zeros((height, width), dtype=np.float32)
     _shade(
-        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, materials, template_points, light, palette, measures, checked,
-        rgb, alpha,
+        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, materials,
+        template_points, light, palette, measures, checked, rgb, alpha,
     )  # fmt: skip
     return rgb, alpha
 
@@ -158,7 +158,7 @@ def _shade(
     kinds: Int32[np.ndarray, "kinds"],
     place: Float32[np.ndarray, "vertices 3"],
     light: Float32[np.ndarray, "vertices 3"],
-    palette: Float32[np.ndarray, "colours 3"],
+    palette: Float32[np.ndarray, "colors 3"],
     cut: Float32[np.ndarray, "cuts"],
     checked: bool,
     rgb: Float32[np.ndarray, "height width 3"],
@@ -176,7 +176,7 @@ def _shade(
                     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
                     on_b, on_c = share_of[row, column, 0], share_of[row, column, 1]
                     on_a = 1.0 - on_b - on_c
-                    colour = albedo_at(
+                    color = albedo_at(
                         kinds[face],
                         on_a * place[a, 0] + on_b * place[b, 0] + on_c * place[c, 0],
                         on_a * place[a, 1] + on_b * place[b, 1] + on_c * place[c, 1],
@@ -188,9 +188,9 @@ def _shade(
                     for_red = on_a * light[a, 0] + on_b * light[b, 0] + on_c * light[c, 0]
                     for_green = on_a * light[a, 1] + on_b * light[b, 1] + on_c * light[c, 1]
                     for_blue = on_a * light[a, 2] + on_b * light[b, 2] + on_c * light[c, 2]
-                    red += min(max(colour[0] * for_red, 0.0), 1.0)
-                    green += min(max(colour[1] * for_green, 0.0), 1.0)
-                    blue += min(max(colour[2] * for_blue, 0.0), 1.0)
+                    red += min(max(color[0] * for_red, 0.0), 1.0)
+                    green += min(max(color[1] * for_green, 0.0), 1.0)
+                    blue += min(max(color[2] * for_blue, 0.0), 1.0)
             if covered > 0:
                 rgb[i, j, 0] = red / covered
                 rgb[i, j, 1] = green / covered

@@ -3,7 +3,7 @@
 All places are on the *template* (the mean body in T-pose, metres), so every person wears the same
 cut; `x` is the body's left, `y` up, `z` out of the chest.
 
-What the two subjects wear: measures of the cut, thickness of the cloth, colours.
+What the two subjects wear: measures of the cut, thickness of the cloth, colors.
 """
 
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ class Outfit:
         ears_covered: Whether hair falls over the ears.
         bun: Whether the hair is tied up in a knot.
         checked: A checked shirt; else a striped one.
-        palette: sRGB colours in [0, 1], in the order that `paint` names.
+        palette: sRGB colors in [0, 1], in the order that `paint` names.
     """
 
     betas: tuple[float, ...]

@@ -109,8 +109,8 @@ def _shelf(
         while x < left + wide - wide // 7:
             thick = int(generator.uniform(0.05, 0.12) * wide)
             lower = y0 + int(generator.uniform(0.05, 0.35) * tall)
-            colour = tuple(int(c) for c in generator.integers(45, 225, 3))
-            cv2.rectangle(large, (x, lower), (x + thick - 2, y1), colour, -1)
+            color = tuple(int(c) for c in generator.integers(45, 225, 3))
+            cv2.rectangle(large, (x, lower), (x + thick - 2, y1), color, -1)
             x += thick
         cv2.line(large, (left, y1), (left + wide, y1), (128, 94, 66), max(wide // 30, 1))
 

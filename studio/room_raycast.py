@@ -2,7 +2,7 @@
 
 A solid is a box that may be turned about the vertical; the first is the room itself, seen from
 within. Rays are not normalised: they advance one metre along the camera's axis, so that the
-parameter of a hit is its depth. A pixel whose neighbours see another face is cast anew with 4 x 4
+parameter of a hit is its depth. A pixel whose neighbours see another face is cast again with 4 x 4
 rays; elsewhere four lookups on the one face do, at one level of its pyramid.
 
 Letters: `o` and `d` are a ray's start and direction; `a` is the axis that a face is perpendicular
@@ -27,13 +27,13 @@ class TexturedBoxes:
     Attributes:
         low, high: Corners of each box in its own frame, metres, in the world where it is not
             turned; the first is the room.
-        turns: Cosine and sine of its turn about the vertical through its middle.
-        middles: The middle of each box (x, z).
+        yaw_cos_sin: Cosine and sine of its turn about the vertical through its middle.
+        centers_xz: The center of each box (x, z).
         textures: Of each face (low x, high x, low y, …), its texture.
         texels: All textures and their halvings, one after the other.
-        pyramid: Of each texture and level: first texel, rows, columns.
+        mip_levels: Of each texture and level: first texel, rows, columns.
         texel_m: Size of a texel of the finest level.
-        light: Factor of the colours of each face.
+        light: Factor of the colors of each face.
     """
 
     low: Float[np.ndarray, "solids 3"]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 TexturePainter = Callable[
     [tuple[int, int], float, np.random.Generator], UInt8[np.ndarray, "rows columns 3"]
 ]
-"""Paints a face of so many texels (columns, rows), each of so many metres."""
+"""Paints a face, given its size in texels (columns, rows) and the texel size in meters."""
 
 LEAF_SIZES_M = (0.012, 0.45)
 """The smallest and the largest leaf."""
@@ -21,12 +21,12 @@ SUBPIXEL_BITS = 4
 """OpenCV draws at this many binary places behind the point."""
 
 
-def plaster(colour: tuple[int, int, int], contrast: float = 13.0) -> TexturePainter:
-    """A wall: faint leaves of one colour, stains, and pictures that hang on it."""
+def plaster(color: tuple[int, int, int], contrast: float = 13.0) -> TexturePainter:
+    """A wall: faint leaves of one color, stains, and pictures that hang on it."""
 
     def paint(size, texel_m, generator):
         picture = _paint_dead_leaves(
-            size, texel_m, generator, np.array(colour, dtype=float), contrast
+            size, texel_m, generator, np.array(color, dtype=float), contrast
         )
         picture = _add_stains(picture, texel_m, generator, 9.0)
         width, height = size[0] * texel_m, size[1] * texel_m
@@ -40,7 +40,7 @@ def plaster(colour: tuple[int, int, int], contrast: float = 13.0) -> TexturePain
     return paint
 
 
-def planks(colour: tuple[int, int, int]) -> TexturePainter:
+def planks(color: tuple[int, int, int]) -> TexturePainter:
     """A wooden floor: boards of all lengths and tones with grain and knots, and a rug."""
 
     def paint(size, texel_m, generator):
@@ -59,12 +59,12 @@ def planks(colour: tuple[int, int, int]) -> TexturePainter:
         fine = _noise((rows, columns), (0.20 / texel_m, 0.008 / texel_m), generator)
         wild = _noise((rows, columns), (0.03 / texel_m, 0.02 / texel_m), generator)
         tone *= 1.0 + 0.10 * fine + 0.07 * wild
-        picture = _to_uint8(tone[..., None] * np.array(colour, dtype=np.float32))
+        picture = _to_uint8(tone[..., None] * np.array(color, dtype=np.float32))
         knots = int(columns * rows * texel_m**2 * 6)
         for x, y in generator.uniform(0.0, 1.0, (knots, 2)) * size:
             radius = generator.uniform(0.006, 0.022) / texel_m
             axes = (max(round(radius), 1), max(round(radius * generator.uniform(1.0, 2.0)), 1))
-            dark = tuple(int(c * generator.uniform(0.35, 0.7)) for c in colour)
+            dark = tuple(int(c * generator.uniform(0.35, 0.7)) for c in color)
             cv2.ellipse(picture, (int(x), int(y)), axes, 0.0, 0.0, 360.0, dark, -1, cv2.LINE_AA)
         left, right, top, below = 0.22 * columns, 0.80 * columns, 0.16 * rows, 0.62 * rows
         rug = picture[int(top) : int(below), int(left) : int(right)]
@@ -76,19 +76,19 @@ def planks(colour: tuple[int, int, int]) -> TexturePainter:
     return paint
 
 
-def dead_leaves(colour: tuple[int, int, int], contrast: float = 30.0) -> TexturePainter:
-    """A face of leaves around one colour: a painted box, a cloth."""
+def dead_leaves(color: tuple[int, int, int], contrast: float = 30.0) -> TexturePainter:
+    """A face of leaves around one color: a painted box, a cloth."""
 
     def paint(size, texel_m, generator):
         picture = _paint_dead_leaves(
-            size, texel_m, generator, np.array(colour, dtype=float), contrast
+            size, texel_m, generator, np.array(color, dtype=float), contrast
         )
         return _add_stains(picture, texel_m, generator, 6.0)
 
     return paint
 
 
-def wood(colour: tuple[int, int, int]) -> TexturePainter:
+def wood(color: tuple[int, int, int]) -> TexturePainter:
     """A board with grain, drawers and handles."""
 
     def paint(size, texel_m, generator):
@@ -96,9 +96,9 @@ def wood(colour: tuple[int, int, int]) -> TexturePainter:
         grain = _noise((rows, columns), (0.010 / texel_m, 0.25 / texel_m), generator)
         wild = _noise((rows, columns), (0.02 / texel_m, 0.03 / texel_m), generator)
         tone = 1.0 + 0.11 * grain + 0.08 * wild
-        picture = _to_uint8(tone[..., None] * np.array(colour, dtype=np.float32))
+        picture = _to_uint8(tone[..., None] * np.array(color, dtype=np.float32))
         steps = max(round(rows * texel_m / generator.uniform(0.25, 0.4)), 1)
-        dark = tuple(int(0.45 * c) for c in colour)
+        dark = tuple(int(0.45 * c) for c in color)
         thick = max(round(0.006 / texel_m), 1)
         for step in range(1, steps):
             row = rows * step // steps
@@ -110,12 +110,12 @@ def wood(colour: tuple[int, int, int]) -> TexturePainter:
     return paint
 
 
-def books(colour: tuple[int, int, int]) -> TexturePainter:
+def books(color: tuple[int, int, int]) -> TexturePainter:
     """Shelves full of books with printed backs."""
 
     def paint(size, texel_m, generator):
         columns, rows = size
-        picture = np.full((rows, columns, 3), np.array(colour) * 0.45, dtype=np.uint8)
+        picture = np.full((rows, columns, 3), np.array(color) * 0.45, dtype=np.uint8)
         shelves = max(round(rows * texel_m / 0.32), 1)
         for shelf in range(shelves):
             below = rows * (shelf + 1) // shelves - max(round(0.02 / texel_m), 1)
@@ -129,7 +129,7 @@ def books(colour: tuple[int, int, int]) -> TexturePainter:
                 back[:] = _paint_dead_leaves(back.shape[1::-1], texel_m, generator, ink, 34.0)
                 back[:, :1] = back[:, :1] // 2
                 column += thick
-            picture[below : below + max(round(0.02 / texel_m), 1)] = colour
+            picture[below : below + max(round(0.02 / texel_m), 1)] = color
         return picture
 
     return paint
@@ -155,12 +155,12 @@ def _paint_dead_leaves(
     size: tuple[int, int],
     texel_m: float,
     generator: np.random.Generator,
-    colour: Float[np.ndarray, "3"],
+    color: Float[np.ndarray, "3"],
     contrast: float,
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Shapes that hide each other, sizes by a power law, colours around one."""
+    """Shapes that hide each other, sizes by a power law, colors around one."""
     columns, rows = size
-    picture = np.full((rows, columns, 3), np.clip(colour, 0, 255), dtype=np.uint8)
+    picture = np.full((rows, columns, 3), np.clip(color, 0, 255), dtype=np.uint8)
     low, high = LEAF_SIZES_M[0], min(LEAF_SIZES_M[1], 0.5 * max(size) * texel_m + LEAF_SIZES_M[0])
     area = columns * rows * texel_m**2
     count = int(min(area * 900.0, 60_000)) + 4
@@ -169,7 +169,7 @@ def _paint_dead_leaves(
     drawn[: count // 8] = np.geomspace(high, 4.0 * low, count // 8)  # the ground is covered
     radii = drawn / texel_m * 2**SUBPIXEL_BITS
     places = generator.uniform(0.0, 1.0, (count, 2)) * size * 2**SUBPIXEL_BITS
-    tones = colour + contrast * generator.standard_normal((count, 1))
+    tones = color + contrast * generator.standard_normal((count, 1))
     tones = np.clip(tones + 0.3 * contrast * generator.standard_normal((count, 3)), 4, 251)
     angles = np.sort(generator.uniform(0.0, 2.0 * np.pi, (count, 5)), axis=1)
     rings = np.stack([np.cos(angles), np.sin(angles)], axis=-1) * radii[:, None, None]

@@ -40,8 +40,8 @@ class StudioScene:
     Attributes:
         actor: Who is filmed.
         cameras: One for all pictures, or one for each.
-        behind: A painted backdrop (for one camera), or a room.
-        first: Number of the first picture, of which a room's noise depends.
+        background: A painted backdrop (for one camera), or a room.
+        first_frame_number: Number of the first image, on which a room's noise depends.
     """
 
     actor: Actor
@@ -231,7 +231,7 @@ def _write_video(
 
 
 def _check_video(path: Path, frames: int) -> None:
-    """OpenCV does not say when it could not write; so the file is asked."""
+    """Count the frames of the file: OpenCV does not report write errors."""
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     written = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
     video.release()

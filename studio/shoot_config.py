@@ -43,7 +43,7 @@ class ShootConfig:
 
     @property
     def effective_background(self) -> Literal["plain", "clutter", "room", "tiles"]:
-        """What stands behind the actor, if nobody said it, too."""
+        """Background, with the default of the motion."""
         return self.background or ("room" if self.camera_moves else "clutter")
 
     def validate(self) -> None:
@@ -64,6 +64,6 @@ class ShootConfig:
                 raise InputError(f"{option} is {value}, but must lie between {low} and {high}.")
         if self.camera_moves and self.effective_background in ("plain", "clutter"):
             raise InputError(
-                f"--background {self.effective_background} is painted for a camera that stands still; with "
-                "--motion walkaround give room or tiles."
+                f"--background {self.effective_background} is painted for a static camera; with "
+                "--motion walkaround use room or tiles."
             )

@@ -70,7 +70,7 @@ FOCAL_SHARE = 0.68
 """Focal length in units of the picture's longer side: a phone's main camera."""
 ARC_DEG = 120.0
 WALK_DISTANCE_HEIGHTS = 1.52
-"""From the actor, in units of the actor's height: whoever films steps back until all is seen."""
+"""Distance to the actor, in heights of the actor: the whole body is in the image."""
 HANDHELD_HEIGHT_M = 1.4
 STANDING_DISTANCE_M = 3.4
 """From here the camera that stands still sees raised arms, too."""
@@ -167,7 +167,7 @@ def _aim_handheld_camera(
 def _smooth_gaussian_noise(
     generator: np.random.Generator, frames: int, columns: int, over: float
 ) -> Float[np.ndarray, "frames columns"]:
-    """Gaussian noise of unit variance, smooth over so many frames."""
+    """Return Gaussian noise of unit variance, smoothed over a number of frames."""
     margin = int(4 * over) + 1
     white = generator.standard_normal((frames + 2 * margin, columns))
     smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + frames]

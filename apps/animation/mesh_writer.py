@@ -67,7 +67,7 @@ def _glb_encoder(manifest: Manifest, motion: Motion, name: str) -> Callable[[Ski
 
 def _static_mesh_encoder(suffix: str) -> Callable[[SkinnedMesh], bytes]:
     """Return what encodes the canonical pose; colors are sRGB, as programs take a PLY's to be."""
-    import trimesh  # an installation of the player alone has none, and is told what to install
+    import trimesh  # missing in an installation of the player alone
 
     options: dict[str, Any] = {
         ".ply": {"vertex_normal": True},

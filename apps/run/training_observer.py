@@ -30,7 +30,7 @@ class ObservableSession(Protocol):
 
     @property
     def stop_requested(self) -> bool:
-        """Whether somebody wants it to end."""
+        """Whether the user has asked to stop."""
         ...
 
 

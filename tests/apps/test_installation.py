@@ -59,7 +59,7 @@ def place(run, film, tmp_path) -> Path:
 
 
 def played(folder: Path) -> bool:
-    """Whether a.png and a.webm show somebody, and a.glb is there."""
+    """Whether a.png and a.webm show a person, and a.glb exists."""
     picture = cv2.imread(str(folder / "a.png"), cv2.IMREAD_UNCHANGED)
     clip, count = cv2.VideoCapture(str(folder / "a.webm")), 0
     while clip.grab():

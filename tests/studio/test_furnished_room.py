@@ -115,7 +115,7 @@ def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, c
     assert met > 20
 
 
-def test_a_place_of_the_wall_has_one_colour_from_everywhere(room):
+def test_a_place_of_the_wall_has_one_color_from_everywhere(room):
     near = studio_cameras.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
     first, second = (room.view_from(camera) for camera in near)
     first = type(first)(rgb=first.rgb.copy(), depth=first.depth, face=first.face)

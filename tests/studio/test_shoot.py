@@ -97,8 +97,8 @@ def test_skinning_is_the_bodys_own(actor):
     )
 
 
-def test_colours_stick_to_the_body(actor):
-    """A place of the chest has one colour before and after the body turned, bowed and moved."""
+def test_colors_stick_to_the_body(actor):
+    """A place of the chest has one color before and after the body turned, bowed and moved."""
     camera = static_camera(actor, 160).resize((640, 640))
     bowed = Gesture(bow=12, yaw=25).joint_rotations().as_rotvec()
     poses = (
@@ -112,14 +112,14 @@ def test_colours_stick_to_the_body(actor):
     shirt = np.unique(actor.faces[actor.materials == SHIRT])
     x, y, z = actor.template_points[shirt].T
     chest = shirt[(np.abs(x + 0.07) < 0.03) & (np.abs(y - 0.06) < 0.09) & (z > 0.08)]
-    colours = []
+    colors = []
     for pose in poses:
         rgb, _ = actor.render_rgb_alpha(pose, camera, supersampling=1)
         column, row = camera.project(actor.vertices(pose)[chest]).astype(int).T
-        colours.append(rgb[row, column])
+        colors.append(rgb[row, column])
     assert len(chest) > 20
-    assert np.abs(colours[0] - colours[1]).mean() < 0.08  # a pixel holds a little of its neighbours
-    assert colours[0].std(axis=0).max() > 0.08  # ... and the place is no plain one
+    assert np.abs(colors[0] - colors[1]).mean() < 0.08  # a pixel holds a little of its neighbours
+    assert colors[0].std(axis=0).max() > 0.08  # ... and the place is no plain one
 
 
 def test_stripes_are_four_centimetres_wide():

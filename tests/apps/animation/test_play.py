@@ -268,7 +268,7 @@ def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
     ("arguments", "word"),
     [
         (["--out", "clip.avi"], ".avi"),
-        (["--background", "no-such-colour"], "--background"),
+        (["--background", "no-such-color"], "--background"),
         (["--size", "4"], "--size"),
         (["--size", "640x"], "--size"),
         (["--size", "99999x99"], "--size"),

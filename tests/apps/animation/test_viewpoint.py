@@ -1,4 +1,4 @@
-"""Where the camera stands when nobody gave one."""
+"""The default camera and its viewpoints."""
 
 import numpy as np
 import pytest

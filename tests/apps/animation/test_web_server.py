@@ -145,13 +145,13 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
-def test_somebody_plays_pauses_turns_and_zooms(page):
+def test_the_page_plays_pauses_turns_and_zooms(page):
     page.run("document.getElementById('picture').focus()")
     until(lambda: moves(page), 30.0)
     paused(page)
     front = drawn(page)
     rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
-    assert len(rows) > 0.6 * front.shape[0]  # somebody upright in the middle
+    assert len(rows) > 0.6 * front.shape[0]  # a person upright in the middle
     assert abs(columns.mean() - SIZE[0] / 2.0) < 0.1 * SIZE[0]
     page.drag((450, 300), (300, 300))
     until(lambda: not moves(page), 30.0)
@@ -263,7 +263,7 @@ def test_nothing_came_from_anywhere_else(page, served):
 @pytest.mark.slow
 def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
     """Python's own server stands for any static host; without --poses the avatar turns round."""
-    out = tmp_path / "host" / "people" / "somebody"
+    out = tmp_path / "host" / "people" / "actor"
     outcome = call_play(package, "--web", "--out", out)
     assert outcome.code == 0
     told = json.loads((out / "avatar.json").read_text())
@@ -277,7 +277,7 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
         try:
             with Browser(tmp_path / "browser", size=SIZE) as browser:
                 browser.emulate(scheme="light", size=SIZE)
-                browser.go(f"{address.rstrip('/').rstrip(')')}/people/somebody/")
+                browser.go(f"{address.rstrip('/').rstrip(')')}/people/actor/")
                 until(lambda: browser.run("!!window.player"), 120.0)
                 until(lambda: drawn(browser).mean() > 0.03, 60.0)
                 paused(browser)

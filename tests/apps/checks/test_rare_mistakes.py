@@ -1,4 +1,4 @@
-"""Tests for mistakes that are rare: named if they can be, and else nothing false is said."""
+"""Rare mistakes: named if possible, and never misnamed."""
 
 import json
 import shutil
@@ -85,7 +85,7 @@ def test_a_cropped_video_is_told_by_its_principal_point_and_mended(
 
 
 @pytest.mark.slow
-def test_somebody_elses_poses_from_the_middle_on_are_no_offset(capture, diagnosed):
+def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagnosed):
     motion = read_motion(capture / "poses.npz")
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
     write_motion(capture / "poses.npz", motion)

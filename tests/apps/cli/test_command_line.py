@@ -44,8 +44,8 @@ def test_every_command_explains_itself_within_the_terminal(program, capsys, monk
     assert max(map(len, prose)) <= 72
 
 
-def test_a_checkout_that_nobody_installed_says_so(capsys, monkeypatch):
-    monkeypatch.setattr(command_line, "DISTRIBUTION", "nobody-has-installed-this")
+def test_a_checkout_has_a_version_without_installation(capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "DISTRIBUTION", "a-package-that-is-not-installed")
     assert "not installed" in answered("ia-play", ["--version"], capsys)
 
 

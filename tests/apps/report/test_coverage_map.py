@@ -1,4 +1,4 @@
-"""The map of the body: dots whose colour says what was seen."""
+"""The map of the body: dots whose color says what was seen."""
 
 import re
 from xml.etree import ElementTree

@@ -134,7 +134,7 @@ def test_a_frame_of_another_video_has_no_best_in_this_one():
 
 
 def test_the_page_explains_drops_of_the_curve():
-    """A drop because other frames joined is told from a drop of single frames."""
+    """A drop because other frames joined is distinguished from a drop of single frames."""
     one = replace(point(2.0, 30.0), frames=((9, 30.0),))
     nine = replace(point(5.0, 24.0), frames=((9, 30.0), (19, 18.0)))
     joined = report_page(report(curve=(one, nine)), name="clip")

@@ -33,7 +33,7 @@ with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chrom
 def scene(browser: Browser) -> tuple[np.ndarray, np.ndarray]:
     """The picture left of the panel, below the browser's own notes, and where it is no paper."""
     picture = browser.picture()[:, :-PANEL_PX].astype(int)
-    picture[:160, :320] = PAPER  # Chromium without a GPU is told so here
+    picture[:160, :320] = PAPER  # Chromium shows its notice about a missing GPU here
     return picture, np.abs(picture - PAPER).max(axis=2) > 24
 
 
@@ -48,7 +48,7 @@ def shows_a_person(drawn: np.ndarray) -> bool:
 
 
 def actors_color(film: Path) -> np.ndarray:
-    """The mean colour of the person in the film's first frame."""
+    """The mean color of the person in the film's first frame."""
     _, bgr = cv2.VideoCapture(str(next(film.glob("video.*")))).read()
     alpha = cv2.imread(str(min((film / "masks").iterdir())), cv2.IMREAD_GRAYSCALE)
     return bgr[alpha > 200][:, ::-1].mean(axis=0)
@@ -62,7 +62,7 @@ def steps(browser: Browser) -> int:
 @with_viser
 @with_chromium
 @pytest.mark.slow
-def test_somebody_watches_pauses_saves_and_lets_it_dance(film, tmp_path):
+def test_a_user_watches_pauses_saves_and_starts_the_dance(film, tmp_path):
     log, out = tmp_path / "log", tmp_path / "run"
     command = [sys.executable, "-m", "apps.ingest", str(film), "--out", str(out)]
     with log.open("w") as file:

@@ -82,7 +82,7 @@ def test_motions_go_on_and_begin_again(recording, observations):
     assert poser.pose_at(DANCE, 3.0, None).joint_rotations == pytest.approx(first.joint_rotations)
     standing = poser.pose_at(STANDING, 0.0, None)
     assert rotation_matrices(standing.root_rotation) == pytest.approx(np.eye(3))
-    # before the first frame the newest is nobody's
+    # before the first frame there is no newest pose
     assert np.array_equal(
         poser.pose_at(NEWEST, 0.0, None).joint_rotations, standing.joint_rotations
     )
