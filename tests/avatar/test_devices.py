@@ -17,6 +17,7 @@ from avatar.training import checkpoint, held_out_pose_fitting
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
+from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 from capture.inbox import Inbox
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -87,13 +88,13 @@ def test_training_rendering_and_fitting_stay_on_their_device(trainer, clip, rig,
     ids=["union", "frame", "none"],
 )  # fmt: skip
 def test_the_papers_schemes_stay_on_their_device(device, scheme, rig, clip):
-    config = replace(CONFIG, rays=8, refine_poses=False, **scheme)
-    trainer = Trainer(rig, config, device)
+    config = replace(CONFIG, rays=8, refine_poses=False)
+    trainer = BaselineTrainer(rig, config, device, BaselineScheme(**scheme))
     trainer.add_frame(next(prepare_stream(iter(clip.observations[:1]), rig, stride=0, total=None)))
     for _ in range(2):
         result = trainer.step(rate=1.0, hard_surface_share=1.0)
     assert result.loss.device == FAKE_DEVICE
-    assert torch.isfinite(trainer.avatar.field.table.cpu()).all()
+    assert torch.isfinite(trainer.trainer.avatar.field.table.cpu()).all()
 
 
 def test_a_checkpoint_goes_from_one_device_to_another(trainer, tmp_path):
