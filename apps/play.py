@@ -14,6 +14,7 @@ from apps.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, run_command
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
+    from apps.animation.render_sequence import RenderSequence
     from export.player import Player
 
 
@@ -97,13 +98,18 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
             encoder=encoder,
             replace=arguments.overwrite,
         )
-    width, height = shots.cameras[0].size_px
-    rate = f" at {shots.fps:.4g} fps" if count > 1 else ""
-    cut = f" of {total}" if count < total else ""
-    frames = "1 frame" if count == 1 else f"{count}{cut} frames"
-    console.info(f"Rendered {frames} of {width}x{height} px{rate}; {encoder.description}:")
+    console.info(f"Rendered {_describe_clip(shots, count)}; {encoder.description}:")
     print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
+
+
+def _describe_clip(shots: "RenderSequence", count: int) -> str:
+    """Return how many frames were rendered, their size, and their rate if there are several."""
+    width, height = shots.cameras[0].size_px
+    cut = f" of {len(shots)}" if count < len(shots) else ""
+    frames = "1 frame" if len(shots) == 1 else f"{count}{cut} frames"
+    rate = f" at {shots.fps:.4g} fps" if count > 1 else ""
+    return f"{frames} of {width}x{height} px{rate}"
 
 
 def _print_package_warnings(player: "Player", console: Console) -> None:

@@ -81,7 +81,7 @@ def kill_and_resume(capture: Path, run: Path, after_s: float) -> ResumedRun:
 
 
 def measure_kills(capture: Path, folder: Path, *, kills: int) -> Iterator[Measurement]:
-    """So many kills at moments spread at random over a whole run."""
+    """Kill the run at this many moments, spread at random over its whole length."""
     _, unbroken, whole_s = run_to_end(capture, folder / "unbroken")
     _, unbroken, whole_s = run_to_end(capture, folder / "again")  # compiled code is kept now
     chance, ended = random.Random(0), list[ResumedRun]()

@@ -71,7 +71,7 @@ def views_of_person(
 ) -> dict[str, list[ComparedView]]:
     """Held-out frames of a real person, and the same person dancing in the place of each.
 
-    Nobody filmed the dances: they say how near the player is to the volume renderer, no more.
+    The dances have no ground truth: they only compare the player with the volume renderer.
 
     Args:
         capture: A folder that `ia-ingest` reads.

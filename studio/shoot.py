@@ -20,11 +20,12 @@ from capture.input_error import InputError
 from capture.video_encoder import video_encoder
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.poses.pose_file import write_motion
-from studio import actor_motions, painted_backdrop, studio_cameras
+from studio import actor_motions, studio_cameras
 from studio.actor import Actor
-from studio.furnished_room import FurnishedRoom
 from studio.input_noise import add_mask_noise, add_pose_noise, to_camera_space
 from studio.lighting import composite_over
+from studio.room import painted_backdrop
+from studio.room.furnished_room import FurnishedRoom
 from studio.shoot_config import ShootConfig as ShootConfig
 from studio.studio_cameras import static_camera
 
@@ -141,7 +142,7 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     write_motion(folder / "truth" / "poses.npz", truth)
     write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
     if config.camera_moves:
-        # Nobody tells a phone where it is: the cameras are truth, and lie where no command looks.
+        # A phone does not know where it is: the cameras are ground truth, where no command looks.
         _write_cameras(folder / "truth" / "cameras.npz", cameras)
         _write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
     else:

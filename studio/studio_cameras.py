@@ -76,7 +76,7 @@ STANDING_DISTANCE_M = 3.4
 """From here the camera that stands still sees raised arms, too."""
 
 NEAR_FOOT_OFFSET_M = 0.2
-"""So much nearer than the actor's middle is the nearer foot."""
+"""Distance by which the nearer foot is closer to the camera than the body center, metres."""
 
 SHAKE_M, SHAKE_DEG = 0.012, 0.6
 """Standard deviation of the hand's trembling, for each axis."""

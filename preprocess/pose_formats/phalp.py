@@ -46,5 +46,5 @@ def _person(rows: list[tuple[int, Any, Any]]) -> Any:
         stack_rows([np.reshape(camera, 3) for _, _, camera in rows]),
         betas=stack_rows([np.reshape(pose["betas"], -1) for pose in poses]),
         frames=[number for number, _, _ in rows],
-        assumed_focal=PHALP_FOCAL,
+        lens=PHALP_FOCAL,
     )

@@ -41,5 +41,5 @@ def _person(rows: dict[str, Any], intrinsic: Any, driving: bool) -> Any:
         frames=rows["frames"],
         body_model="smplx",
         space="camera" if in_camera else "world",
-        intrinsic=intrinsic if in_camera else None,
+        lens=intrinsic if in_camera else None,
     )

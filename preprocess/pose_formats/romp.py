@@ -66,7 +66,7 @@ def _person(rows: dict[str, Any], frames: Any) -> Any:
         if np.allclose(places[:, 2] * scales, 2.0, rtol=1e-3):
             lens = WEAK_PERSPECTIVE_FOCAL
     return build_motion(
-        [thetas], places, betas=betas[:, :10], frames=frames, assumed_focal=lens,
+        [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
         lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed
         anchor="hips" if is_bev else "pelvis",
     )  # fmt: skip

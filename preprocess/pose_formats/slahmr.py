@@ -33,7 +33,7 @@ def parse_people(content: Any, prefer_world: bool = False) -> MotionByPerson | N
         intrinsic = np.asarray(content["cam_intrinsics"], dtype=np.float64)
         return {
             str(number): _with_cameras(
-                build_motion([poses], places, betas=shape, space="world", intrinsic=intrinsic),
+                build_motion([poses], places, betas=shape, space="world", lens=intrinsic),
                 cameras,
             )
             for number, ((poses, places), shape) in enumerate(zip(rows, shapes, strict=True))
@@ -54,7 +54,7 @@ def _slahmr(content: dict[str, Any], number: int) -> Motion:
         if "track_mask" in content
         else None,
         space="world",
-        intrinsic=_intrinsic_from_four(content["intrins"]) if "intrins" in content else None,
+        lens=_intrinsic_from_four(content["intrins"]) if "intrins" in content else None,
     )
     if not {"cam_R", "cam_t"} <= content.keys():
         return found

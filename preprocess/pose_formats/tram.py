@@ -44,7 +44,7 @@ def _person(rows: dict[str, Any], camera: Any) -> Any:
         np.reshape(rows["pred_trans"], (-1, 3)),
         betas=rows.get("pred_shape"),
         frames=rows["frame"],
-        intrinsic=intrinsic_from_focal(focal, center),
+        lens=intrinsic_from_focal(focal, center),
     )
 
 

@@ -38,5 +38,5 @@ def _person(rows: dict[str, Any]) -> Any:
         np.column_stack([x, y, depth]),
         betas=rows.get("betas"),
         frames=rows["frame_ids"],
-        assumed_focal=VIBE_FOCAL,
+        lens=VIBE_FOCAL,
     )

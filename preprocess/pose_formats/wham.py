@@ -36,5 +36,5 @@ def _person(rows: dict[str, Any], in_world: bool) -> Any:
         betas=rows.get("betas"),
         frames=rows["frame_ids"],
         space="world" if in_world else "camera",
-        assumed_focal=None if in_world else WHAM_FOCAL,
+        lens=None if in_world else WHAM_FOCAL,
     )

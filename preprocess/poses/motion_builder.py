@@ -23,9 +23,7 @@ def build_motion(
     body_model: str = "smpl",
     space: PoseSpace = "camera",
     anchor: RootAnchor = "pelvis",
-    intrinsic: Any = None,
-    assumed_focal: RelativeFocalLength | None = None,
-    note: str | None = None,
+    lens: Any = None,
 ) -> Motion:
     """Poses of one person, rows in the order of their frames.
 
@@ -36,12 +34,13 @@ def build_motion(
         frames: The frames' numbers; of a number that comes twice the first row counts.
         times_s: Times in seconds.
         lost: Which rows the tracker itself calls lost.
-        body_model, space, anchor, assumed_focal, note: See `Motion`.
-        intrinsic: One K, or one per pose.
+        body_model, space, anchor: See `Motion`.
+        lens: The camera matrix K, or one per pose; or the focal length that the tracker assumed.
 
     Raises:
         ValueError: If the parts do not fit together.
     """
+    is_assumed = isinstance(lens, RelativeFocalLength)
     turned = stack_axis_angles(rotations)
     placed = np.asarray(translations, dtype=np.float64).reshape(len(turned), 3)
     order = np.arange(len(turned))
@@ -63,11 +62,10 @@ def build_motion(
         body_model=body_model,
         frames=frames,
         times_s=None if times_s is None else times_s[order],
-        intrinsic=_median_intrinsic(intrinsic),
-        assumed_focal=assumed_focal,
+        intrinsic=None if is_assumed else _median_intrinsic(lens),
+        assumed_focal=lens if is_assumed else None,
         anchor=anchor,
         space=space,
-        note=note,
     )
 
 

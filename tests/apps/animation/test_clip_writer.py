@@ -58,7 +58,7 @@ def shown(path):
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
 @pytest.mark.parametrize("color", ["#808080", "#4080c0", "#c8d2dc"])
-def test_a_video_has_the_colours_that_were_drawn(tmp_path, library, suffix, color):
+def test_a_video_has_the_colors_that_were_drawn(tmp_path, library, suffix, color):
     path, blend = tmp_path / f"clip{suffix}", background_compositor(color)
     assert written(path, disc(6), blend=blend) == 6
     frames, fps = shown(path)

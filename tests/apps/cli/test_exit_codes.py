@@ -207,7 +207,7 @@ def test_durations_as_people_say_them(seconds, said):
     assert format_duration(seconds) == said
 
 
-def test_colours_and_pictures_stand_behind_an_avatar(tmp_path, rng):
+def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):
     rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
     rgba[0, :, 3], rgba[1, :, 3] = 0, 255
     on_blue = background_compositor("rgb(10, 20, 250)")(rgba)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from capture.camera import Camera
-from studio.room_raycast import RoomView, TexturedBoxes, raycast_boxes
-from studio.room_textures import (
+from studio.room.room_raycast import RoomView, TexturedBoxes, raycast_boxes
+from studio.room.room_textures import (
     TexturePainter,
     books,
     dead_leaves,

@@ -1,0 +1,1 @@
+"""Backgrounds of the studio: painted backdrops and a furnished room."""
