@@ -163,11 +163,14 @@ def atomic_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
 
 
 def check_replaceable_folder(path: Path) -> None:
-    """Refuses a folder with anything in it that this program did not write there.
+    """Refuse a folder that cannot be made, or with anything in it that this program did not write.
 
     Raises:
-        InputError: Naming what is there.
+        InputError: Naming what is in the way.
     """
+    file = next((parent for parent in path.absolute().parents if parent.is_file()), None)
+    if file is not None:
+        raise InputError(f"{path} cannot be a folder: {file} is a file.")
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{path} is a file; a folder was expected.")
     stranger = next(OutputFileList(path).foreign_files(), None)

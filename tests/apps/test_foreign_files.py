@@ -205,7 +205,7 @@ def work():
         write_text_atomically(run.checkpoint / "state.pt", "learnt")
     package = AtomicFile(run.package)
     package.temporary_path.write_bytes(b"avatar")
-    package.finish()
+    package.commit()
     write_text_atomically(run.report_json, "{}")
     with atomic_folder(folder / "frames") as part:
         (part / "0000.png").write_bytes(b"new")

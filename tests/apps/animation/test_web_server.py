@@ -289,7 +289,9 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
                 largest = max((out / "data").iterdir(), key=lambda file: file.stat().st_size)
                 largest.write_bytes(largest.read_bytes()[:-1000])  # as a copy that was cut off
                 browser.run("location.reload()")
-                until(lambda: f"{largest.name} came damaged or in part" in browser.text(), 60.0)
+                until(
+                    lambda: f"{largest.name} arrived damaged or incomplete" in browser.text(), 60.0
+                )
         finally:
             process.terminate()
 

@@ -178,7 +178,7 @@ def test_a_portrait_film_that_was_laid_on_its_side_is_stood_up(spoilt, tmp_path,
 def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_path, call_check):
     folder, out = spoilt(capture_corruptions.add_second_person), tmp_path / "corrected"
     _, _, found = call_check(folder, "--fix", out)
-    assert [cure["cause"] for cure in found["corrections"]] == ["add_second_person"]
+    assert [cure["cause"] for cure in found["corrections"]] == ["second_person"]
     assert found["iou"]["after_fix"] > 0.75
     masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (out / "masks").iterdir()]
     masks = [mask for mask in masks if mask is not None and mask.any()]
