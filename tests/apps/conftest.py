@@ -49,18 +49,23 @@ FEW_STEPS = 10
 """Training steps where a test is not about what was learnt."""
 
 
-@pytest.fixture(scope="session", autouse=True)
-def briefly_tuned():
-    """Bricks are fine-tuned on fewer, smaller pictures, and poses are fitted in fewer steps.
+BRIEF = pytest.MonkeyPatch()
+"""Shorter fine-tuning and pose fitting; undone after each test, for other folders measure both."""
 
-    What these are worth is seen in tests of `export` and of `avatar`.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
-        patch.setattr(fine_tuning, "TRAINING_PX", 128)
-        patch.setattr(fine_tuning, "VALIDATION_PX", 128)
-        patch.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
-        yield
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup():
+    """Fine-tune on fewer, smaller images, and fit poses in fewer steps."""
+    BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
+    BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
+    BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
+    BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown():
+    """Undo it."""
+    BRIEF.undo()
 
 
 @pytest.fixture(scope="session")
