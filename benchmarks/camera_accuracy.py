@@ -254,7 +254,7 @@ def main() -> None:
                 fine &= name != "solved" or lost < MOST_PSNR_LOSS
                 print(f"held out, {name}: {psnr:.2f} dB ({-lost:+.2f})", flush=True)
     print(
-        f"asked: centres under {MOST_CENTER_CM} cm, rotation under {MOST_ROTATION_DEG}°, scale "
+        f"target: centers under {MOST_CENTER_CM} cm, rotation under {MOST_ROTATION_DEG}°, scale "
         f"within {100.0 * MOST_SCALE:.0f} %; tiles may be refused"
     )
     sys.exit(0 if fine else 1)

@@ -110,7 +110,7 @@ def test_fewer_masks_than_frames_and_what_to_try(refused, capture, step, hint):
     refused(capture, words=[f"{len(kept)} masks", "24 frames", hint])
 
 
-def test_pictures_of_a_phone_that_nobody_reads(refused, capture, tmp_path):
+def test_unreadable_phone_image_formats_are_refused(refused, capture, tmp_path):
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"ftypheic")
     refused(
@@ -173,7 +173,7 @@ def test_empty_masks(refused, capture):
     refused(capture, words=["masks", "empty"])
 
 
-def test_a_segmenter_that_nobody_installed(refused, capture):
+def test_a_segmenter_that_is_not_installed_is_refused(refused, capture):
     refused(capture, "--masks", "segmenter:sam", words=["no such segmenter", "grabcut"])
 
 

@@ -50,9 +50,7 @@ def test_the_whole_person_is_in_the_views(rig):
         (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "does not exist"),
     ],
 )
-def test_what_cannot_be_done_is_said_and_nothing_is_written(
-    run, call_export, tmp_path, change, told
-):
+def test_impossible_exports_are_refused_and_write_nothing(run, call_export, tmp_path, change, told):
     folder, out = change(run, tmp_path / "a.iavatar")
     code, said = call_export(folder, "--out", out)
     assert code == 2

@@ -117,7 +117,7 @@ def test_one_opaque_picture_at_the_start_does_not_decide(folder, live):
     assert recording.mask_report()["masks"] == ALPHA
 
 
-def test_an_alpha_channel_that_comes_later_is_told(folder, shots):
+def test_an_alpha_channel_that_begins_later_is_reported(folder, shots):
     """What was there at the start decided; the finished folder is read otherwise."""
     there = folder(["opaque"] * FRAMES, beside=False)
     recording = open_capture(wanted(there, "none", live=True))
@@ -147,7 +147,9 @@ def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folde
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_videos_alpha_channel_is_told_where_masks_are_estimated(capture, monkeypatch, masked):
+def test_an_unread_alpha_channel_is_reported_where_masks_are_estimated(
+    capture, monkeypatch, masked
+):
     monkeypatch.setattr("capture.video_decoder.has_alpha_plane", lambda tag: True)
     monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
     if not masked:

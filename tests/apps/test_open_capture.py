@@ -68,7 +68,7 @@ def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp
         open_capture(CaptureInputs(**paths, person="7"))
 
 
-def test_without_masks_they_are_estimated_and_that_is_said(film, tmp_path):
+def test_missing_masks_are_estimated_with_a_note(film, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in ("video.mp4", "poses.npz", "cameras.npz"):

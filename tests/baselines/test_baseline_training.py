@@ -126,7 +126,7 @@ def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping
     assert float(torch.cosine_similarity(*found, dim=0)) > 0.97
 
 
-def test_global_sparsity_is_asked_for_in_the_whole_box(rig, clip):
+def test_global_sparsity_samples_the_whole_box(rig, clip):
     trainer = trainer_of(rig, clip, "global")
     points = trainer.trainer.sampler.sample_empty(4000, torch.Generator().manual_seed(2))
     low, high = torch.from_numpy(rig.box_low), torch.from_numpy(rig.box_high)

@@ -60,7 +60,7 @@ def test_a_full_inbox_makes_the_producer_wait_and_loses_nothing():
     inbox.close()
 
 
-def test_taking_does_not_wait_unless_it_is_told_to():
+def test_taking_waits_only_on_request():
     gate = threading.Event()
 
     def items():

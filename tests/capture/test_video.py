@@ -27,7 +27,7 @@ def test_frames_come_in_order_with_their_timestamps_and_in_rgb(write_video):
     assert not source.warnings
 
 
-def test_reading_again_starts_anew(write_video):
+def test_reading_again_starts_at_the_first_frame(write_video):
     source = open_source(write_video(frames=5))
     iterator = source.frames()
     next(iterator)

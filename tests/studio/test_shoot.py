@@ -214,7 +214,7 @@ def test_pose_noise_has_the_deviation_asked_for_and_is_smooth():
     assert add_pose_noise(truth, degrees=0.0, centimetres=0.0, seed=4) is truth
 
 
-def test_mask_noise_moves_the_border_by_what_is_asked():
+def test_mask_noise_moves_the_border_by_the_given_distance():
     alpha = np.zeros((200, 400), dtype=np.float32)
     alpha[100:] = 1.0
     rough = add_mask_noise(alpha, 3.0, np.random.default_rng(0))
@@ -346,7 +346,7 @@ def test_a_folder_that_is_no_capture_is_never_overwritten(tmp_path):
     assert (tmp_path / "thesis.txt").exists()
 
 
-def test_every_progress_step_is_told_once(tmp_path):
+def test_every_progress_step_is_reported_once(tmp_path):
     told = []
     film_capture(tmp_path / "c", ShootConfig(frames=2, size=32), lambda *step: told.append(step))
     assert told == [(done, 14) for done in range(1, 15)]

@@ -114,7 +114,7 @@ def test_a_webm_keeps_soft_alpha(tmp_path):
         assert np.abs(alpha - rgba[..., 3]).mean() < 2.0
 
 
-def test_without_the_extra_it_is_said_what_is_written(monkeypatch, tmp_path):
+def test_without_the_extra_the_fallback_codec_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(video_encoder, "_pyav_has", lambda codec: False)
     white = background_compositor("white")
     assert "VP8" in choose_encoder(tmp_path / "a.webm", white).description

@@ -211,7 +211,7 @@ def test_golden_frames_look_the_same_here(call_play, package, tmp_path):
     assert min(frame["close"] for frame in found["frames"]) >= 0.999
 
 
-def test_golden_frames_that_look_different_are_told_by_the_exit_code(call_play, package, tmp_path):
+def test_different_golden_frames_set_the_exit_code(call_play, package, tmp_path):
     sound = read_package(package)
     dark = tuple(np.where(frame > 128, frame - 100, frame) for frame in sound.golden[1:])
     other = tmp_path / "avatar.iavatar"
@@ -234,7 +234,7 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
         assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
 
 
-def test_what_was_wrong_when_a_package_was_written_is_said(package):
+def test_warnings_of_the_export_are_repeated_when_played(package):
     manifest = replace(Player.load(package).manifest, metrics={})
     assert package_warnings(manifest) == []
     mark = {"psnr": 6.9, "verdict": "failed"}
@@ -337,7 +337,7 @@ def test_a_folder_or_a_pipe_in_the_packages_place_is_named(call_play, package, t
 
 
 @pytest.mark.parametrize("command", [play, ingest])
-def test_without_any_argument_what_is_missing_is_said(command, capsys):
+def test_missing_arguments_are_named(command, capsys):
     with pytest.raises(SystemExit) as end:
         command.main([])
     assert end.value.code == 2

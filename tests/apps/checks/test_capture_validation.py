@@ -255,7 +255,7 @@ def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt,
 
 
 @pytest.mark.slow
-def test_a_camera_that_nobody_described_is_found(spoilt, call_check):
+def test_an_unknown_camera_is_found(spoilt, call_check):
     _, _, found = call_check(spoilt(capture_corruptions.reset_extrinsics))
     assert found["cause"] == "world_frame"
     assert found["iou"]["after_fix"] > 0.75
@@ -278,7 +278,7 @@ def test_a_sheet_that_is_no_picture_is_refused_before_anything_is_looked_at(tmp_
     assert ".png" in capsys.readouterr().err
 
 
-def test_what_cannot_be_read_is_said_in_the_json_too(tmp_path, call_check):
+def test_unreadable_input_is_reported_in_the_json_too(tmp_path, call_check):
     code, said, found = call_check(tmp_path / "nothing", "--poses", tmp_path / "none.npz")
     assert code == 2
     assert found["verdict"] == "unusable"

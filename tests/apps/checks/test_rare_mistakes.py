@@ -55,7 +55,7 @@ def change_masks(folder: Path, change) -> None:
 
 
 @pytest.mark.slow
-def test_a_cropped_video_is_told_by_its_principal_point_and_mended(
+def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
     capture, diagnosed, tmp_path, capsys
 ):
     cut = 18
@@ -148,9 +148,7 @@ def test_without_masks_the_pictures_edges_tell_whether_poses_fit(capture, diagno
 
 
 @pytest.mark.slow
-def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
-    capture, diagnosed, tmp_path
-):
+def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path):
     true = read_motion(capture / "poses.npz")
     back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
     write_motion(capture / "poses.npz", back)
@@ -165,7 +163,7 @@ def test_a_film_that_runs_backwards_against_its_poses_is_told_and_mended(
 
 
 @pytest.mark.slow
-def test_degrees_are_told_from_radians_and_mended(capture, diagnosed, tmp_path):
+def test_degrees_are_distinguished_from_radians_and_corrected(capture, diagnosed, tmp_path):
     true = read_motion(capture / "poses.npz")
     degrees = replace(
         true,

@@ -50,7 +50,7 @@ def test_each_failure_has_its_number_and_one_message(error, code, word, capsys):
     assert said.count("\n") == 1
 
 
-def test_what_is_added_on_the_way_is_said(capsys):
+def test_notes_added_to_an_error_are_printed(capsys):
     error = OSError(errno.ENOSPC, "No space left on device")
     error.add_note("The checkpoint is kept.")
     assert run_command("ia-test", raising(error)) == 3
@@ -129,7 +129,7 @@ def test_a_reader_that_has_seen_enough_is_no_fault():
         assert process.stderr.read() == b""
 
 
-def test_work_goes_on_when_nobody_listens_any_more():
+def test_work_continues_when_its_output_is_closed():
     code = (
         "import sys\n"
         "from apps.cli.console import Console\n"

@@ -227,7 +227,9 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
         ([], "run"),
     ],
 )
-def test_what_cannot_be_scored_is_said(run, film, call_evaluate, tmp_path, words, told):
+def test_what_cannot_be_scored_is_refused_with_the_reason(
+    run, film, call_evaluate, tmp_path, words, told
+):
     lost = tmp_path / "lost"
     shutil.copytree(run, lost)
     (lost / "report.json").unlink()

@@ -52,7 +52,7 @@ def test_where_threads_say_nothing_steps_do(trainer, tmp_path):
     assert meter.measure() == CpuTime(used_s=22.0, waited_s=40.0, steps=200)
 
 
-def test_a_starved_run_is_told_what_it_missed():
+def test_a_run_short_of_cpu_time_reports_the_missing_steps():
     said = CpuTime(used_s=17.0, waited_s=103.0, steps=134).warning()
     assert "17 of 120 core-seconds" in said
     assert "134 instead of about 946 steps" in said

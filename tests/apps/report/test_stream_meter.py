@@ -117,7 +117,7 @@ def test_of_very_many_lost_frames_only_the_number_is_kept():
     assert [note.index for note in meter.dropped] == list(range(MAX_DROPPED_LISTED))
 
 
-def test_what_the_source_and_the_inbox_dropped_is_told_together():
+def test_drops_of_the_source_and_of_the_inbox_are_summed():
     source = Recorded()
     meter = StreamMeter(threading.Event(), source)
     source.dropped, meter.inbox_dropped = 3, 4

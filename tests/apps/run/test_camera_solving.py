@@ -213,7 +213,7 @@ def test_the_process_ends_with_a_parent_that_is_killed(walkaround, tmp_path):
     assert not Path(f"/proc/{child}").exists()
 
 
-def test_a_process_that_breaks_is_said_with_its_log(walkaround, tmp_path):
+def test_a_broken_solver_process_is_reported_with_its_log(walkaround, tmp_path):
     with SolverProcess(job_of(walkaround), tmp_path) as solving:
         solving._process.kill()
         with pytest.raises(InputError, match=r"(?s)ended with -9.*log\.txt"):

@@ -16,7 +16,7 @@ GIVEN = "--no-refine-poses"
 FEW = ("--frames", "0:8", GIVEN)
 
 
-def test_another_video_is_added_and_what_the_first_lost_is_said(
+def test_another_video_is_added_and_forgetting_is_reported(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
     from avatar.training import saved_frames

@@ -126,7 +126,7 @@ def test_a_camera_that_another_program_uses(call_ingest, film, tmp_path, monkeyp
         (["--live", "--idle-seconds", "0.2"], "No picture came"),
     ],
 )
-def test_what_is_wrong_with_a_live_source_is_said(call_ingest, tmp_path, arguments, word):
+def test_errors_of_a_live_source_are_reported(call_ingest, tmp_path, arguments, word):
     (tmp_path / "capture" / "images").mkdir(parents=True)
     outcome = call_ingest(tmp_path / "capture", *arguments, "--out", tmp_path / "run")
     assert outcome.code == 2

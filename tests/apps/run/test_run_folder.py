@@ -117,7 +117,7 @@ def test_a_file_is_never_an_input_nor_read_as_a_part_of_one(tmp_path):
     check_output_file(capture / "runs" / "sheet.png", "--sheet", inputs, overwrite=False)
 
 
-def test_a_file_that_is_there_is_replaced_when_that_is_asked_for(tmp_path):
+def test_an_existing_file_is_replaced_only_on_request(tmp_path):
     path = tmp_path / "clip.mp4"
     path.write_bytes(b"film")
     with pytest.raises(InputError, match=r"--overwrite.*--out \S*clip-2\.mp4"):
@@ -272,7 +272,7 @@ def test_a_killed_run_holds_its_folder_no_longer(tmp_path):
     assert not (tmp_path / LOCK_FILE_NAME).exists()
 
 
-def test_somebody_elses_file_is_no_lock(tmp_path):
+def test_a_foreign_file_is_not_taken_for_a_lock(tmp_path):
     (tmp_path / LOCK_FILE_NAME).write_text("mine")
     with pytest.raises(InputError, match="not a lock"), lock_folder(tmp_path, Console()):
         pass

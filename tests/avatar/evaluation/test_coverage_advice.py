@@ -44,7 +44,7 @@ def test_before_the_first_frame_no_person_has_been_seen(coverage):
     assert coverage_advice(coverage) == NOT_SEEN_YET
 
 
-def test_who_faces_the_camera_is_told_to_turn(observed, coverage):
+def test_a_person_facing_the_camera_is_advised_to_turn(observed, coverage):
     coverage.add(observed())
     assert coverage_advice(coverage) == "Turn until your back has been seen."
 

@@ -121,7 +121,7 @@ def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
 
 
 @given(count=st.integers(0, 60), most=st.integers(2, 20))
-def test_at_most_so_many_are_scored_evenly_over_the_stream(held, count, most):
+def test_scored_frames_are_limited_and_evenly_spread(held, count, most):
     frames = [
         HeldOutFrame(observation=held.observation, correspondences=held.correspondences)
         for _ in range(count)

@@ -80,7 +80,7 @@ def along_a_line(*logs: float) -> tuple[torch.Tensor, torch.Tensor]:
     return raw, points
 
 
-def test_a_steep_edge_becomes_as_gentle_as_is_asked_and_a_gentle_one_stays():
+def test_a_steep_edge_flattens_to_the_limit_and_a_gentle_one_stays():
     raw, points = along_a_line(5.0, -5.0)
     for _ in range(2000):
         raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
@@ -94,7 +94,7 @@ def test_the_slope_of_empty_space_is_not_penalised():
     assert not field_priors.density_slope_gradient(raw, points, 600.0, 1.0).any()
 
 
-def test_needless_density_is_asked_to_fall():
+def test_needless_density_is_penalized():
     raw, points = along_a_line(8.0, 8.0)
     for _ in range(4000):
         raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
@@ -111,7 +111,7 @@ def test_only_the_colors_of_visible_pairs_become_even():
     assert not field_priors.color_tv_gradient(raw, 1.0).any()
 
 
-def test_close_pairs_are_drawn_only_where_something_is_asked_of_them(generator):
+def test_close_pairs_are_drawn_only_if_a_prior_needs_them(generator):
     samples = torch.rand(100, 3, generator=generator)
     before = generator.get_state()
     assert len(field_priors.sample_smoothness_pairs(samples, TrainConfig(), generator)) == 0

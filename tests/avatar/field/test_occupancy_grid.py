@@ -103,7 +103,7 @@ def test_there_are_no_empty_points_while_everything_is_occupied(occupancy, gener
     assert len(occupancy.sample_empty(100, generator)) == 0
 
 
-def test_haze_counts_as_nothing_where_that_is_asked(occupancy, generator):
+def test_haze_below_the_minimum_density_counts_as_empty(occupancy, generator):
     def haze(at):
         return torch.full_like(at[:, 0], math.log(30.0))
 

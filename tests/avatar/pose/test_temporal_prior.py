@@ -62,7 +62,7 @@ def test_the_error_of_a_frame_in_between_is_guessed_where_errors_wander(rng):
     assert np.mean(np.square(missed)) < 0.3 * np.mean(np.square(errors[10::10]))
 
 
-def test_a_slot_is_asked_of_by_its_neighbours_and_does_not_tell_of_itself(rng):
+def test_a_pose_is_predicted_by_its_neighbours_and_not_by_itself(rng):
     errors, neighbours = errors_of(rng, 40, alike=0.95), TemporalPosePrior(40)
     for slot in range(40):
         neighbours.set_frame(slot, slot)

@@ -74,7 +74,7 @@ def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
     assert source.waited_s > 0.2
 
 
-def test_who_comes_late_gets_the_latest_and_is_told_what_was_lost(monkeypatch):
+def test_a_late_reader_gets_the_newest_frames_and_a_drop_count(monkeypatch):
     monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(500))
     source = CameraDevice("0", FrameSelection(), PacingClock())
     frames = source.frames()

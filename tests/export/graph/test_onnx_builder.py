@@ -48,7 +48,7 @@ def test_bits_are_masked_and_shifted_without_a_sign():
 
 
 @pytest.mark.parametrize("turns", [0, 1, 7])
-def test_a_loop_does_its_body_as_often_as_it_is_told(turns):
+def test_a_loop_runs_its_body_the_given_number_of_times(turns):
     graph = GraphBuilder()
     x, count = graph.input("x", np.float32, [4]), graph.input("count", np.int64, [])
 

@@ -352,7 +352,7 @@ def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
             Player(replace(read_package(exported.path), graphs={"hq": graph}))
 
 
-def test_a_graph_that_draws_no_picture_or_asks_for_everything_is_told(exported, views):
+def test_a_graph_with_a_wrong_or_too_large_output_is_refused(exported, views):
     size = numpy_helper.from_array(np.array([1 << 20, 1 << 20, 4]), "size")
     endless = helper.make_node(
         "ConstantOfShape", ["size"], ["rgba"], value=helper.make_tensor("v", 6, [1], [7])

@@ -87,7 +87,7 @@ def test_every_file_that_the_page_names_is_there(files):
     assert {"runtime/LICENSE", "runtime/ThirdPartyNotices.txt"} <= files.keys()
 
 
-def test_a_runtime_that_is_not_there_is_asked_for(tmp_path):
+def test_a_missing_runtime_is_refused_with_the_command_to_run(tmp_path):
     with pytest.raises(InputError, match="make web"):
         onnxruntime_web.runtime_files(tmp_path)
 

@@ -52,7 +52,7 @@ def test_a_fisheye_is_never_read_as_another_lens(tmp_path, said):
     assert read_named_cameras(path)[0].camera.distortion[0] == 0.1
 
 
-def test_pictures_of_one_name_in_several_folders_are_told_apart(tmp_path):
+def test_images_of_one_name_in_several_folders_are_distinguished(tmp_path):
     content = {"w": 80, "h": 60, "fl_x": 90.0}
     both = [
         {"file_path": f"images\\{side}\\{n}.png", "transform_matrix": pose.tolist()}

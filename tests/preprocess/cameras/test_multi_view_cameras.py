@@ -77,7 +77,7 @@ def test_a_folder_of_pictures_takes_the_camera_that_it_is_named_like(studio, cam
         assert same(track[0], cameras[name])
 
 
-def test_a_video_of_another_name_is_told_the_names(studio):
+def test_a_video_of_another_name_is_refused_with_the_camera_names(studio):
     with pytest.raises(InputError, match=r"3 cameras \(01, 02, B3\).*named like none.*Name"):
         read_multi_view_camera(studio, studio / "dance.mp4", SIZE)
 
@@ -118,7 +118,7 @@ def test_zju_mocap_speaks_in_millimetres_and_names_cameras_by_folders(tmp_path, 
          "Rot_01: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 7", "not rigid"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_a_file_is_said(studio, file, old, new, words):
+def test_errors_in_a_camera_file_are_reported(studio, file, old, new, words):
     text = (studio / file).read_text()
     assert old in text
     (studio / file).write_text(text.replace(old, new))

@@ -236,7 +236,7 @@ def test_what_is_no_pose_of_smpl_is_called_by_its_name(tmp_path, content, words)
         read_poses(path)
 
 
-def test_hdf5_is_told_how_to_become_an_npz(tmp_path):
+def test_hdf5_is_refused_with_the_conversion_to_npz(tmp_path):
     path = tmp_path / "reconstructed_poses.hdf5"
     path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(InputError, match=r"HDF5.*h5py.*savez"):

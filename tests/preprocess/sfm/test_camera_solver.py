@@ -67,7 +67,7 @@ def test_cameras_of_a_walk_are_solved_to_millimetres(walk):
     assert {gate.name for gate in solved.gates} >= {"agreement", "followed_px", "registered"}
 
 
-def test_every_stage_is_told_and_paid_for(walk):
+def test_every_stage_reports_progress_and_cost(walk):
     *_, solved, _, told = walk
     stages = list(dict.fromkeys(name for name, _ in told))
     assert stages == [
@@ -92,7 +92,7 @@ def test_what_is_finished_is_not_done_again(walk, tmp_path, monkeypatch):
     assert again.gates == solved.gates
 
 
-def test_a_stage_that_was_cut_off_is_done_anew(walk, tmp_path):
+def test_an_interrupted_stage_is_repeated(walk, tmp_path):
     _, source, solved, work, _ = walk
     shutil.copytree(work, tmp_path / "work")
     (tmp_path / "work" / "frames between").rename(tmp_path / "work" / "part.frames between")
@@ -200,7 +200,7 @@ def test_a_tripod_needs_no_solution(room, walked, tmp_path, monkeypatch):
     assert CameraSolution.load(tmp_path / "work").is_static
 
 
-def test_a_missing_pycolmap_is_said(monkeypatch, tmp_path):
+def test_a_missing_pycolmap_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(colmap_mapping.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="pip install pycolmap"):
         colmap_mapping.require_pycolmap()

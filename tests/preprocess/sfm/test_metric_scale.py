@@ -71,7 +71,7 @@ def test_without_a_floor_a_person_in_place_tells(cameras):
     assert scale.metres_per_unit == pytest.approx(TRUE, rel=1e-9)
 
 
-def test_nothing_tells_the_size_is_said(cameras, rng):
+def test_an_unknown_metric_scale_is_reported(cameras, rng):
     wandering = np.cumsum(rng.normal(size=(len(cameras), 3)), axis=0) * [1.0, 0.0, 1.0]
     scale = estimate_metric_scale(filmed(cameras, at=wandering), None)
     assert "floor was not seen" in scale.rejection_reason

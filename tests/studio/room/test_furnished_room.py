@@ -165,7 +165,7 @@ def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
         assert abs(actor.sole_height_m(motion[row])) < 1e-9
 
 
-def test_the_cameras_are_told_only_by_the_truth(capture):
+def test_the_cameras_are_written_to_the_ground_truth_only(capture):
     assert {path.name for path in capture.iterdir()} == {
         "video.mp4", "preview.webm", "masks", "poses.npz", "dance.npz", "truth", LIST
     }  # fmt: skip
