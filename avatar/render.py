@@ -68,7 +68,65 @@ class BodyFrameRays:
         )
 
 
-@torch.no_grad()
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedAvatar:
+    """An avatar in one pose, ready to be seen by one camera.
+
+    Attributes:
+        avatar: Avatar to render.
+        camera: Camera and size of the image.
+        world_from_body: Transform of the pose's body frame.
+        grid: Occupancy outside which the field is taken to be empty.
+        tables: Correspondence grid of the pose, without cells that lead to unoccupied space.
+        check: Finds spurious samples.
+        bounds: Rows and columns of the image outside of which nothing is seen.
+    """
+
+    avatar: Avatar
+    camera: Camera
+    world_from_body: Float[np.ndarray, "4 4"]
+    grid: DensityGrid
+    tables: CorrespondenceTables
+    check: CorrespondenceCheck
+    bounds: tuple[slice, slice]
+
+    @classmethod
+    def of(
+        cls,
+        avatar: Avatar,
+        pose: BodyPose,
+        camera: Camera,
+        *,
+        cells: CorrespondenceGrid | None = None,
+    ) -> "PosedAvatar":
+        """Culls the correspondence grid of a pose, and solves it unless it is given."""
+        device = avatar.field.table.device
+        cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
+        world_from_body = avatar.rig.world_from_body(pose)
+        grid = avatar.rendering_grid()
+        cells = cull_cells(cells, grid)
+        return cls(
+            avatar=avatar,
+            camera=camera,
+            world_from_body=world_from_body,
+            grid=grid,
+            tables=correspondence_tables(cells, device),
+            check=CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device),
+            bounds=screen_bounds(cells, camera, world_from_body),
+        )
+
+    @torch.no_grad()
+    def colors_at(self, pixels: Float[np.ndarray, "pixels 2"]) -> Float32[np.ndarray, "pixels 4"]:
+        """Premultiplied RGBA in [0, 1] at image points, px."""
+        field = self.avatar.field
+        rays = BodyFrameRays.through(pixels, self.camera, self.world_from_body)
+        colors = trace_rays(
+            field, ray_batch(rays, field.table.device), self.tables,
+            grid=self.grid, check=self.check, sample_step_m=self.avatar.sample_step_m,
+        )  # fmt: skip
+        return colors.cpu().numpy()
+
+
 def render(
     avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid | None = None
 ) -> Float32[np.ndarray, "height width 4"]:
@@ -84,23 +142,12 @@ def render(
         camera: Camera and size of the image.
         cells: Correspondence grid of the pose, if it has been solved already.
     """
-    device = avatar.field.table.device
-    cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
-    world_from_body = avatar.rig.world_from_body(pose)
-    grid = avatar.rendering_grid()
-    cells = cull_cells(cells, grid)
-    rows, columns = screen_bounds(cells, camera, world_from_body)
-    check = CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device)
-    tables = correspondence_tables(cells, device)
+    posed = PosedAvatar.of(avatar, pose, camera, cells=cells)
     width, height = camera.size_px
     picture = np.zeros((height, width, 4), dtype=np.float32)
+    rows, columns = posed.bounds
     for part, pixels in pixel_chunks(picture[rows, columns], rows.start, columns.start):
-        rays = BodyFrameRays.through(pixels, camera, world_from_body)
-        colors = trace_rays(
-            avatar.field, ray_batch(rays, device), tables,
-            grid=grid, check=check, sample_step_m=avatar.sample_step_m,
-        )  # fmt: skip
-        part[:] = colors.cpu().numpy().reshape(part.shape)
+        part[:] = posed.colors_at(pixels).reshape(part.shape)
     return picture
 
 

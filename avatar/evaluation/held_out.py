@@ -13,7 +13,7 @@ from avatar.deformation.rig import Rig
 from avatar.evaluation.image_metrics import (
     composite_on_white,
     ground_truth_on_white,
-    psnr,
+    psnr_of_errors,
     soft_iou,
     ssim,
 )
@@ -74,10 +74,11 @@ def score_rendering(
     """Compares a premultiplied rendering of a frame's pose with the frame."""
     observation, truth = frame.observation, ground_truth_on_white(frame.observation)
     image = np.clip(composite_on_white(rendering), 0.0, 1.0)
-    psnr_mask = psnr(image, truth, observation.alpha > MASK_THRESHOLD)
+    errors = (image.astype(np.float64) - truth) ** 2
+    psnr_mask = psnr_of_errors(errors[observation.alpha > MASK_THRESHOLD])
     return HeldOutScore(
         frame=observation.frame.index,
-        psnr=psnr(image, truth),
+        psnr=psnr_of_errors(errors),
         psnr_mask=psnr_mask,
         ssim=ssim(image, truth),
         blur=equivalent_blur(psnr_mask, frame.blur_calibration),

@@ -1,15 +1,15 @@
 """Image metrics: PSNR, SSIM and soft IoU, and the white background they are taken on."""
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped
-from scipy.ndimage import correlate1d
 
 from preprocess.observation import Observation
 
 
 def composite_on_white(
-    premultiplied: Float32[np.ndarray, "height width 4"],
-) -> Float32[np.ndarray, "height width 3"]:
+    premultiplied: Float32[np.ndarray, "*shape 4"],
+) -> Float32[np.ndarray, "*shape 3"]:
     """Composites a premultiplied image over white."""
     return premultiplied[..., :3] + (1.0 - premultiplied[..., 3:])
 
@@ -32,17 +32,20 @@ def psnr(
         mask: Pixels that count; all if None. An empty mask gives NaN.
     """
     error = (image.astype(np.float64) - truth) ** 2
-    if mask is not None:
-        error = error[mask]
-    if error.size == 0:
+    return psnr_of_errors(error if mask is None else error[mask])
+
+
+def psnr_of_errors(
+    errors: Float[np.ndarray, "..."], weights: Float[np.ndarray, "..."] | None = None
+) -> float:
+    """PSNR in dB of a (weighted) mean of squared errors; NaN of none."""
+    if errors.size == 0:
         return float("nan")
-    mean = float(error.mean())
+    mean = float(np.average(errors, weights=weights))
     return float("inf") if mean == 0.0 else -10.0 * float(np.log10(mean))
 
 
-def soft_iou(
-    rendered: Shaped[np.ndarray, "height width"], truth: Shaped[np.ndarray, "height width"]
-) -> float:
+def soft_iou(rendered: Shaped[np.ndarray, "*shape"], truth: Shaped[np.ndarray, "*shape"]) -> float:
     """Intersection over union of two silhouettes, in [0, 1]; 1 if both are empty.
 
     Alphas count by Σ min / Σ max, so that fog lowers the value as well.
@@ -59,8 +62,7 @@ def ssim(
     taps /= taps.sum()
 
     def blurred(picture: np.ndarray) -> np.ndarray:
-        inner = correlate1d(correlate1d(picture, taps, axis=0), taps, axis=1)
-        return inner[5:-5, 5:-5]
+        return np.asarray(cv2.sepFilter2D(picture, cv2.CV_64F, taps, taps))[5:-5, 5:-5]
 
     a, b = image.astype(np.float64), truth.astype(np.float64)
     mean_a, mean_b = blurred(a), blurred(b)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -30,16 +30,19 @@ def score_with_fitted_poses(
     trainer: Trainer,
     frames: list[HeldOutFrame],
     *,
+    given: Sequence[HeldOutScore] | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[HeldOutScore, ...]:
     """Scores of held-out frames in poses fitted to them (`fit_test_poses`)."""
-    return tuple(found for _, found in fit_test_poses(trainer, frames, progress=progress))
+    fitted = fit_test_poses(trainer, frames, given=given, progress=progress)
+    return tuple(score for _, score in fitted)
 
 
 def fit_test_poses(
     trainer: Trainer,
     frames: list[HeldOutFrame],
     *,
+    given: Sequence[HeldOutScore] | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[tuple[HeldOutFrame, HeldOutScore]]:
     """Held-out frames in poses that have been fitted to them, each with its score.
@@ -51,21 +54,14 @@ def fit_test_poses(
     Args:
         trainer: Trainer of the avatar; the gradients of its field are overwritten.
         frames: Frames that were never trained on.
+        given: Their scores in the given poses, if these have been measured already.
         progress: Receives the completed share, from 0 to 1.
     """
     if not frames:
         return
     avatar, field = trainer.avatar, trainer.avatar.field
     device = field.table.device
-    replay = ReplayBuffer(len(frames), device)
-    poses = PoseOptimizer(avatar.rig, len(frames), device, avatar_frozen=True)
-    for frame in frames:
-        prepared = prepare_frame(frame.observation, avatar.rig)
-        slot = replay.add(prepared)
-        begin = interpolate_correction(prepared.index, trainer.pose_corrections)
-        poses.set_pose(slot, prepared.pose, correction=begin)
-        if begin.any():
-            resolve_correspondences(avatar.rig, replay, poses, slot)
+    replay, poses = _with_neighboring_corrections(trainer, frames)
     config = dataclasses.replace(
         trainer.config,
         empty_space_weight=0.0,
@@ -93,6 +89,24 @@ def fit_test_poses(
         moved = HeldOutFrame(
             observation=replace(frame.observation, pose=pose), correspondences=cells
         )
-        either = [(one, score_frame(avatar, one)) for one in (frame, moved)]
+        before = score_frame(avatar, frame) if given is None else given[slot]
+        either = [(frame, before), (moved, score_frame(avatar, moved))]
         progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
         yield max(either, key=lambda scored: scored[1].psnr)
+
+
+def _with_neighboring_corrections(
+    trainer: Trainer, frames: list[HeldOutFrame]
+) -> tuple[ReplayBuffer, PoseOptimizer]:
+    """The frames and their poses, slot by slot, corrected like the frames about them."""
+    rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
+    replay = ReplayBuffer(len(frames), device)
+    poses = PoseOptimizer(rig, len(frames), device, avatar_frozen=True)
+    for frame in frames:
+        prepared = prepare_frame(frame.observation, rig)
+        slot = replay.add(prepared)
+        begin = interpolate_correction(prepared.index, trainer.pose_corrections)
+        poses.set_pose(slot, prepared.pose, correction=begin)
+        if begin.any():
+            resolve_correspondences(rig, replay, poses, slot)
+    return replay, poses

@@ -46,9 +46,11 @@ def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None
 class UncompiledAdam(torch.optim.Adam):
     """`torch.optim.Adam` that does not load `torch._dynamo` (0.7 to 1 s) at its first use.
 
-    torch wraps these two methods to exclude them from compilation, and loads the compiler to do so.
+    torch wraps these methods to exclude them from compilation, and loads the compiler to do so.
     Nothing is compiled here, and the unwrapped methods are used.
     """
 
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
     step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))

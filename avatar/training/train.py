@@ -9,9 +9,9 @@ from avatar.evaluation.held_out import (
     HeldOutFrame,
     add_held_out,
     coarse_to_fine_order,
-    score_frame,
     subsample_evenly,
 )
+from avatar.evaluation.pixel_sample import PixelSample
 from avatar.events import (
     Evaluated,
     Finished,
@@ -35,8 +35,9 @@ MIN_STEPS_AFTER_LAST_FRAME = 20
 STREAMING_RATE_FACTOR = 0.5
 """Factor of the learning rates while a video plays in real time: without a falling rate, smaller
 swings of the parameters leave their mean closer to the optimum."""
-EVALUATION_TIME_SHARE = 0.015
-"""Share of the time budget that one evaluation may take; it scores at least one frame."""
+EVALUATION_TIME_SHARE = 0.004
+"""Share of the time budget that one evaluation may take; it scores at least one frame. A minute
+has seven of them: 3 % at most."""
 EVALUATION_TIMES_S = (2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
 """Schedule times of the learning curve, seconds; 30 s apart after the last."""
 
@@ -246,20 +247,24 @@ class _EvaluationSchedule:
         self._trainer = trainer
         self._times = _evaluation_times(after=trainer.scheduled_seconds)
         self._next = next(self._times)
+        self._samples: dict[int, PixelSample] = {}
 
     def is_due(self, now: float) -> bool:
         """Whether the next evaluation is due."""
         return now >= self._next
 
     def score(self, held_out: list[HeldOutFrame], clock: TrainingClock) -> Evaluated:
-        """Scores held-out frames, evenly over the stream, until the evaluation's time is spent."""
+        """Scores held-out frames, evenly over the stream, until the evaluation's time is spent.
+
+        Each is scored by a sample of its pixels (`PixelSample`).
+        """
         trainer, scores = self._trainer, list[HeldOutScore]()
         at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
         enough = clock.read() + EVALUATION_TIME_SHARE * trainer.config.seconds
         for frame in coarse_to_fine_order(subsample_evenly(held_out, FRAMES_PER_EVALUATION)):
             if scores and clock.read() > enough:
                 break
-            scores.append(score_frame(trainer.avatar, frame))
+            scores.append(self._sample(frame).score(trainer.avatar))
         now = clock.read()
         self._next = next(time for time in self._times if time > now)
         return Evaluated(
@@ -268,6 +273,16 @@ class _EvaluationSchedule:
             frames_seen=trainer.frames_seen,
             scores=tuple(scores),
         )
+
+    def _sample(self, frame: HeldOutFrame) -> PixelSample:
+        """The frame's sample, which later evaluations find again; bounded in number."""
+        index = frame.observation.frame.index
+        if index not in self._samples:
+            while len(self._samples) >= 2 * FRAMES_PER_EVALUATION:
+                del self._samples[next(iter(self._samples))]
+            sample = PixelSample.of(frame).with_correspondences(self._trainer.avatar.rig)
+            self._samples[index] = sample
+        return self._samples[index]
 
 
 def _evaluation_times(*, after: float) -> Iterator[float]:

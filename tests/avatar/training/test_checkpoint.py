@@ -106,6 +106,20 @@ def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
     assert again.frames_seen == 3
 
 
+def test_a_detached_state_is_that_of_the_step_it_was_taken_at(trainer, saved, tmp_path):
+    detached = checkpoint.detached_state(trainer)
+    trainer.step(rate=1.0, hard_surface_share=0.5)
+    checkpoint.write_state(detached, tmp_path / "later")
+    before, after = (
+        checkpoint.load(folder, CPU)[0] for folder in (saved.parent, tmp_path / "later")
+    )
+    assert before.steps == after.steps == trainer.steps - 1
+    assert torch.equal(before.field.table, after.field.table)
+    assert not torch.equal(before.field.table, trainer.field.table)
+    moments = [each.optimizer.state[each.field.table]["exp_avg"] for each in (before, after)]
+    assert torch.equal(*moments)
+
+
 def test_a_second_checkpoint_replaces_the_first(trainer, saved):
     trainer.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.save(trainer, saved.parent)
