@@ -9,6 +9,8 @@ from typing import Any
 class CurvePoint:
     """One evaluation of held-out frames during training.
 
+    Its scores are estimates from a sample of each frame's pixels, the same ones every time.
+
     Attributes:
         wall_seconds: Training time up to here, wall clock.
         cpu_seconds: Training time up to here, CPU.
@@ -19,6 +21,7 @@ class CurvePoint:
         frames: Frame number in the video and PSNR of the whole image of each frame scored here.
             Evaluations may score different frames, so only a frame's own scores show a drop.
         video: Number of the video that the frames are from, 1 for the first.
+        pixels: Pixels sampled of each frame, at most; None if all were scored.
     """
 
     wall_seconds: float
@@ -29,6 +32,7 @@ class CurvePoint:
     verdict: str | None = None
     frames: tuple[tuple[int, float], ...] = ()
     video: int = 1
+    pixels: int | None = None
 
     @classmethod
     def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":

@@ -30,10 +30,8 @@ from apps.report.report_schema import (
 )
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
-from avatar.evaluation.held_out import subsample_evenly
-from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
+from avatar.evaluation.image_metrics import ground_truth_on_white
 from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
-from avatar.render import render
 from capture.atomic_files import write_text_atomically
 from capture.live.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb
@@ -114,8 +112,6 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     return f", and check poses and masks: {shlex.join(words)}"
 
 
-MAX_PAIRS = 6
-"""Held-out frames shown beside their renderings on the page."""
 ANIMATION_PX = 320
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
@@ -210,21 +206,19 @@ def play_command(package: Path, poses: Path) -> str:
 def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
     """Held-out frames beside what the avatar shows, for the page."""
     shown = []
-    scores = {score.frame: score for score in result.scores}
-    for held in subsample_evenly(result.held_out, MAX_PAIRS):
+    scores = {score.frame: score for score in result.scores.given}
+    for held in result.held_out:
         observation = held.observation
-        if observation.frame.index not in scores:
+        index = observation.frame.index
+        if index not in result.scores.renderings:
             continue
-        picture = render(
-            result.trainer.avatar, observation.pose, observation.camera, cells=held.correspondences
-        )
         shown.append(
             ComparisonPair(
-                frame=observation.frame.index,
-                psnr=scores[observation.frame.index].psnr,
-                verdict=overall_verdict([scores[observation.frame.index]]),
+                frame=index,
+                psnr=scores[index].psnr,
+                verdict=overall_verdict([scores[index]]),
                 truth=webp_data_uri(to_uint8(ground_truth_on_white(observation))),
-                render=webp_data_uri(to_uint8(composite_on_white(picture))),
+                render=webp_data_uri(result.scores.renderings[index]),
             )
         )
     return shown
@@ -242,9 +236,9 @@ def demo_animation(player: Player) -> str:
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
     """Scores in poses fitted to the frames, if there are any."""
-    if not result.fitted_pose_scores:
+    if not result.scores.fitted:
         return None
-    return replace(HeldOutStats.of(result.fitted_pose_scores, result.meter.size_px), poses="fitted")
+    return replace(HeldOutStats.of(result.scores.fitted, result.meter.size_px), poses="fitted")
 
 
 def _package_stats(result: TrainingResult, run: RunFolder, console: Console) -> PackageStats | None:
@@ -274,7 +268,8 @@ def _build_report(
 ) -> Report:
     trainer, snapshot = result.trainer, result.package
     ready_at = None if package is None or snapshot is None else snapshot.ready_at
-    held_out = HeldOutStats.of(result.scores, result.meter.size_px if result.scores else None)
+    scores = result.scores.given
+    held_out = HeldOutStats.of(scores, result.meter.size_px if scores else None)
     recipe = asdict(trainer.config) | {
         "camera": capture.cameras.source,
         "body": capture.shaped.body.family,

@@ -1,10 +1,12 @@
 """Start of a training session: kernels, a new, resumed or extended trainer, the viewer."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from apps.cli.console import Console, format_duration
 from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
+from apps.evaluation.final_scoring import SCORING_LIMIT_S
 from apps.run.continual_learning import EarlierVideos
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
@@ -199,6 +201,7 @@ def _announce_duration(
         expected_held_out(source.frame_count, arguments.hold_out, MAX_HELD_OUT),
         min(longer_side_px, capture.size_px or longer_side_px),
         fit_poses=config.refine_poses,
+        scoring_limit_s=math.inf if config.steps else SCORING_LIMIT_S,
     )
     seconds = max(0.0, config.seconds - trainer.wall_seconds)
     duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"

@@ -4,6 +4,8 @@ Durations are core-seconds of an idle core, rounded up: packaging as measured fo
 scoring as measured for docs/evaluation.md, pose fitting and report as rough estimates.
 """
 
+import math
+
 PACKAGING_S = 12.0
 """Baking, fine-tuning, checking and writing a package, seconds."""
 SCORE_S = 0.3
@@ -17,7 +19,12 @@ REPORT_S = 3.0
 
 
 def post_training_seconds(
-    held_out: int, longer_side_px: int, *, fit_poses: bool, slowdown: float = 1.0
+    held_out: int,
+    longer_side_px: int,
+    *,
+    fit_poses: bool,
+    slowdown: float = 1.0,
+    scoring_limit_s: float = math.inf,
 ) -> float:
     """Estimate the seconds from the last step to the report.
 
@@ -26,10 +33,11 @@ def post_training_seconds(
         longer_side_px: Their longer side.
         fit_poses: Whether poses are fitted to them as well.
         slowdown: Factor by which the machine is slower than an idle one.
+        scoring_limit_s: Seconds after which no more frames are scored.
     """
     scoring = SCORE_S * (longer_side_px / SCORED_PX) ** 2
-    each = scoring + (POSE_FIT_S + 2.0 * scoring if fit_poses else 0.0)
-    return slowdown * (PACKAGING_S + REPORT_S + held_out * each)
+    each = scoring + (POSE_FIT_S + scoring if fit_poses else 0.0)
+    return slowdown * (PACKAGING_S + REPORT_S) + min(slowdown * held_out * each, scoring_limit_s)
 
 
 def expected_held_out(frames: int | None, hold_every: int, maximum: int) -> int:

@@ -1,7 +1,8 @@
 """Result of training, for scores, package and report."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from apps.evaluation.final_scoring import FinalScores
 from apps.report.cpu_contention import CpuTime
 from apps.report.learning_curve import CurvePoint
 from apps.report.report_schema import ForgettingStats
@@ -9,7 +10,6 @@ from apps.report.stream_meter import StreamMeter
 from apps.run.package_snapshot import PackageSnapshot
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.events import HeldOutScore
 from avatar.training.trainer import Trainer
 
 
@@ -27,8 +27,7 @@ class TrainingResult:
         interrupted: Whether Ctrl-C ended training.
         cpu_time: CPU time used, and lost to other programs.
         package: Outcome of packaging; None before `TrainingSession.bake`.
-        scores: Final scores of the held-out frames in the given poses; empty before `bake`.
-        fitted_pose_scores: Final scores in poses fitted to the frames, if poses are refined.
+        scores: Final scores of the held-out frames; empty before `bake`.
         earlier_videos: Forgetting of earlier videos, if there were any.
     """
 
@@ -41,8 +40,7 @@ class TrainingResult:
     interrupted: bool
     cpu_time: CpuTime
     package: PackageSnapshot | None = None
-    scores: tuple[HeldOutScore, ...] = ()
-    fitted_pose_scores: tuple[HeldOutScore, ...] = ()
+    scores: FinalScores = field(default_factory=FinalScores)
     earlier_videos: ForgettingStats | None = None
 
     @property

@@ -1,11 +1,9 @@
 """A training session: frames in, steps, checkpoints, package, scores."""
 
+import math
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, final
 
@@ -13,10 +11,12 @@ import torch
 
 from apps.cli.console import Console, ProgressBar, format_duration
 from apps.cli.exit_codes import BAD_INPUT, INTERRUPTED, CommandExit
+from apps.evaluation.final_scoring import SCORING_LIMIT_S, score_finally
 from apps.report.cpu_contention import CpuContentionMeter, CpuTime
 from apps.report.learning_curve import CurvePoint
 from apps.report.report_schema import finite_mean, format_percent, format_psnr
 from apps.report.stream_meter import StreamMeter
+from apps.run.checkpoint_writer import CheckpointWriter
 from apps.run.continual_learning import EarlierVideos, earlier_video_names
 from apps.run.package_snapshot import (
     PackageSnapshot,
@@ -32,24 +32,18 @@ from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
-from avatar.evaluation.held_out import HeldOutFrame, add_held_out, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, add_held_out
+from avatar.evaluation.pixel_sample import PIXELS_PER_FRAME
 from avatar.evaluation.sharpness import overall_verdict
 from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
-from avatar.training import checkpoint
 from avatar.training.frame_stream import StreamItem, prepare_items, separate_held_out
-from avatar.training.held_out_pose_fitting import score_with_fitted_poses
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
-from capture.atomic_files import atomic_file
 from capture.inbox import Inbox
 from capture.live.realtime_playback import RealtimePlayback
 from export.bake.render_targets import PosedView
-from preprocess.body.body_file import write_shaped_body
 from preprocess.capture_session import Capture
-
-CHECKPOINT_INTERVAL_S = 5.0
-"""Seconds of training between two checkpoints."""
 
 
 def new_trainer(
@@ -116,7 +110,7 @@ class TrainingSession:
             CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
         ]
         self.held_out: list[HeldOutFrame] = []
-        self._checkpointed_at, self._body_written = time.perf_counter(), False
+        self._checkpoints = CheckpointWriter(run, recording.shaped)
         self.meter = StreamMeter(stop, recording.source)
         self.coverage = Coverage(recording.shaped)
         if "coverage" in notes:
@@ -143,7 +137,8 @@ class TrainingSession:
         try:
             added = self._restore_frames(inbox, restore_count) - self.trainer.frames_seen
             self._set_unpaced(False)
-            self._checkpointed_at, waited = time.perf_counter(), CpuContentionMeter(self.trainer)
+            self._checkpoints.restart_interval()
+            waited = CpuContentionMeter(self.trainer)
             with self._console.progress("training", self.trainer.config.seconds) as bar:
                 for event in train(self.trainer, inbox, self.held_out):
                     self._handle_event(event, bar)
@@ -155,6 +150,7 @@ class TrainingSession:
         finally:
             source.close()
             inbox.close()
+            self._checkpoints.settle()
         self.meter.inbox_dropped, cpu = inbox.dropped, waited.measure()
         interrupted = self._stop.is_set()
         late = [*self.meter.lateness_warnings(), *filter(None, [cpu.warning()])]
@@ -177,7 +173,7 @@ class TrainingSession:
         )
 
     def bake(self, result: TrainingResult) -> TrainingResult:
-        """Write the package, then score every held-out frame.
+        """Write the package, then score the held-out frames.
 
         A paced source has a user waiting at its end, so a quick package comes first and a final
         one with finer detail replaces it after scoring.
@@ -191,8 +187,12 @@ class TrainingSession:
             validation_views(self.held_out, self._recording),
             self._recording.source.paced,
         )
-        with self._checkpointing():
+        self._begin_checkpoint(trains_on=False)  # baking changes nothing of it
+        try:
             package = self._write_package("writing the package", views, quick=quick)
+        finally:
+            self._checkpoints.settle()
+        self._checkpoints.wait()
         result = self._with_scores(result)
         if quick:
             final = self._write_package("writing the final package, with finer detail", views)
@@ -225,28 +225,20 @@ class TrainingSession:
                 progress=bar.set_share,
             )
 
-    @contextmanager
-    def _checkpointing(self) -> Iterator[None]:
-        """Write a checkpoint on another thread during this block, which must not train."""
-        with ThreadPoolExecutor(1) as beside:
-            saved = beside.submit(self._save_checkpoint)
-            yield
-        saved.result()
-
     def _with_scores(self, result: TrainingResult) -> TrainingResult:
-        """Score every held-out frame, in the given poses and in poses fitted to it."""
-        scores = self._score_held_out()
-        self._save_checkpoint()
+        """Score held-out frames, in the given poses and in poses fitted to them."""
+        fits = self.trainer.config.refine_poses and not result.interrupted
+        scores = score_finally(self.trainer, self.held_out, self._console, fit_poses=fits)
+        last = self.curve[-1].wall_seconds if self.curve else -1.0
+        if scores.sampled and self.trainer.wall_seconds > last:
+            wall_s, cpu_s = self.trainer.wall_seconds, self.trainer.cpu_seconds
+            self._add_curve_point(scores.sampled, wall_s, cpu_s)
+        self._begin_checkpoint(trains_on=False)
+        self._checkpoints.wait()
         extended = EarlierVideos(self._run, self._notes).measure_forgetting(
             self.trainer, self.held_out, self._console
         )
-        return replace(
-            result,
-            scores=scores,
-            fitted_pose_scores=() if result.interrupted else self._score_in_fitted_poses(),
-            curve=tuple(self.curve),
-            earlier_videos=extended,
-        )
+        return replace(result, scores=scores, curve=tuple(self.curve), earlier_videos=extended)
 
     def _set_unpaced(self, unpaced: bool) -> None:
         """Deliver frames without delay while a resumed run reads back what it has seen."""
@@ -287,8 +279,8 @@ class TrainingSession:
             case Stepped():
                 self.meter.inbox_depth.add(float(self._inbox.pending))
                 progress.update(self.trainer.scheduled_seconds, self._progress_text())
-                if time.perf_counter() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
-                    self._save_checkpoint()
+                if self._checkpoints.is_due():
+                    self._begin_checkpoint(trains_on=True)
             case Evaluated():
                 point = self._add_curve_point(event.scores, event.wall_seconds, event.cpu_seconds)
                 if point.psnr is not None:
@@ -305,6 +297,7 @@ class TrainingSession:
             max(size),
             fit_poses=config.refine_poses,
             slowdown=1.0 / max(cpu.granted_share, 0.05),
+            scoring_limit_s=math.inf if config.steps else SCORING_LIMIT_S,
         )
         return f"about {format_duration(rest)}"
 
@@ -348,39 +341,12 @@ class TrainingSession:
             verdict=overall_verdict(scores),
             frames=tuple((s.frame, s.psnr) for s in scores),
             video=1 + len(earlier_video_names(self._notes)),
+            pixels=PIXELS_PER_FRAME,
         )
         self.curve.append(point)
         return point
 
-    def _score_held_out(self) -> tuple[HeldOutScore, ...]:
-        if not self.held_out:
-            return ()
-        scores = tuple(self._score_with_progress(self.held_out))
-        last = self.curve[-1].wall_seconds if self.curve else -1.0
-        if self.trainer.wall_seconds > last:
-            self._add_curve_point(scores, self.trainer.wall_seconds, self.trainer.cpu_seconds)
-        return scores
-
-    def _score_with_progress(self, held: Sequence[HeldOutFrame]) -> Iterator[HeldOutScore]:
-        with self._console.progress(
-            f"scoring {len(held)} held-out frames", float(len(held))
-        ) as bar:
-            for done, frame in enumerate(held, start=1):
-                yield score_frame(self.trainer.avatar, frame)
-                bar.set_count(done)
-
-    def _score_in_fitted_poses(self) -> tuple[HeldOutScore, ...]:
-        if not (self.held_out and self.trainer.config.refine_poses):
-            return ()
-        with self._console.progress("fitting poses to the held-out frames", 1.0) as bar:
-            return score_with_fitted_poses(self.trainer, self.held_out, progress=bar.set_share)
-
-    def _save_checkpoint(self) -> None:
+    def _begin_checkpoint(self, *, trains_on: bool) -> None:
         curve = [vars(point) for point in self.curve]
         notes = {**self._notes, "curve": curve, "coverage": self.coverage.to_state()}
-        checkpoint.save(self.trainer, self._run.checkpoint, notes=notes)
-        if not self._body_written:
-            with atomic_file(self._run.body_file) as path:
-                write_shaped_body(path, self._recording.shaped)
-            self._body_written = True
-        self._checkpointed_at = time.perf_counter()
+        self._checkpoints.begin(self.trainer, notes, trains_on=trains_on)

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from apps.run import report_writer, training_session
+from apps.evaluation import final_scoring
+from apps.run import checkpoint_writer, report_writer
 from apps.run.report_writer import diagnose_failure
 from apps.run.run_folder import RunFolder
 from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
@@ -59,7 +60,7 @@ def test_the_report_has_the_keys_that_were_agreed(report):
         assert list(found) == keys.split()
     assert set(report["curve"][0]) == {
         "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask", "verdict",
-        "frames", "video",
+        "frames", "video", "pixels",
     }  # fmt: skip
     last = report["curve"][-1]
     assert [frame for frame, _ in last["frames"]] == report["held_out"]["frames"]
@@ -92,12 +93,12 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
 ):
     """The package and the report are there; the exit code is not 0."""
     monkeypatch.setattr(report_writer, "diagnose_failure", diagnose_failure)
-    score = training_session.score_frame
+    score = final_scoring.score_rendering
 
-    def as_of_a_room(avatar, held):
-        return replace(score(avatar, held), psnr=6.88, blur=math.inf, overlap=0.2)
+    def as_of_a_room(picture, held):
+        return replace(score(picture, held), psnr=6.88, blur=math.inf, overlap=0.2)
 
-    monkeypatch.setattr(training_session, "score_frame", as_of_a_room)
+    monkeypatch.setattr(final_scoring, "score_rendering", as_of_a_room)
     out = tmp_path / "run"
     outcome = call_ingest(capture, *FEW, "--out", out, "--no-refine-poses")
     assert outcome.code == 1
@@ -213,7 +214,8 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
 def test_a_full_disk_keeps_the_checkpoint_before(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(training_session, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_COST_SHARE", 1e6)
     save, written = torch.save, []
 
     def full_after_one(state, file):
