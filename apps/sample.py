@@ -32,6 +32,10 @@ class SampleArguments:
     video it comes without cameras: poses.npz is relative to the camera of each frame, with K; the
     true cameras are in OUT/truth/cameras.npz, for comparison or for --cameras.
 
+    With --like-a-phone everything is a little wrong, as in reality. OUT/truth then holds what is
+    exact of body, poses, cameras and masks; ia-ingest takes it with --body, --poses, --cameras and
+    --masks.
+
     Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C. The folder is written whole or not at
     all.
     """
@@ -57,7 +61,9 @@ def _film(config: SampleArguments, console: Console) -> int:
         raise
     video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
     console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
-    console.info(f"Preview for a browser: {config.out / 'preview.webm'}. Next:")
+    if not config.shoot.like_a_phone:
+        console.info(f"Preview for a browser: {config.out / 'preview.webm'}.")
+    console.info("Next:")
     console.info(f"  ia-ingest {video} --poses {poses}")
     return DONE
 

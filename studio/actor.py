@@ -13,8 +13,9 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
 from preprocess.body.parametric_body import ShapedBody
 from studio.clothing_layers import all_template_points, build_layers
-from studio.lighting import bake_light, composite_over, shade_pixels
+from studio.lighting import LAMP_STRENGTH, bake_light, composite_over, shade_pixels
 from studio.outfit import OUTFITS, SHOE, Outfit
+from studio.phone.proportions import BodyProportions
 from studio.zbuffer import rasterize
 
 A_POSE = np.zeros(69)
@@ -51,9 +52,19 @@ class Actor:
     palette: Float32[np.ndarray, "colors 3"]
 
     @classmethod
-    def of(cls, subject: int = 1, seed: int = 0) -> "Actor":
-        """Subject 1 or 2; the seed varies shape and colors a little (0: as designed)."""
+    def of(
+        cls, subject: int = 1, seed: int = 0, proportions: BodyProportions | None = None
+    ) -> "Actor":
+        """One of the subjects of `OUTFITS`.
+
+        Args:
+            subject: Which one.
+            seed: Varies shape and colors a little (0: as designed).
+            proportions: What is different from the body model beyond betas; None: nothing.
+        """
         body, outfit = load_body_model(), OUTFITS[subject]
+        if proportions is not None:
+            outfit = replace(outfit, looseness=proportions.looseness)
         generator = np.random.default_rng([seed, subject])
         spread = 0.0 if seed == 0 else 1.0
         betas = np.zeros(10)
@@ -68,9 +79,13 @@ class Actor:
             [layer.faces + start for layer, start in zip(layers, starts, strict=False)]
         )
         kinds = np.concatenate([np.full(len(layer.faces), layer.material) for layer in layers])
+        shaped = body.with_shape(betas)
+        if proportions is not None:
+            rest = proportions.move_vertices(rest, body.weights[source], shaped.joints)
+            shaped = _reproportion(shaped, proportions)
         undone = cls(
             betas=betas,
-            shaped=body.with_shape(betas),
+            shaped=shaped,
             outfit=outfit,
             rest_vertices=rest,
             template_points=all_template_points(layers),
@@ -80,7 +95,7 @@ class Actor:
             baked_light=np.ones((len(rest), 3), dtype=np.float32),
             palette=np.clip(np.array(outfit.palette) * tint, 0.0, 1.0).astype(np.float32),
         )
-        return undone._with_baked_light()
+        return undone.with_baked_light()
 
     @cached_property
     def _weights(self) -> Float[np.ndarray, "vertices 24"]:
@@ -142,8 +157,12 @@ class Actor:
         rgb, alpha = self.render_rgb_alpha(pose, camera)
         return composite_over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
 
-    def _with_baked_light(self) -> "Actor":
-        """The same actor with the light of the A-pose painted on."""
+    def with_baked_light(self, lamp_strength: float = LAMP_STRENGTH) -> "Actor":
+        """The same actor with the light of the A-pose painted on.
+
+        Args:
+            lamp_strength: Of the lamp, as a factor of color; without it the sky's light remains.
+        """
         pose = BodyPose(
             root_rotation=np.zeros(3),
             root_translation=np.zeros(3),
@@ -157,5 +176,15 @@ class Actor:
             template_points=self.template_points,
             materials=self.materials,
             measures=self.outfit.measures,
+            lamp_strength=lamp_strength,
         )
         return replace(self, baked_light=light)
+
+
+def _reproportion(shaped: ShapedBody, proportions: BodyProportions) -> ShapedBody:
+    """The body at rest with other proportions."""
+    return replace(
+        shaped,
+        vertices=proportions.move_vertices(shaped.vertices, shaped.body.weights, shaped.joints),
+        joints=proportions.move_joints(shaped.joints),
+    )

@@ -11,23 +11,35 @@ from preprocess.body.body_pose import BodyPose, Motion
 from studio.actor import Actor
 from studio.gestures import FILMED_DANCE, KICK, NOVEL_POSES, UNFILMED_DANCE, Arm, Gesture, Leg
 
+ARM_LIFT_DEG = -44.0
+"""Upper arms above the horizontal, while the actor turns before a wide camera."""
 
-def turning_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+
+def turning_motion(
+    actor: Actor,
+    *,
+    frames: int,
+    fps: float,
+    turns: float,
+    seed: int,
+    arm_lift_deg: float = ARM_LIFT_DEG,
+) -> Motion:
     """Turning round on the spot, arms off the body, swaying a little (PeopleSnapshot's way)."""
     phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, 8)
-    return _motion_from_gestures(
-        actor, [_turning_gesture(i / frames, turns, phases) for i in range(frames)], fps
-    )
+    gestures = [_turning_gesture(i / frames, turns, phases, arm_lift_deg) for i in range(frames)]
+    return _motion_from_gestures(actor, gestures, fps)
 
 
-def _turning_gesture(share: float, turns: float, phases: Float[np.ndarray, "8"]) -> Gesture:
-    """The turn after `share` of its length."""
+def _turning_gesture(
+    share: float, turns: float, phases: Float[np.ndarray, "8"], lift: float
+) -> Gesture:
+    """The turn after `share` of its length, the arms at `lift` degrees."""
     wave = np.sin(2.0 * np.pi * share * np.array([3, 2, 5, 3, 4, 2, 3, 5]) + phases)
     knee = 7.0 + 6.0 * wave[4]
     bend = Leg(out=5.0 + wave[3], forward=0.55 * knee, knee=knee)
     return Gesture(
-        left=Arm(lift=-44.0 + 9.0 * wave[0], forward=8.0 * wave[1], elbow=16.0 + 9.0 * wave[2]),
-        right=Arm(lift=-44.0 + 9.0 * wave[5], forward=8.0 * wave[6], elbow=16.0 - 9.0 * wave[2]),
+        left=Arm(lift=lift + 9.0 * wave[0], forward=8.0 * wave[1], elbow=16.0 + 9.0 * wave[2]),
+        right=Arm(lift=lift + 9.0 * wave[5], forward=8.0 * wave[6], elbow=16.0 - 9.0 * wave[2]),
         left_leg=bend,
         right_leg=bend,
         lean=2.5 * wave[3],

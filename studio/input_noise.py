@@ -20,11 +20,21 @@ BORDER_NOISE_SCALE_PX = 6.0
 
 
 def add_mask_noise(
-    alpha: Float32[np.ndarray, "height width"], noise_px: float, generator: np.random.Generator
+    alpha: Float32[np.ndarray, "height width"],
+    noise_px: float,
+    generator: np.random.Generator,
+    *,
+    grown_px: float = 0.0,
+    soft_px: float = 1.0,
 ) -> Float32[np.ndarray, "height width"]:
-    """The mask with its border moved in and out by smooth noise of `noise_px` (standard deviation).
+    """The mask with its border moved in and out by smooth noise.
 
-    The border stays one pixel soft. Without noise the mask is returned as it is.
+    Args:
+        alpha: The exact mask; returned as it is if there is no noise.
+        noise_px: Standard deviation of the border.
+        generator: Where the noise comes from.
+        grown_px: How far the whole border is moved outwards.
+        soft_px: Width of the border's ramp from 0 to 1.
     """
     if noise_px == 0.0:
         return alpha
@@ -34,7 +44,8 @@ def add_mask_noise(
         white, (0, 0), BORDER_NOISE_SCALE_PX, borderType=cv2.BORDER_REFLECT_101
     )
     wander *= noise_px * 2.0 * np.sqrt(np.pi) * BORDER_NOISE_SCALE_PX  # a blur leaves 1 / (2 √π σ)
-    return np.clip(inside_px + wander + 0.5, 0.0, 1.0).astype(np.float32)
+    moved = (inside_px + grown_px + wander) / soft_px
+    return np.clip(moved + 0.5, 0.0, 1.0).astype(np.float32)
 
 
 NOISE_FRAMES = 3.0
@@ -54,8 +65,8 @@ def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: 
         return motion
     generator = np.random.default_rng([seed, 3])
     frames = len(motion)
-    turned = _smooth_noise(generator, (frames, 24, 3)) * np.deg2rad(degrees)
-    moved = _smooth_noise(generator, (frames, 3)) * centimetres / 100.0
+    turned = smooth_noise(generator, (frames, 24, 3)) * np.deg2rad(degrees)
+    moved = smooth_noise(generator, (frames, 3)) * centimetres / 100.0
     return replace(
         motion,
         root_rotations=motion.root_rotations + turned[:, 0],
@@ -80,12 +91,18 @@ def to_camera_space(
     )
 
 
-def _smooth_noise(
-    generator: np.random.Generator, shape: tuple[int, ...]
+def smooth_noise(
+    generator: np.random.Generator, shape: tuple[int, ...], over: float = NOISE_FRAMES
 ) -> Float[np.ndarray, "frames *rest"]:
-    """Gaussian noise of unit variance, smooth over `NOISE_FRAMES` frames."""
-    margin = int(4 * NOISE_FRAMES)
+    """Gaussian noise of unit variance, smooth over a number of frames (a Gaussian's width).
+
+    Args:
+        generator: Where the noise comes from.
+        shape: Frames, and what each has.
+        over: Standard deviation of the smoothing, frames.
+    """
+    margin = max(1, int(4 * over))
     white = generator.standard_normal((shape[0] + 2 * margin, *shape[1:]))
-    smooth = gaussian_filter1d(white, NOISE_FRAMES, axis=0)[margin:-margin]
+    smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + shape[0]]
     # The power of a Gaussian filter: its variance falls to 1 / (2 √π σ).
-    return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * NOISE_FRAMES)
+    return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * over)

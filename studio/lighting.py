@@ -18,6 +18,8 @@ LAMP_FROM = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
 LAMP_RGB = np.array([1.00, 0.96, 0.88])
 SKY_RGB = np.array([0.92, 0.97, 1.00])
 FLOOR_RGB = np.array([0.62, 0.56, 0.50])
+LAMP_STRENGTH = 0.42
+"""Light of the lamp, as a factor of color."""
 
 SHADOW_BIAS_M = 0.02
 """A surface does not shade itself nearer than this."""
@@ -32,23 +34,21 @@ def bake_light(
     materials: Int32[np.ndarray, "faces"],
     measures: Float32[np.ndarray, "cuts"],
     directions: int = 32,
+    lamp_strength: float = LAMP_STRENGTH,
 ) -> Float32[np.ndarray, "vertices 3"]:
     """Light on each vertex as a factor of its color, about 0.45 in folds to 1.15 in the lamp."""
     sky = np.zeros((len(points), 3))
     lamp = np.zeros(len(points))
     weight = lamp_weight = 0.0
     for toward in _fibonacci_directions(directions):
-        camera = _directional_camera(points, toward)
-        depth_seen = rasterize(
+        free = lamp_visibility(
             points,
             faces,
-            camera,
-            supersampling=1,
+            toward,
             template_points=template_points,
             materials=materials,
             measures=measures,
-        ).depth
-        free = _visibility(points, camera, depth_seen)
+        )
         facing = np.maximum(normals @ toward, 0.0) * free
         up = 0.5 + 0.5 * toward[1]
         sky += facing[:, None] * (up * SKY_RGB + (1.0 - up) * FLOOR_RGB)
@@ -56,8 +56,37 @@ def bake_light(
         near_lamp = max(float(toward @ LAMP_FROM) - 0.55, 0.0)
         lamp += facing * near_lamp
         lamp_weight += near_lamp
-    light = 0.32 + 0.58 * sky / weight + 0.42 * LAMP_RGB * (lamp / lamp_weight)[:, None]
+    light = 0.32 + 0.58 * sky / weight + lamp_strength * LAMP_RGB * (lamp / lamp_weight)[:, None]
     return light.astype(np.float32)
+
+
+def lamp_visibility(
+    points: Float[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    toward: Float[np.ndarray, "3"],
+    *,
+    template_points: Float32[np.ndarray, "vertices 3"],
+    materials: Int32[np.ndarray, "faces"],
+    measures: Float32[np.ndarray, "cuts"],
+) -> Float[np.ndarray, "vertices"]:
+    """How much of each vertex a far lamp reaches past the others, in [0, 1].
+
+    Args:
+        points, faces: Vertices in the world, metres, and triangles.
+        toward: Unit vector to the lamp.
+        template_points, materials, measures: As `rasterize` reads them.
+    """
+    camera = _directional_camera(points, toward)
+    seen = rasterize(
+        points,
+        faces,
+        camera,
+        supersampling=1,
+        template_points=template_points,
+        materials=materials,
+        measures=measures,
+    )
+    return _visibility(points, camera, seen.depth)
 
 
 def _fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:

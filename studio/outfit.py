@@ -3,7 +3,7 @@
 All places are on the *template* (the mean body in T-pose, metres), so every person wears the same
 cut; `x` is the body's left, `y` up, `z` out of the chest.
 
-What the two subjects wear: measures of the cut, thickness of the cloth, colors.
+What the three subjects wear: measures of the cut, thickness of the cloth, colors.
 """
 
 from dataclasses import dataclass
@@ -95,6 +95,7 @@ class Outfit:
         bun: Whether the hair is tied up in a knot.
         checked: A checked shirt; else a striped one.
         palette: sRGB colors in [0, 1], in the order that `paint` names.
+        looseness: Factor of how far shirt and trousers stand off the body.
     """
 
     betas: tuple[float, ...]
@@ -108,6 +109,7 @@ class Outfit:
     bun: bool
     checked: bool
     palette: tuple[tuple[float, float, float], ...]
+    looseness: float = 1.0
 
     @property
     def measures(self) -> Float32[np.ndarray, "cuts"]:
@@ -128,7 +130,8 @@ class Outfit:
         folds = 0.0055 * np.sin(np.arctan2(z - 0.03, x) * 7.0 + 3.0 * np.sin(y * 9.0))
         folds = folds * _smoothstep_array(-y, -0.12, 0.25) * (1.0 - on_sleeve)
         creases = 0.003 * np.sin(side * 110.0 + 9.0 * z) * on_sleeve
-        return (1.0 - on_sleeve) * torso + on_sleeve * sleeve + folds + creases
+        thickness = (1.0 - on_sleeve) * torso + on_sleeve * sleeve + folds + creases
+        return self.looseness * thickness
 
     def trouser_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
@@ -138,7 +141,7 @@ class Outfit:
         down = _smoothstep_array(-y, -BELT_Y, 1.1)
         knee = np.exp(-(((y + 0.70) / 0.10) ** 2)) + np.exp(-(((y + 1.08) / 0.07) ** 2))
         creases = 0.0035 * np.sin(y * 95.0 + 14.0 * np.abs(x) + 20.0 * z) * knee
-        return 0.007 + 0.014 * down + creases
+        return self.looseness * (0.007 + 0.014 * down + creases)
 
     def hair_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
@@ -201,6 +204,24 @@ OUTFITS = {
             *("e46f51", "f3c9a0", "5b2a4d"),
             *("5f6b45", "717f54", "d9cf9a"),
             *("3b3f4a", "f0ede6"),
+        ),
+    ),
+    3: Outfit(
+        betas=(-0.1, 0.3, 0.2, -0.3),
+        sleeve=0.420,
+        hem=-0.330,
+        cuff=-1.140,
+        neck_depth=0.050,
+        nape=0.385,
+        fringe=0.566,
+        ears_covered=True,
+        bun=False,
+        checked=True,
+        palette=_srgb_palette(
+            *("c98d68", "a5524c", "7a5230", "55703f"),
+            *("7d8ea3", "dfe3e6", "a33b3b"),
+            *("4a4440", "5b534d", "8f8677"),
+            *("8c6f55", "e3ddd0"),
         ),
     ),
 }

@@ -1,36 +1,31 @@
 """Film the actor before a backdrop or in a room, and write a native capture folder."""
 
-import errno
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from os import cpu_count
 from pathlib import Path
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
-from capture.image_folder import silence_opencv
 from capture.input_error import InputError
 from capture.video_encoder import video_encoder
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.poses.pose_file import write_motion
 from studio import actor_motions, studio_cameras
 from studio.actor import Actor
+from studio.capture_files import lossless_video, to_uint8, write_cameras, write_png
+from studio.draw_ahead import RenderedFrame, ShootProgress, draw_ahead
 from studio.input_noise import add_mask_noise, add_pose_noise, to_camera_space
 from studio.lighting import composite_over
+from studio.phone.phone_capture import write_phone_capture
 from studio.room import painted_backdrop
 from studio.room.furnished_room import FurnishedRoom
 from studio.shoot_config import ShootConfig as ShootConfig
 from studio.studio_cameras import static_camera
-
-RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
-"""The actor on the stage, and the exact soft mask."""
 
 
 @final
@@ -59,19 +54,7 @@ class StudioScene:
 
     def render_all(self, motion: Motion) -> Iterator[RenderedFrame]:
         """All pictures of a motion in order, a few drawn ahead on other threads."""
-        workers = max(1, min(4, cpu_count() or 1))
-        with ThreadPoolExecutor(workers) as pool:
-            ahead = deque()
-            try:
-                for row in range(len(motion)):
-                    ahead.append(pool.submit(self.render, motion[row], row))
-                    if len(ahead) > workers:
-                        yield ahead.popleft().result()
-                while ahead:
-                    yield ahead.popleft().result()
-            finally:
-                for waiting in ahead:
-                    waiting.cancel()
+        return draw_ahead(lambda row: self.render(motion[row], row), len(motion))
 
     def _render_background(
         self, camera: Camera, feet: Float[np.ndarray, "feet 3"], number: int
@@ -79,10 +62,6 @@ class StudioScene:
         if isinstance(self.background, FurnishedRoom):
             return self.background.render(camera, feet, self.first_frame_number + number)
         return painted_backdrop.add_foot_shadows(self.background, feet, camera)
-
-
-ShootProgress = Callable[[int, int], None]
-"""Called after each picture with how many are done and how many there will be."""
 
 
 def film_capture(
@@ -96,7 +75,7 @@ def film_capture(
 
     Args:
         out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
-            in truth/), poses.npz, dance.npz and truth/.
+            in truth/), poses.npz, dance.npz and truth/; see `write_phone_capture` for a phone's.
         config: What is filmed.
         progress: Told after each picture; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
@@ -108,7 +87,8 @@ def film_capture(
     config.validate()
     _check_output(out, overwrite=overwrite)
     with atomic_folder(out) as unfinished:
-        _write_capture(unfinished, config, progress or (lambda done, total: None))
+        write = write_phone_capture if config.like_a_phone else _write_capture
+        write(unfinished, config, progress or (lambda done, total: None))
 
 
 def _check_output(out: Path, *, overwrite: bool) -> None:
@@ -143,10 +123,10 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
     if config.camera_moves:
         # A phone does not know where it is: the cameras are ground truth, where no command looks.
-        _write_cameras(folder / "truth" / "cameras.npz", cameras)
-        _write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
+        write_cameras(folder / "truth" / "cameras.npz", cameras)
+        write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
     else:
-        _write_cameras(folder / "cameras.npz", cameras)
+        write_cameras(folder / "cameras.npz", cameras)
 
 
 def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
@@ -186,19 +166,6 @@ def _build_scenes(
     return filmed, replace(filmed, cameras=(apart,), first_frame_number=len(truth))
 
 
-def _write_cameras(path: Path, cameras: tuple[Camera, ...]) -> None:
-    """One camera, or one a frame, with their common K."""
-    extrinsics = np.stack([camera.camera_from_world for camera in cameras])
-    width, height = cameras[0].size_px
-    np.savez(
-        path,
-        intrinsic=cameras[0].intrinsic,
-        extrinsic=extrinsics[0] if len(cameras) == 1 else extrinsics,
-        height=height,
-        width=width,
-    )
-
-
 def _write_video(
     folder: Path,
     stage: StudioScene,
@@ -208,36 +175,14 @@ def _write_video(
 ) -> None:
     """video.mp4, lossless (FFV1), and masks/."""
     (folder / "masks").mkdir()
-    path = folder / "video.mp4"
-    # The default mp4v costs 30 dB on stripes; FFV1 is exact, fast, and OpenCV reads it.
-    silence_opencv()
-    code = cv2.VideoWriter.fourcc(*"FFV1")
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, config.fps, stage.cameras[0].size_px)
-    if not writer.isOpened():
-        path.write_bytes(bytes(1 << 16))  # says so if there is no room
-        raise InputError(
-            f"OpenCV {cv2.__version__} cannot write a lossless video (FFV1 in .mp4); 4.13 or newer "
-            "can: pip install --upgrade opencv-contrib-python-headless."
-        )
     generator = np.random.default_rng([config.seed, 5])
-    try:
+    size_px = stage.cameras[0].size_px
+    with lossless_video(folder / "video.mp4", size_px, config.fps, len(motion)) as writer:
         for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
             writer.write(np.ascontiguousarray(rgb[..., ::-1]))
             mask = add_mask_noise(alpha, config.mask_noise_px, generator)
-            _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
+            write_png(folder / "masks" / f"{index:04d}.png", to_uint8(mask))
             done(index + 1)
-    finally:
-        writer.release()
-    _check_video(path, len(motion))
-
-
-def _check_video(path: Path, frames: int) -> None:
-    """Count the frames of the file: OpenCV does not report write errors."""
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    written = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
-    video.release()
-    if written != frames:
-        raise OSError(errno.ENOSPC, f"only {written} of {frames} video frames could be written")
 
 
 def _write_preview(folder: Path, fps: float) -> None:
@@ -259,17 +204,7 @@ def _write_novel_poses(
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
-        _write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
-        _write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(alpha))
+        write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
+        write_png(folder / "masks" / f"{index:04d}.png", to_uint8(alpha))
         done(index + 1)
     write_motion(folder / "poses.npz", motion)
-
-
-def _to_uint8(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    return (alpha * 255.0 + 0.5).astype(np.uint8)
-
-
-def _write_png(path: Path, image: UInt8[np.ndarray, "..."]) -> None:
-    """A PNG in OpenCV's channel order; unlike OpenCV's own writer it says when the disk is full."""
-    _, code = cv2.imencode(".png", image)
-    path.write_bytes(code.tobytes())

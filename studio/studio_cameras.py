@@ -21,16 +21,33 @@ HEADROOM_SHARE = 0.110
 """Share of the picture above the head: room for raised arms."""
 
 
+PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE = 0.85, 0.075
+"""The same of a portrait."""
+
+
 def static_camera(actor: Actor, size: int) -> Camera:
     """The studio's square camera, set up for one actor; the world's floor is y = 0."""
-    points = _standing_vertices(actor)
-    focal, target = 1.3 * size, 0.9
-    camera = _aim_camera(size, focal, target)
+    return _frame_actor(actor, (size, size), PERSON_HEIGHT_SHARE, HEADROOM_SHARE)
+
+
+def portrait_camera(actor: Actor, width: int) -> Camera:
+    """A phone held upright on a tripod, 9:16, set up for one actor; sides are even numbers."""
+    size_px = 2 * round(width / 2), 2 * round(width * 8 / 9)
+    return _frame_actor(actor, size_px, PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE)
+
+
+def _frame_actor(
+    actor: Actor, size_px: tuple[int, int], height_share: float, headroom_share: float
+) -> Camera:
+    """A camera whose picture the standing actor fills to a share of its height."""
+    points, height = _standing_vertices(actor), size_px[1]
+    focal, target = 1.3 * height, 0.9
+    camera = _aim_camera(size_px, focal, target)
     for _ in range(12):
-        rows = camera.project(points)[:, 1] / size
-        focal *= PERSON_HEIGHT_SHARE / float(np.ptp(rows))
-        target += (HEADROOM_SHARE - float(rows.min())) * size * STATIC_DISTANCE_M / focal
-        camera = _aim_camera(size, focal, target)
+        rows = camera.project(points)[:, 1] / height
+        focal *= height_share / float(np.ptp(rows))
+        target += (headroom_share - float(rows.min())) * height * STATIC_DISTANCE_M / focal
+        camera = _aim_camera(size_px, focal, target)
     return camera
 
 
@@ -48,7 +65,7 @@ def _standing_vertices(actor: Actor) -> Float[np.ndarray, "vertices 3"]:
     return np.concatenate(views)
 
 
-def _aim_camera(size: int, focal: float, target: float) -> Camera:
+def _aim_camera(size_px: tuple[int, int], focal: float, target: float) -> Camera:
     """A camera in front of the actor that looks at the height `target` above the origin."""
     eye = np.array([0.0, STATIC_HEIGHT_M, STATIC_DISTANCE_M])
     forward = np.array([0.0, target, 0.0]) - eye
@@ -59,8 +76,8 @@ def _aim_camera(size: int, focal: float, target: float) -> Camera:
     camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
     return Camera(
         focal_px=(focal, focal),
-        center_px=(0.5 * size, 0.5 * size),
-        size_px=(size, size),
+        center_px=(0.5 * size_px[0], 0.5 * size_px[1]),
+        size_px=size_px,
         camera_from_world=camera_from_world,
     )
 

@@ -89,14 +89,29 @@ def refocus_translation(
 ) -> Float[np.ndarray, "3"]:
     """How far a body must be moved so that another camera sees it where the tracker's saw it.
 
-    Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x.
-
     Args:
         joints: In the tracker's camera, metres.
         intrinsic: The tracker's K, for pictures of the camera's size.
         camera: The true one; its place does not matter.
     """
     pixels = joints[:, :2] / joints[:, 2:] * intrinsic[[0, 1], [0, 1]] + intrinsic[:2, 2]
+    return place_by_pixels(joints, pixels, camera)
+
+
+def place_by_pixels(
+    joints: Float[np.ndarray, "joints 3"],
+    pixels: Float[np.ndarray, "joints 2"],
+    camera: Camera,
+) -> Float[np.ndarray, "3"]:
+    """How far a body must be moved so that a camera sees its joints at given pixels.
+
+    Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x.
+
+    Args:
+        joints: In the camera's axes, metres, from any place.
+        pixels: Where each is to be seen.
+        camera: Without distortion; its place does not matter.
+    """
     middle = joints.mean(axis=0)
     shape = joints - middle
     focal, away = np.array(camera.focal_px), pixels - np.array(camera.center_px)

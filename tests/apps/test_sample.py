@@ -25,6 +25,14 @@ def test_it_films_and_says_what_comes_next(tmp_path, capsys):
     ]  # fmt: skip
 
 
+def test_a_capture_like_a_phones_names_no_preview(tmp_path, capsys):
+    assert run(tmp_path / "c", "--like-a-phone", "--frames", 2, "--size", 36) == 0
+    printed = capsys.readouterr().err
+    assert "preview" not in printed
+    assert "--poses" in printed
+    assert (tmp_path / "c" / "truth" / "body.npz").exists()
+
+
 @pytest.mark.parametrize(
     ("option", "value"),
     [("--frames", "0"), ("--size", "3"), ("--fps", "nan"), ("--mask-noise-px", "-1")],
@@ -44,7 +52,7 @@ def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
 
 
 def test_unknown_subjects_are_bad_input(tmp_path):
-    assert run(tmp_path / "c", "--subject", 3) == 2
+    assert run(tmp_path / "c", "--subject", 4) == 2
 
 
 @pytest.mark.parametrize(

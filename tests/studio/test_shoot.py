@@ -33,7 +33,7 @@ def dressed_once():
         yield
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[1, 2, 3])
 def actor(request):
     return Actor.of(request.param)
 

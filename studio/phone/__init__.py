@@ -1,0 +1,1 @@
+"""Captures as a phone, a tracker and a segmenter give them: everything a little wrong."""
