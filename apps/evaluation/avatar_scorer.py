@@ -88,9 +88,8 @@ class AvatarScorer:
         for held, _ in fit_test_poses(
             trainer, [HeldOutFrame(observation=seen) for seen in observations]
         ):
-            seen = held.observation
-            draw = partial(render, trainer.avatar, seen.pose, seen.camera)
-            self._fitted.scores.append(score_frame(seen, draw))
+            draw = partial(_render_exposed, trainer, held)
+            self._fitted.scores.append(score_frame(held.observation, draw))
 
 
 def evaluate_avatar(
@@ -122,6 +121,11 @@ def evaluate_avatar(
         judge.score_frames(frames, bar, stop)
     video = str(frames.recording.paths.video)
     return AvatarEvaluation(name=name, capture=video, size=judge.size_px, rows=judge.rows)
+
+
+def _render_exposed(trainer: Trainer, held: HeldOutFrame) -> PremultipliedImage:
+    seen = held.observation
+    return held.expose(render(trainer.avatar, seen.pose, seen.camera))
 
 
 def _render_with_player(player: Player, observation: Observation) -> PremultipliedImage:

@@ -55,6 +55,10 @@ class EarlierVideos:
             index - INDEX_SHIFT_PER_VIDEO: correction
             for index, correction in trainer.pose_corrections.items()
         }
+        gains = trainer.exposures.by_frame
+        trainer.exposures.restore(
+            {index - INDEX_SHIFT_PER_VIDEO: gain for index, gain in gains.items()}
+        )
         if not self._kept.replay_frames:
             console.warning(
                 "The previous video's run did not finish, so its key frames were not saved: they "

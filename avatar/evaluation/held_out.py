@@ -41,10 +41,12 @@ class HeldOutFrame:
         observation: Image, mask, pose and camera.
         correspondences: Correspondence grid of the pose; None to solve it at every rendering. A
             grid is as large as its image, and most frames are rendered only once, at the end.
+        gain: Factor of each color channel of the rendering, where the exposure has been fitted.
     """
 
     observation: Observation
     correspondences: CorrespondenceGrid | None = None
+    gain: Float32[np.ndarray, "3"] | None = None
 
     @cached_property
     def blur_calibration(self) -> BlurCalibration:
@@ -52,6 +54,14 @@ class HeldOutFrame:
         return calibrate_blur(
             ground_truth_on_white(self.observation), self.observation.alpha > MASK_THRESHOLD
         )
+
+    def expose(
+        self, rendering: Float32[np.ndarray, "height width 4"]
+    ) -> Float32[np.ndarray, "height width 4"]:
+        """A premultiplied rendering in the frame's exposure."""
+        if self.gain is None:
+            return rendering
+        return rendering * np.append(self.gain, np.float32(1.0))
 
     def with_correspondences(self, rig: Rig) -> "HeldOutFrame":
         """The frame with its correspondence grid, for repeated rendering."""
@@ -71,9 +81,9 @@ def score_frame(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
 def score_rendering(
     rendering: Float32[np.ndarray, "height width 4"], frame: HeldOutFrame
 ) -> HeldOutScore:
-    """Compares a premultiplied rendering of a frame's pose with the frame."""
+    """Compares a premultiplied rendering of a frame's pose, in its exposure, with the frame."""
     observation, truth = frame.observation, ground_truth_on_white(frame.observation)
-    image = np.clip(composite_on_white(rendering), 0.0, 1.0)
+    image = np.clip(composite_on_white(frame.expose(rendering)), 0.0, 1.0)
     errors = (image.astype(np.float64) - truth) ** 2
     psnr_mask = psnr_of_errors(errors[observation.alpha > MASK_THRESHOLD])
     return HeldOutScore(

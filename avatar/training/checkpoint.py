@@ -58,6 +58,9 @@ def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> d
         "corrections": {
             frame: torch.from_numpy(numbers) for frame, numbers in trainer.pose_corrections.items()
         },
+        "gains": {
+            frame: torch.from_numpy(gain) for frame, gain in trainer.exposures.by_frame.items()
+        },
         "notes": notes or {},
     }
 
@@ -129,6 +132,8 @@ def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
     trainer.pose_corrections = {
         frame: tensor.numpy() for frame, tensor in state["corrections"].items()
     }
+    gains = state.get("gains", {})  # checkpoints before 2026-11-22 have none
+    trainer.exposures.restore({frame: gain.numpy() for frame, gain in gains.items()})
     for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])
     return trainer

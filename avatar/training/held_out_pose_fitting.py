@@ -1,10 +1,11 @@
-"""Fits poses to held-out frames with the avatar frozen, to separate the poses' errors."""
+"""Fits poses and exposures to held-out frames with the avatar frozen, to separate their errors."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
@@ -12,12 +13,15 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction
+from avatar.training.frame_exposure import FrameExposures
 from avatar.training.optimizer import cosine_decay
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import Trainer, correct_one_pose, resolve_correspondences
 from avatar.training.training_frame import prepare_frame
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
+MIN_SCORED_GAIN = 0.01
+"""Difference of a gain from 1 up to which the given pose is not scored again with it."""
 CORRECTIONS_PER_FRAME = 32
 """Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 512
@@ -45,11 +49,11 @@ def fit_test_poses(
     given: Sequence[HeldOutScore] | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[tuple[HeldOutFrame, HeldOutScore]]:
-    """Held-out frames in poses that have been fitted to them, each with its score.
+    """Held-out frames in poses and exposures fitted to them, each with its score.
 
-    The avatar is frozen; only the poses are optimized, starting from the corrections of neighboring
+    The avatar is frozen; only poses and exposures are optimized, starting from those of neighboring
     frames. Each correction uses a few hundred rays, so an exact pose ends about a millimetre off;
-    the given pose is kept where it scores higher.
+    the given pose, or exposure, is kept where it scores higher.
 
     Args:
         trainer: Trainer of the avatar; the gradients of its field are overwritten.
@@ -59,9 +63,36 @@ def fit_test_poses(
     """
     if not frames:
         return
-    avatar, field = trainer.avatar, trainer.avatar.field
-    device = field.table.device
+    avatar, device = trainer.avatar, trainer.replay.device
     replay, poses = _with_neighboring_corrections(trainer, frames)
+    exposures = FrameExposures(len(frames), device, avatar_frozen=True)
+    for slot, index in enumerate(replay.frame_indices):
+        exposures.set_frame(slot, index, trainer.exposures.expected_gain(index))
+    _fit_frames(trainer, replay, poses, exposures, progress)
+    for slot, frame in enumerate(frames):
+        pose, gain = poses.pose(slot), exposures.gains[slot].cpu().numpy()
+        cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
+        moved = HeldOutFrame(
+            observation=replace(frame.observation, pose=pose), correspondences=cells, gain=gain
+        )
+        before = score_frame(avatar, frame) if given is None else given[slot]
+        options = [(frame, before), (moved, score_frame(avatar, moved))]
+        if np.abs(gain - 1.0).max() > MIN_SCORED_GAIN:
+            exposed = replace(frame, gain=gain)
+            options.append((exposed, score_frame(avatar, exposed)))
+        progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
+        yield max(options, key=lambda scored: scored[1].psnr)
+
+
+def _fit_frames(
+    trainer: Trainer,
+    replay: ReplayBuffer,
+    poses: PoseOptimizer,
+    exposures: FrameExposures,
+    progress: Callable[[float], None],
+) -> None:
+    """Fits poses and exposures to the frames of `replay`."""
+    avatar, field = trainer.avatar, trainer.avatar.field
     config = dataclasses.replace(
         trainer.config,
         empty_space_weight=0.0,
@@ -70,29 +101,21 @@ def fit_test_poses(
         rays=2 * RAYS_PER_CORRECTION,
     )
     sampler = OccupancySampler(field.backend, avatar.occupancy, config)
-    generator = torch.Generator(device=device).manual_seed(config.seed)
-    steps = math.ceil(CORRECTIONS_PER_FRAME * len(frames) / 2)
+    generator = torch.Generator(device=replay.device).manual_seed(config.seed)
+    steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / 2)
     for step in range(steps):
         batch = replay.sample_rays(config.rays, generator)
-        compute_gradients(
-            avatar, sampler, replay.correspondences, batch, config,
+        result = compute_gradients(
+            avatar, sampler, replay.correspondences, exposures.neutralize(batch), config,
             hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
         field.table_grad.zero_()
+        if config.estimate_exposures:
+            exposures.observe(batch, result.rendered)
         for _ in range(2):
             rate = cosine_decay(step / steps)
             correct_one_pose(avatar.rig, trainer.backend, replay, poses, rate=rate)
         progress(FITTING_SHARE * (step + 1) / steps)
-    for slot, frame in enumerate(frames):
-        pose = poses.pose(slot)
-        cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
-        moved = HeldOutFrame(
-            observation=replace(frame.observation, pose=pose), correspondences=cells
-        )
-        before = score_frame(avatar, frame) if given is None else given[slot]
-        either = [(frame, before), (moved, score_frame(avatar, moved))]
-        progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
-        yield max(either, key=lambda scored: scored[1].psnr)
 
 
 def _with_neighboring_corrections(

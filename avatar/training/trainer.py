@@ -20,6 +20,7 @@ from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import Backend
 from avatar.kernels.hash_levels import HashLevels
 from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.training.frame_exposure import FrameExposures
 from avatar.training.optimizer import UncompiledAdam, update_ema
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.training_frame import TrainingFrame
@@ -50,6 +51,7 @@ class Trainer:
         sampler: Chooses the samples along rays.
         replay: Frames to train on.
         poses: Poses of these frames, corrected if the configuration says so.
+        exposures: Exposures of these frames, estimated if the configuration says so.
         generator: Source of random numbers, on the field's device.
         pose_corrections: Correction of each frame's pose, by the frame's index in its source; a
             frame that is read again starts from it. To be cleared before another source is read;
@@ -81,6 +83,7 @@ class Trainer:
         self.avatar = replace(self.learner, field=self.field.clone())
         self.replay = ReplayBuffer(config.replay_capacity, device)
         self.poses = PoseOptimizer(rig, config.replay_capacity, device)
+        self.exposures = FrameExposures(config.replay_capacity, device)
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
@@ -115,6 +118,7 @@ class Trainer:
             The replay slot that holds the frame.
         """
         slot = self.replay.add(frame)
+        self.exposures.set_frame(slot, frame.index)
         known = self.pose_corrections.get(frame.index)
         step = 0 if is_restored else self.steps
         self.poses.set_pose(slot, frame.pose, correction=known, frame=frame.index, step=step)
@@ -152,7 +156,8 @@ class Trainer:
         refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
         refines = refines and self.poses.freeze_converged(self.steps)
         result = compute_gradients(
-            self.learner, self.sampler, self.replay.correspondences, batch, config,
+            self.learner, self.sampler, self.replay.correspondences,
+            self.exposures.neutralize(batch), config,
             hard_surface_share=hard_surface_share,
             surface_share=1.0 - falling,
             caches_density=self.steps % config.occupancy_interval < 2,
@@ -168,6 +173,8 @@ class Trainer:
         if refines:
             self._correct_poses(falling)
         self.replay.update_errors(batch.rays.slots.long(), result.loss)
+        if config.estimate_exposures:
+            self.exposures.observe(batch, result.rendered)
         if self.steps % config.occupancy_interval == 0:
             self._update_occupancy(1.0 - falling)
         self.steps += 1

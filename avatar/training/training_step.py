@@ -15,6 +15,7 @@ from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
     MarchSettings,
+    PremultipliedPixels,
     RayBatch,
     RaySamples,
 )
@@ -66,10 +67,12 @@ class StepResult(NamedTuple):
 
     Attributes:
         loss: Loss of each ray.
+        rendered: Premultiplied color and alpha of each ray.
         sample_count: Samples of all rays together.
     """
 
     loss: Float32[Tensor, "rays"]
+    rendered: PremultipliedPixels
     sample_count: int
 
 
@@ -109,7 +112,7 @@ def compute_gradients(
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
     background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
-    _, loss, grad = field.backend.composite_loss(
+    rendered, loss, grad = field.backend.composite_loss(
         raw, samples, config.sample_step_m, batch.target, background,
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
@@ -123,7 +126,7 @@ def compute_gradients(
         log_density = raw[:, 3].contiguous()
         grid = learner.occupancy.density_grid
         field.backend.scatter_max_density(seen.points[:count], log_density, grid)
-    return StepResult(loss, count)
+    return StepResult(loss, rendered, count)
 
 
 def _regularization_points(

@@ -1,0 +1,119 @@
+"""Exposure of each training frame: gains of the color channels, as a camera's automatics set them.
+
+A phone adapts exposure and white balance while it films. A field that knows nothing of it learns
+the mean, and poses are bent to hide the difference. The gains of a frame are the ratio of its
+pixels to the rendering of the same rays, from running sums, so that they cost no gradient; training
+targets are divided by them. Their geometric mean over the frames is 1: the avatar stays neutral.
+"""
+
+from collections.abc import Mapping
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from avatar.kernels.backend_protocol import PremultipliedPixels
+from avatar.training.replay_buffer import TrainingBatch
+
+ChannelGains = Float32[np.ndarray, "3"]
+"""Factor of each color channel of a frame against the neutral avatar."""
+
+MIN_PERSON_ALPHA = 0.5
+"""Alpha, in the frame and in the rendering, above which a ray counts."""
+MEMORY_RAYS = 1000.0
+"""Rays of a frame after which an earlier one weighs 1/e, because the field has changed since."""
+INITIAL_RAYS = 50.0
+"""Rays that a frame's initial gains are worth."""
+INITIAL_COLOR = 0.4
+"""Color of these rays."""
+CONSTANT_EXPOSURE_ERROR = 0.015
+"""Standard deviation of the log gains that are found where exposure is constant."""
+MAX_FRAME_GAP = 30
+"""Distance in frames from which a neighbor's gains are no guess."""
+
+
+@final
+class FrameExposures:
+    """Gains of the replay buffer's frames, slot by slot.
+
+    Attributes:
+        gains: Factor of each slot's color channels against the neutral avatar.
+    """
+
+    def __init__(self, capacity: int, device: torch.device, *, avatar_frozen: bool = False) -> None:
+        """Starts without frames.
+
+        Args:
+            capacity: Number of slots.
+            device: Where the gains lie.
+            avatar_frozen: Whether the avatar no longer changes. Its brightness is then known, and
+                gains are neither centered nor shrunk.
+        """
+        self.gains: Float32[Tensor, "slots 3"] = torch.ones(capacity, 3, device=device)
+        self._avatar_frozen = avatar_frozen
+        self._frames: list[int] = []
+        self._restored: dict[int, ChannelGains] = {}
+        self._pixels = torch.zeros(capacity, 3, device=device)
+        self._rendered = torch.zeros(capacity, 3, device=device)
+
+    @property
+    def by_frame(self) -> dict[int, ChannelGains]:
+        """Known gains, by the frames' indices in their source."""
+        gains = self.gains[: len(self._frames)].cpu().numpy().copy()
+        return {**self._restored, **dict(zip(self._frames, gains, strict=True))}
+
+    def restore(self, gains: Mapping[int, ChannelGains]) -> None:
+        """Takes gains of frames that may be read again, instead of those known so far."""
+        self._restored = dict(gains)
+
+    def expected_gain(self, frame: int) -> ChannelGains:
+        """Gains of the nearest known frame; 1 if none is near."""
+        known = self.by_frame
+        nearest = min(known, key=lambda other: abs(other - frame), default=None)
+        if nearest is None or abs(nearest - frame) > MAX_FRAME_GAP:
+            return np.ones(3, dtype=np.float32)
+        return known[nearest]
+
+    def set_frame(self, slot: int, frame: int, gain: ChannelGains | None = None) -> None:
+        """Gives a slot to a frame.
+
+        Args:
+            slot: The next one, or one whose frame is replaced.
+            frame: Index of the frame in its source.
+            gain: Its initial gains; those of the nearest known frame if None.
+        """
+        gain = self.expected_gain(frame) if gain is None else gain
+        self._frames[slot : slot + 1] = [frame]
+        self.gains[slot] = torch.from_numpy(gain).to(self.gains)
+        self._rendered[slot] = INITIAL_RAYS * INITIAL_COLOR
+        self._pixels[slot] = self._rendered[slot] * self.gains[slot]
+
+    def neutralize(self, batch: TrainingBatch) -> TrainingBatch:
+        """The batch as the neutral avatar should look; unchanged while no exposure differs."""
+        target = batch.target.clone()
+        target[:, :3] /= self.gains[batch.rays.slots.long()]
+        return batch._replace(target=target)
+
+    def observe(self, batch: TrainingBatch, rendered: PremultipliedPixels) -> None:
+        """Updates the gains.
+
+        Args:
+            batch: Rays with their pixels as filmed.
+            rendered: Neutral rendering of the same rays.
+        """
+        slots, held = batch.rays.slots.long(), len(self._frames)
+        is_person = torch.minimum(batch.target[:, 3], rendered[:, 3]) > MIN_PERSON_ALPHA
+        seen = torch.cat([torch.ones_like(rendered[:, 3:]), batch.target, rendered], dim=1)
+        sums = seen.new_zeros(held, 9).index_add_(0, slots, seen * is_person[:, None])
+        kept = torch.exp(-sums[:, :1] / MEMORY_RAYS)
+        self._pixels[:held] = kept * self._pixels[:held] + sums[:, 1:4]
+        self._rendered[:held] = kept * self._rendered[:held] + sums[:, 5:8]
+        log_gains = torch.log(self._pixels[:held] / self._rendered[:held])
+        if not self._avatar_frozen:
+            log_gains -= log_gains.mean(dim=0)
+            # James and Stein's shrinkage: differences no larger than their error are not believed
+            power = log_gains.square().mean(dim=0).clamp(min=1e-12)
+            log_gains *= (1.0 - CONSTANT_EXPOSURE_ERROR**2 / power).clamp(min=0.0)
+        self.gains[:held] = log_gains.exp()
