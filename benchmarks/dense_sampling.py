@@ -108,7 +108,8 @@ def dense_as_in_paper(
 def _ends(frame: TrainingFrame, center: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "ends 3"]:
     """Where the samples of a frame's rays begin and end, body frame, metres."""
     middle = np.linalg.norm(frame.origin - center)
-    ends = [frame.origin + (middle + way) * frame.directions for way in (-REACH_M, REACH_M)]
+    directions = frame.directions()
+    ends = [frame.origin + (middle + way) * directions for way in (-REACH_M, REACH_M)]
     return np.concatenate(ends).astype(np.float32)
 
 

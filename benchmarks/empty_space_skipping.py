@@ -15,10 +15,10 @@ from jaxtyping import Float32
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.kernels.backend_protocol import RayBatch
-from avatar.render import BodyFrameRays, correspondence_tables, render
+from avatar.render import correspondence_tables, render
 from avatar.training.optimizer import cosine_decay
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame
 from benchmarks.dense_sampling import DenseSampler, dense_as_in_paper, dense_in_box
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer
@@ -156,14 +156,12 @@ def _rendering(seen: LoadedTrainer, held: HeldOutFrame, device: torch.device) ->
 
 def whole_frame(seen: LoadedTrainer, held: HeldOutFrame) -> TrainingFrame:
     """A held-out frame with every pixel of its picture."""
-    observation, rig = held.observation, seen.trainer.avatar.rig
-    pixels = observation.camera.pixel_centers().reshape(-1, 2)
-    rays = BodyFrameRays.through(pixels, observation.camera, rig.world_from_body(observation.pose))
-    return TrainingFrame(
-        index=observation.frame.index, pose=observation.pose, correspondences=held.correspondences,
-        origin=rays.origin, directions=rays.directions,
-        colors=np.zeros((len(pixels), 4), dtype=np.uint8), near_count=len(pixels),
-    )  # fmt: skip
+    observation = held.observation
+    near = np.ones_like(observation.alpha, dtype=bool)
+    view = RayView(camera=observation.camera, near_person_bits=np.packbits(near))
+    colors = np.zeros((near.size, 4), dtype=np.uint8)
+    rig = seen.trainer.avatar.rig
+    return rebuild_frame(observation.frame.index, observation.pose, view, colors, rig)
 
 
 def dense_picture(
@@ -174,7 +172,7 @@ def dense_picture(
     field, grid = avatar.field, avatar.occupancy.density_grid
     origin = torch.from_numpy(frame.origin).to(grid.low)
     parts = []
-    for chunk in torch.from_numpy(frame.directions).to(grid.low).split(RAYS_AT_ONCE):
+    for chunk in torch.from_numpy(frame.directions()).to(grid.low).split(RAYS_AT_ONCE):
         count = len(chunk)
         rays = RayBatch(
             origin.expand(count, 3).contiguous(),

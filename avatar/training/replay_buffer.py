@@ -5,24 +5,28 @@ from all kept frames, half in proportion to each frame's running error; a new fr
 largest error.
 """
 
-from typing import NamedTuple, final
+from dataclasses import replace
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from avatar.deformation.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.pose.pose_optimizer import RootCorrection
 from avatar.training.keyframe_selection import view_descriptor
-from avatar.training.training_frame import RayView, TrainingFrame
+from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame
+from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
 NEAR_PERSON_RAY_SHARE = 0.9
 """Share of the rays that pass through pixels near the person."""
 ERROR_EMA_DECAY = 0.9
 """Decay of each frame's running error."""
+PIXEL_KEYS_PER_SLOT = 1 << 32
+"""Distance of the slots' keys in the search for a pixel's run; no image has as many pixels."""
 
 
 class ReplayFrame(NamedTuple):
@@ -32,7 +36,7 @@ class ReplayFrame(NamedTuple):
         index: Index of the frame in its source.
         pose: The tracker's pose.
         view: Camera and pixels.
-        colors: Premultiplied RGBA of these pixels.
+        colors: Premultiplied RGBA of the pixels near the person.
     """
 
     index: int
@@ -53,6 +57,18 @@ class TrainingBatch(NamedTuple):
     target: Float32[Tensor, "rays 4"]
 
 
+class _RunTable(NamedTuple):
+    """Runs of pixels of all slots, one after the other.
+
+    Attributes:
+        ends: `PixelRuns.ends` plus the slot's multiple of `PIXEL_KEYS_PER_SLOT`: rising.
+        shifts: `PixelRuns.shifts`.
+    """
+
+    ends: Int64[np.ndarray, "runs"]
+    shifts: Int32[np.ndarray, "runs"]
+
+
 @final
 class ReplayBuffer:
     """Bounded buffer of prepared frames with distinct views and poses, one slot each.
@@ -66,7 +82,7 @@ class ReplayBuffer:
         self.capacity = capacity
         self.device = device
         self.frame_indices: list[int] = []
-        self._poses_and_views: list[tuple[BodyPose, RayView | None]] = []
+        self._poses_and_views: list[tuple[BodyPose, RayView]] = []
         self._descriptors = np.zeros((capacity, 3 + 69))
         self._descriptor_distances = np.full((capacity, capacity), np.inf)
         self._error = torch.zeros(capacity, device=device)
@@ -74,12 +90,17 @@ class ReplayBuffer:
         self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._given_origins = np.zeros((capacity, 3))
         self._origins = torch.zeros(capacity, 3, device=device)
+        self._body_from_camera = np.zeros((capacity, 3, 3))
         self._turns = torch.zeros(capacity, 3, 3, device=device)
         self._low = torch.zeros(capacity, 3, device=device)
         self._shape = torch.ones(capacity, 3, dtype=torch.int32, device=device)
         self._index = torch.zeros(capacity, 1, dtype=torch.int32, device=device)
         self._roots = torch.zeros(capacity, 1, 12, device=device)
-        self._directions = torch.zeros(capacity, 1, 3, device=device)
+        self._lenses: list[Camera] = []
+        self._lens_numbers: dict[tuple[Any, ...], int] = {}
+        self._lens = np.zeros(capacity, dtype=np.int64)
+        self._runs: list[PixelRuns] = []
+        self._run_table: _RunTable | None = None
         self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8, device=device)
 
     def __len__(self) -> int:
@@ -116,11 +137,9 @@ class ReplayBuffer:
     def replay_frames(self) -> list[ReplayFrame]:
         """The frames as they are saved, for training on them again."""
         kept = []
-        for slot, (pose, sight) in enumerate(self._poses_and_views):
-            if sight is not None:
-                pixels = int(self._near[slot] + self._far[slot])
-                colors = self._colors[slot, :pixels].cpu().numpy().copy()
-                kept.append(ReplayFrame(self.frame_indices[slot], pose, sight, colors))
+        for slot, (pose, view) in enumerate(self._poses_and_views):
+            colors = self._colors[slot, : int(self._near[slot])].cpu().numpy().copy()
+            kept.append(ReplayFrame(self.frame_indices[slot], pose, view, colors))
         return kept
 
     def set_correspondences(self, slot: int, correspondences: CorrespondenceGrid) -> None:
@@ -137,7 +156,7 @@ class ReplayBuffer:
             self._given_origins[slot] - correction.pivot - correction.shift
         )
         self._origins[slot] = torch.from_numpy(origin).to(self._origins)
-        self._turns[slot] = torch.from_numpy(turn).to(self._turns)
+        self._turns[slot] = torch.from_numpy(turn @ self._body_from_camera[slot]).to(self._turns)
 
     def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
         """Draws rays from the kept frames.
@@ -161,11 +180,12 @@ class ReplayBuffer:
         pixel = torch.minimum(pixel, near + far - 1)
         rays = RayBatch(
             self._origins[slot],
-            (self._turns[slot] @ self._directions[slot, pixel][..., None])[..., 0],
+            (self._turns[slot] @ self._camera_directions(slot, pixel)[..., None])[..., 0],
             slot.int(),
             uniform(count),
         )
-        return TrainingBatch(rays, self._colors[slot, pixel].float() / 255.0)
+        color = self._colors[slot, torch.minimum(pixel, near - 1)].float() / 255.0
+        return TrainingBatch(rays, color * (pixel < near)[:, None])
 
     def update_errors(self, slots: Int64[Tensor, "rays"], loss: Float32[Tensor, "rays"]) -> None:
         """Updates the running error of the frames that the rays came from."""
@@ -177,15 +197,45 @@ class ReplayBuffer:
         error = self._error[:held]
         error[seen] = ERROR_EMA_DECAY * error[seen] + (1.0 - ERROR_EMA_DECAY) * mean[seen]
 
+    def _camera_directions(
+        self, slot: Int64[Tensor, "rays"], pixel: Int64[Tensor, "rays"]
+    ) -> Float32[Tensor, "rays 3"]:
+        """Unit directions of numbered pixels in the axes of their slots' cameras."""
+        if self._run_table is None:
+            keys = PIXEL_KEYS_PER_SLOT * np.arange(len(self))
+            ends = [runs.ends + key for runs, key in zip(self._runs, keys, strict=True)]
+            shifts = [runs.shifts for runs in self._runs]
+            self._run_table = _RunTable(np.concatenate(ends), np.concatenate(shifts))
+        slots, pixels = slot.cpu().numpy(), pixel.cpu().numpy()
+        run = self._run_table.ends.searchsorted(pixels + slots * PIXEL_KEYS_PER_SLOT, side="right")
+        flat, lens = pixels + self._run_table.shifts[run], self._lens[slots]
+        directions = np.empty((len(flat), 3), dtype=np.float32)
+        for number in np.unique(lens):
+            mine, camera = lens == number, self._lenses[number]
+            row, column = np.divmod(flat[mine], camera.size_px[0])
+            directions[mine] = camera.ray_directions(np.stack([column, row], axis=-1) + 0.5)
+        return torch.from_numpy(directions).to(self.device)
+
+    def _lens_number(self, camera: Camera) -> int:
+        """The number of a camera's lens; cameras that only move share one."""
+        lens = camera.focal_px, camera.center_px, camera.size_px, camera.distortion
+        number = self._lens_numbers.setdefault(lens, len(self._lenses))
+        if number == len(self._lenses):
+            self._lenses.append(replace(camera, camera_from_world=np.eye(4)))
+        return number
+
     def _store_frame(self, slot: int, frame: TrainingFrame) -> None:
         self.set_correspondences(slot, frame.correspondences)
-        self._directions = self._store_rows(self._directions, slot, frame.directions)
+        self._lens[slot] = self._lens_number(frame.view.camera)
+        self._runs[slot:] = [frame.pixels, *self._runs[slot + 1 :]]
+        self._run_table = None
         self._colors = self._store_rows(self._colors, slot, frame.colors)
         self._given_origins[slot] = frame.origin
         self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
-        self._turns[slot] = torch.eye(3, device=self.device)
-        self._near[slot] = frame.near_count
-        self._far[slot] = len(frame.colors) - frame.near_count
+        self._body_from_camera[slot] = frame.body_from_camera
+        self._turns[slot] = torch.from_numpy(frame.body_from_camera).to(self.device)
+        self._near[slot] = frame.pixels.near_count
+        self._far[slot] = frame.pixels.count - frame.pixels.near_count
 
     def _store_rows(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
         """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""

@@ -1,12 +1,11 @@
-"""A frame prepared for training: its correspondence grid, and its pixels as body-frame rays."""
+"""A frame prepared for training: its correspondence grid, and which of its pixels are rays."""
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int, Int32, UInt8
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
@@ -32,6 +31,42 @@ class RayView(NamedTuple):
     near_person_bits: UInt8[np.ndarray, "bytes"]
 
 
+class PixelRuns(NamedTuple):
+    """Pixels of an image in runs of adjacent ones: those near the person, then those about them.
+
+    The pixels are numbered through; 100 bytes of runs stand for a thousand pixels.
+
+    Attributes:
+        ends: Number of pixels up to the end of each run.
+        shifts: Difference between a pixel's flat index in the image and its number, by run.
+        near_count: Number of pixels near the person.
+    """
+
+    ends: Int32[np.ndarray, "runs"]
+    shifts: Int32[np.ndarray, "runs"]
+    near_count: int
+
+    @classmethod
+    def of(
+        cls, near: Bool[np.ndarray, "height width"], far: Bool[np.ndarray, "height width"]
+    ) -> "PixelRuns":
+        """The runs of two masks."""
+        sides = [_run_sides(mask) for mask in (near, far)]
+        starts, stops = (np.concatenate(parts) for parts in zip(*sides, strict=True))
+        ends = np.cumsum(stops - starts)
+        shifts = stops - ends
+        return cls(ends.astype(np.int32), shifts.astype(np.int32), int(near.sum()))
+
+    @property
+    def count(self) -> int:
+        """Number of pixels."""
+        return int(self.ends[-1])
+
+    def flat_indices(self) -> Int[np.ndarray, "pixels"]:
+        """Flat indices of all pixels in the image."""
+        return np.arange(self.count) + np.repeat(self.shifts, np.diff(self.ends, prepend=0))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingFrame:
     """An observation as the replay buffer takes it.
@@ -41,86 +76,83 @@ class TrainingFrame:
         pose: Pose of the body.
         correspondences: Correspondence grid of the pose.
         origin: Origin of the rays, body frame, metres.
-        directions: Unit directions of the training pixels, those near the person first.
-        colors: Premultiplied RGBA of the same pixels.
-        near_count: Number of pixels near the person.
-        view: View from which the frame can be rebuilt with its colors alone; None if it need not
-            be saved.
+        body_from_camera: Rotation of the rays.
+        pixels: Training pixels.
+        colors: Premultiplied RGBA of those near the person; that of the others is zero.
+        view: View from which the frame can be rebuilt with its colors alone.
     """
 
     index: int
     pose: BodyPose
     correspondences: CorrespondenceGrid
     origin: Float32[np.ndarray, "3"]
-    directions: Float32[np.ndarray, "pixels 3"]
-    colors: UInt8[np.ndarray, "pixels 4"]
-    near_count: int
-    view: RayView | None = None
+    body_from_camera: Float32[np.ndarray, "3 3"]
+    pixels: PixelRuns
+    colors: UInt8[np.ndarray, "near 4"]
+    view: RayView
+
+    def directions(self) -> Float32[np.ndarray, "pixels 3"]:
+        """Unit directions of all training pixels, body frame; computed at every call."""
+        camera = replace(self.view.camera, camera_from_world=np.eye(4))
+        row, column = np.divmod(self.pixels.flat_indices(), camera.size_px[0])
+        sights = camera.ray_directions(np.stack([column, row], axis=-1) + 0.5)
+        return sights.astype(np.float32) @ self.body_from_camera.T
 
 
 def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
     """Solves the frame's correspondences and selects its training pixels."""
-    mask = _near_person_mask(observation.alpha)
-    chosen = np.concatenate(_split_pixels(mask))
-    sight = RayView(camera=observation.camera, near_person_bits=np.packbits(mask))
-    colors = _premultiplied_rgba(observation, chosen)
-    return rebuild_frame(observation.frame.index, observation.pose, sight, colors, rig)
+    near = _near_person_mask(observation.alpha)
+    view = RayView(camera=observation.camera, near_person_bits=np.packbits(near))
+    colors = _premultiplied_rgba(observation, near)
+    return _assemble_frame(observation.frame.index, observation.pose, view, near, colors, rig)
 
 
 def rebuild_frame(
     index: int, pose: BodyPose, view: RayView, colors: UInt8[np.ndarray, "pixels 4"], rig: Rig
 ) -> TrainingFrame:
     """Makes a frame ready from what is kept of it: finds its rays, and solves its warp."""
-    camera = view.camera
-    width, height = camera.size_px
-    mask = (
-        np.unpackbits(view.near_person_bits, count=width * height)
-        .reshape(height, width)
-        .astype(bool)
-    )
-    near, far = _split_pixels(mask)
-    world_from_body = rig.world_from_body(pose)
+    width, height = view.camera.size_px
+    bits = np.unpackbits(view.near_person_bits, count=width * height)
+    return _assemble_frame(index, pose, view, bits.reshape(height, width) > 0, colors, rig)
+
+
+def _assemble_frame(
+    index: int,
+    pose: BodyPose,
+    view: RayView,
+    near: Bool[np.ndarray, "height width"],
+    colors: UInt8[np.ndarray, "pixels 4"],
+    rig: Rig,
+) -> TrainingFrame:
+    camera, world_from_body = view.camera, rig.world_from_body(pose)
     camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
-    sights = _camera_directions(
-        camera.focal_px, camera.center_px, camera.size_px, camera.distortion
-    )
     origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
+    pixels = PixelRuns.of(near, _around(near) & ~near)
     return TrainingFrame(
         index=index,
         pose=pose,
         correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
         origin=origin.astype(np.float32),
-        directions=sights[np.concatenate([near, far])] @ camera_from_body.astype(np.float32),
-        colors=colors,
-        near_count=len(near),
+        body_from_camera=np.ascontiguousarray(camera_from_body.T, dtype=np.float32),
+        pixels=pixels,
+        colors=colors[: pixels.near_count],  # earlier versions saved the others' zeros, too
         view=view,
     )
 
 
-@lru_cache(maxsize=2)
-def _camera_directions(
-    focal_px: tuple[float, float],
-    center_px: tuple[float, float],
-    size_px: tuple[int, int],
-    distortion: tuple[float, ...],
-) -> Float32[np.ndarray, "pixels 3"]:
-    """Unit directions through all pixels in the camera's axes: the same in every frame."""
-    camera = Camera(
-        focal_px=focal_px, center_px=center_px, size_px=size_px, distortion=distortion,
-        camera_from_world=np.eye(4),
-    )  # fmt: skip
-    return camera.ray_directions(camera.pixel_centers().reshape(-1, 2)).astype(np.float32)
-
-
 def _premultiplied_rgba(
-    observation: Observation, chosen: Int[np.ndarray, "pixels"]
-) -> UInt8[np.ndarray, "pixels 4"]:
-    """Color times alpha, and alpha, of some pixels, in 8 bits."""
-    alpha = observation.alpha.reshape(-1, 1)[chosen]
-    premultiplied = np.empty((len(chosen), 4), dtype=np.float32)
-    np.multiply(observation.frame.rgb.reshape(-1, 3)[chosen], alpha, out=premultiplied[:, :3])
-    np.multiply(alpha, np.float32(255.0), out=premultiplied[:, 3:])
-    return np.rint(premultiplied, out=premultiplied).astype(np.uint8)
+    observation: Observation, near: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "near 4"]:
+    """Color times alpha, and alpha, of the pixels near the person, in 8 bits."""
+    places = np.flatnonzero(near)
+    alpha = observation.alpha.reshape(-1).take(places)
+    rgb = observation.frame.rgb.reshape(-1, 3).take(places, axis=0)
+    premultiplied = np.empty((4, len(places)), dtype=np.float32)
+    for channel in range(3):
+        np.multiply(rgb[:, channel], alpha, out=premultiplied[channel])
+    np.multiply(alpha, np.float32(255.0), out=premultiplied[3])
+    rounded = np.rint(premultiplied, out=premultiplied).astype(np.uint8)
+    return np.ascontiguousarray(rounded.T)
 
 
 def _near_person_mask(
@@ -131,10 +163,8 @@ def _near_person_mask(
     return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
 
 
-def _split_pixels(
-    near: Bool[np.ndarray, "height width"],
-) -> tuple[Int[np.ndarray, "near"], Int[np.ndarray, "far"]]:
-    """Flat indices of the pixels near the person, and of the others in a box around them."""
+def _around(near: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """The pixels in a box around those near the person."""
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
     margin = int(BOX_MARGIN_SHARE * len(near))
     box = np.zeros_like(near)
@@ -142,4 +172,12 @@ def _split_pixels(
         max(0, rows[0] - margin) : rows[-1] + margin + 1,
         max(0, columns[0] - margin) : columns[-1] + margin + 1,
     ] = True
-    return np.flatnonzero(near), np.flatnonzero(box & ~near)
+    return box
+
+
+def _run_sides(
+    mask: Bool[np.ndarray, "height width"],
+) -> tuple[Int[np.ndarray, "runs"], Int[np.ndarray, "runs"]]:
+    """Flat indices at which the runs of a mask begin, and behind which they end."""
+    changes = np.flatnonzero(np.diff(mask.reshape(-1).view(np.int8), prepend=0, append=0))
+    return changes[::2], changes[1::2]

@@ -6,12 +6,11 @@ import time
 import numpy as np
 from jaxtyping import UInt8
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
-from avatar.render import BodyFrameRays, render
+from avatar.render import render
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
@@ -57,15 +56,8 @@ def _front_camera(rig: Rig) -> Camera:
 
 def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:
     pose = BodyPose.rest()
-    pixels = camera.pixel_centers().reshape(-1, 2)
-    rays = BodyFrameRays.through(pixels, camera, rig.world_from_body(pose))
-    colors: UInt8[np.ndarray, "pixels 4"] = np.full((len(pixels), 4), 255, dtype=np.uint8)
-    return TrainingFrame(
-        index=0,
-        pose=pose,
-        correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
-        origin=rays.origin,
-        directions=rays.directions,
-        colors=colors,
-        near_count=len(pixels),
-    )
+    width, height = camera.size_px
+    near = np.full((height, width), True)
+    colors: UInt8[np.ndarray, "pixels 4"] = np.full((near.size, 4), 255, dtype=np.uint8)
+    view = RayView(camera=camera, near_person_bits=np.packbits(near))
+    return rebuild_frame(0, pose, view, colors, rig)

@@ -74,7 +74,7 @@ def test_without_time_a_few_frames_are_that_are_spread_over_the_video(score, hel
     assert np.diff(frames).max() <= 10 * (COUNT // 4)
 
 
-def test_a_run_of_so_many_steps_does_not_depend_on_the_machine(score):
+def test_a_run_with_counted_steps_does_not_depend_on_the_machine(score):
     assert len(score(steps=10, limit_s=0.0).given) == COUNT
 
 

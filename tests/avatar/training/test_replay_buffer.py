@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from avatar.training.replay_buffer import NEAR_PERSON_RAY_SHARE, ReplayBuffer
-from avatar.training.training_frame import prepare_frame
+from avatar.training.training_frame import PixelRuns, prepare_frame
 from preprocess.body.body_pose import BodyPose
 
 CPU = torch.device("cpu")
@@ -30,10 +30,12 @@ def store(frames, capacity=8) -> ReplayBuffer:
 
 def cut(frame, near, far):
     """The same frame with fewer pixels."""
-    kept = np.r_[:near, frame.near_count : frame.near_count + far]
-    return dataclasses.replace(
-        frame, directions=frame.directions[kept], colors=frame.colors[kept], near_count=near
-    )
+    width, height = frame.view.camera.size_px
+    masks = np.zeros((2, height * width), dtype=bool)
+    places, count = frame.pixels.flat_indices(), frame.pixels.near_count
+    masks[0, places[:near]] = masks[1, places[count : count + far]] = True
+    pixels = PixelRuns.of(*masks.reshape(2, height, width))
+    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near])
 
 
 def posed(frame, index, *, knee):
@@ -47,10 +49,23 @@ def posed(frame, index, *, knee):
 
 
 def places(batch, frames):
-    """Where each ray stands in the list of its frame's pixels; fails if it does not."""
-    lists = [{d.tobytes(): i for i, d in enumerate(frame.directions)} for frame in frames]
-    rays = zip(batch.rays.slots.tolist(), batch.rays.directions.numpy(), strict=True)
-    return np.array([lists[slot][direction.tobytes()] for slot, direction in rays])
+    """Number of each ray's pixel in its frame; fails if it is none of them."""
+    found = np.empty(len(batch.rays.slots), dtype=int)
+    for slot, frame in enumerate(frames):
+        mine, camera = (batch.rays.slots == slot).numpy(), frame.view.camera
+        sights = batch.rays.directions.numpy()[mine] @ frame.body_from_camera
+        pixels = sights[:, :2] / sights[:, 2:] * camera.focal_px + camera.center_px
+        column, row = np.floor(pixels).astype(int).T
+        np.testing.assert_allclose(pixels, np.stack([column, row], axis=1) + 0.5, atol=1e-3)
+        numbers = {place: number for number, place in enumerate(frame.pixels.flat_indices())}
+        found[mine] = [numbers[place] for place in row * camera.size_px[0] + column]
+    return found
+
+
+def colors_of(frame):
+    """Colors of all training pixels of a frame."""
+    far = np.zeros((frame.pixels.count - frame.pixels.near_count, 4), dtype=np.uint8)
+    return np.concatenate([frame.colors, far])
 
 
 def drawn_from(replay, generator, count=40_000):
@@ -78,6 +93,37 @@ def test_targets_are_the_videos_colors_along_exactly_those_rays(rig, clip, frame
         np.testing.assert_allclose(batch.target.numpy()[mine], shown, atol=0.5 / 255 + 1e-6)
 
 
+def test_a_video_whose_lens_changes_is_seen_through_each_frames_own(frames, generator):
+    """One lens zooms, another bends."""
+    zoomed, bent = (
+        dataclasses.replace(frame.view.camera, **change)
+        for frame, change in zip(
+            frames[1:3],
+            ({"focal_px": (90.0, 91.0)}, {"distortion": (0.1, 0.0, 0.0, 0.0)}),
+            strict=True,
+        )
+    )
+    own = [
+        dataclasses.replace(frame, view=frame.view._replace(camera=camera))
+        for frame, camera in zip(frames, (frames[0].view.camera, zoomed, bent), strict=False)
+    ]
+    batch = store(own).sample_rays(600, generator)
+    for slot, frame in enumerate(own):
+        mine = batch.rays.directions.numpy()[(batch.rays.slots == slot).numpy()]
+        nearest = (mine @ frame.directions().T).max(axis=1)
+        np.testing.assert_allclose(nearest, 1.0, atol=1e-6)
+
+
+def test_a_frame_takes_five_bytes_a_pixel_near_the_person(frames):
+    """Rays are found from runs of pixels; colors are kept where they are not zero."""
+    for frame in frames:
+        runs = frame.pixels
+        held = frame.colors.nbytes + runs.ends.nbytes + runs.shifts.nbytes
+        held += frame.view.near_person_bits.nbytes
+        assert held < 8.0 * runs.near_count  # of a small picture; larger ones have longer runs
+        assert len(frame.colors) == runs.near_count < runs.count
+
+
 def test_rays_begin_anywhere_within_a_step(frames, generator):
     jitter = store(frames).sample_rays(20_000, generator).rays.jitter
     assert 0.0 <= float(jitter.min()) < float(jitter.max()) < 1.0
@@ -87,7 +133,7 @@ def test_rays_begin_anywhere_within_a_step(frames, generator):
 
 def test_nine_rays_in_ten_go_near_the_person(frames, generator):
     batch = store(frames).sample_rays(20_000, generator)
-    near = np.array([frame.near_count for frame in frames])[batch.rays.slots.numpy()]
+    near = np.array([frame.pixels.near_count for frame in frames])[batch.rays.slots.numpy()]
     share = float((places(batch, frames) < near).mean())
     assert share == pytest.approx(NEAR_PERSON_RAY_SHARE, abs=0.01)
 
@@ -98,7 +144,7 @@ def test_whatever_the_frames_hold_rays_stay_within_it(frames, sizes):
     """Frames without far pixels, with a single pixel, later ones larger than earlier ones."""
     small = [cut(f, near, far) for f, (near, far) in zip(frames, sizes, strict=False)]
     batch = store(small).sample_rays(400, torch.Generator().manual_seed(1))
-    colors = [small[slot].colors for slot in batch.rays.slots.tolist()]
+    colors = [colors_of(small[slot]) for slot in batch.rays.slots.tolist()]
     place = places(batch, small)
     expected = np.stack([c[p] for c, p in zip(colors, place, strict=True)]) / np.float32(255.0)
     np.testing.assert_array_equal(batch.target.numpy(), expected.astype(np.float32))
@@ -171,7 +217,7 @@ def test_a_slot_that_is_taken_over_shows_the_new_frame(frames, generator):
     place = places(batch, held)
     np.testing.assert_array_equal(
         batch.target.numpy() * 255.0,
-        np.stack([held[s].colors[p] for s, p in zip(batch.rays.slots, place, strict=True)]),
+        np.stack([colors_of(held[s])[p] for s, p in zip(batch.rays.slots, place, strict=True)]),
     )
     np.testing.assert_array_equal(
         batch.rays.origins, np.stack([held[s].origin for s in batch.rays.slots])
