@@ -16,6 +16,8 @@ from apps.run.run_folder import RunFolder
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from preprocess.capture_session import Capture
+from preprocess.fitting.capture_fit import load_capture_fit
+from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 
 PROGRAM = "ia-ingest"
 
@@ -60,7 +62,26 @@ def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) 
         console.warning(note)
     if not (arguments.resume and run.has_checkpoint()):
         preflight_check(capture, arguments.capture_inputs(), console, force=arguments.force)
-    return capture
+    return _fit_to_masks(arguments, capture, run, console)
+
+
+def _fit_to_masks(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> Capture:
+    """Fit body, poses and focal length to the masks, unless the poses are exact."""
+    if not arguments.refine_poses:
+        return capture
+    resumes = arguments.resume and run.has_checkpoint()
+    fit = load_capture_fit(run.fit_file, capture.identity) if resumes else None
+    if fit is None:
+        with console.status("fitting body and poses to the masks"):
+            fit = fit_capture(capture, fit_body=not resumes)
+    if fit is None:
+        return capture
+    fitted = apply_fit(capture, fit, height_m=arguments.capture_inputs().height_m)
+    for note in fitted.notes[len(capture.notes) :]:
+        console.info(note)
+    return fitted
 
 
 def _describe_capture(capture: Capture) -> str:

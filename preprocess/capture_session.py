@@ -21,6 +21,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
+from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.live.live_inputs import LiveInputs
 from preprocess.masks.mask_files import Masks
@@ -96,6 +97,7 @@ class Capture:
         camera_report: Entry of the report about solved cameras.
         refit: How the poses were fitted to the masks, if they were made for another body.
         live_fit: Fit of a live source's poses to the masks, repeated while frames arrive.
+        fit: What was fitted to the masks before training (`preprocess.fitting`).
     """
 
     paths: CapturePaths
@@ -111,6 +113,15 @@ class Capture:
     camera_report: dict[str, Any] | None = None
     refit: BodyPlacement | None = None
     live_fit: LiveAlignment | None = None
+    fit: CaptureFit | None = None
+
+    @property
+    def identity(self) -> str:
+        """What identifies the video in a checkpoint; each recording of a camera is a new one."""
+        source = self.source
+        if camera_address(source.path) is not None:
+            return f"{source.path} {source.started_at:.3f}"
+        return str(source.path.resolve())
 
     def check(self) -> None:
         """Whether the parts fit together; no frame is read.

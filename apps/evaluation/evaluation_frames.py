@@ -11,6 +11,8 @@ from apps.run.ingest_arguments import IngestArguments, trainable_longer_side_px
 from apps.run.run_folder import RunFolder
 from capture.input_error import InputError
 from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fit import load_capture_fit
+from preprocess.fitting.capture_fitting import apply_fit
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 
@@ -85,8 +87,7 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     inputs = given.capture_inputs()
     if given.cameras == "solve" and run.cameras.is_file():
         inputs = replace(inputs, cameras=str(run.cameras), poses=run.poses)
-    person = run.body_file if run.body_file.is_file() else None
-    recording = open_capture(inputs, avatar_body=person)
+    recording = _open_as_trained(inputs, run, height_m=inputs.height_m)
     own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
     numbers = report["held_out"]["frames"]
     if not numbers:
@@ -96,6 +97,15 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     return EvaluationFrames(
         recording=replace(recording, size_px=size_px or own_px), frame_indices=frozenset(numbers)
     )
+
+
+def _open_as_trained(inputs: CaptureInputs, run: RunFolder, *, height_m: float | None) -> Capture:
+    """Open a run's own capture with the body and the poses that it was trained with."""
+    recording = open_capture(inputs)
+    fit = load_capture_fit(run.fit_file, recording.identity)
+    if run.body_file.is_file() and (fit is None or not fit.fits_body):
+        recording = open_capture(inputs, avatar_body=run.body_file)
+    return recording if fit is None else apply_fit(recording, fit, height_m=height_m)
 
 
 def trained_longer_side_px(run: RunFolder) -> int | None:

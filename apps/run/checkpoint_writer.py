@@ -10,7 +10,7 @@ from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
 from preprocess.body.body_file import write_shaped_body
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.capture_session import Capture
 
 CHECKPOINT_INTERVAL_S = 5.0
 """Shortest time between two checkpoints, seconds."""
@@ -25,14 +25,14 @@ class CheckpointWriter:
     The thread that trains copies the state; another one writes it.
     """
 
-    def __init__(self, run: RunFolder, shaped: ShapedBody) -> None:
+    def __init__(self, run: RunFolder, capture: Capture) -> None:
         """Writes nothing yet.
 
         Args:
             run: Folder of the run.
-            shaped: The person's body, which is written beside the first checkpoint.
+            capture: Its body and its fit to the masks are written beside the first checkpoint.
         """
-        self._run, self._shaped, self._body_written = run, shaped, False
+        self._run, self._capture, self._body_written = run, capture, False
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[float] | None = None
         self._copy_cost_s = self._interval_s = 0.0
@@ -95,11 +95,13 @@ class CheckpointWriter:
         self._interval_s = cost_s / (CHECKPOINT_COST_SHARE * (os.cpu_count() or 1))
 
     def _write(self, state: dict[str, Any]) -> float:
-        """Write a state, and the body beside the first; return the CPU time it took."""
+        """Write a state, and body and fit beside the first; return the CPU time it took."""
         began = time.thread_time()
         checkpoint.write_state(state, self._run.checkpoint)
         if not self._body_written:
             with atomic_file(self._run.body_file) as path:
-                write_shaped_body(path, self._shaped)
+                write_shaped_body(path, self._capture.shaped)
+            if self._capture.fit is not None:
+                self._capture.fit.save(self._run.fit_file, self._capture.identity)
             self._body_written = True
         return time.thread_time() - began

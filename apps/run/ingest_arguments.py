@@ -19,6 +19,7 @@ from capture.live.camera_device import camera_address
 from capture.live.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
 from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.masks.mask_origin import segmenter_name
 from preprocess.open_capture import open_capture
 
@@ -114,7 +115,8 @@ class IngestArguments:
     hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
     """Hold out every Nth frame for evaluation; 0 trains on all frames."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
-    """Optimize the poses during training. Tracker jitter is the largest source of error."""
+    """Fit poses, body and focal length to the masks, and optimize the poses during training. With
+    --no-refine-poses all are taken as exact."""
     force: Flag = False
     """Train even if ia-check considers poses and masks unusable."""
     view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
@@ -228,9 +230,11 @@ class IngestArguments:
         """Open the capture that the arguments name."""
         run = self.run_folder()
         resumes = self.resume and run.has_checkpoint() and run.body_file.is_file()
-        recording = open_capture(
-            self.capture_inputs(), avatar_body=run.body_file if resumes else None
-        )
+        recording = open_capture(self.capture_inputs())
+        if resumes:
+            fit = load_capture_fit(run.fit_file, recording.identity)
+            if fit is None or not fit.fits_body:
+                recording = open_capture(self.capture_inputs(), avatar_body=run.body_file)
         size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
         return recording.in_real_time() if self.realtime else recording

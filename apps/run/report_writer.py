@@ -275,6 +275,7 @@ def _build_report(
         "body": capture.shaped.body.family,
         "pose_model": capture.motion.body_model,
         "body_fit": capture.body_fit_report(),
+        "mask_fit": None if capture.fit is None else capture.fit.as_json(),
         **capture.mask_report(),
     }
     return Report(

@@ -18,7 +18,7 @@ from capture.output_file_list import OutputFileList
 
 STATE_FILE = "state.pt"
 """Trainer and avatar, in checkpoint/."""
-CHECKPOINT_FILES = (STATE_FILE, "person.npz", "frames.tensors", "earlier.tensors")
+CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earlier.tensors")
 """Files that ia-ingest writes into checkpoint/."""
 
 
@@ -58,6 +58,11 @@ class RunFolder:
     def body_file(self) -> Path:
         """The body of the avatar, for videos that are added later."""
         return self.checkpoint / "person.npz"
+
+    @property
+    def fit_file(self) -> Path:
+        """What was fitted to the masks of the last video."""
+        return self.checkpoint / "fit.npz"
 
     @property
     def cameras(self) -> Path:

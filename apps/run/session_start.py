@@ -17,7 +17,6 @@ from avatar.evaluation.held_out import MAX_HELD_OUT
 from avatar.training import checkpoint, warmup
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
 from export.bake import bake_kernels
 from preprocess.capture_session import Capture
 
@@ -96,7 +95,7 @@ def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
         hold_every=arguments.hold_out,
         device=resolve_device(arguments.device),
     )
-    notes = {"video": _video_identity(capture), "name": capture.paths.video.name}
+    notes = {"video": capture.identity, "name": capture.paths.video.name}
     return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
 
 
@@ -107,7 +106,7 @@ def _load_trainer(
     trainer, notes = checkpoint.load(run.checkpoint, resolve_device(arguments.device))
     _check_same_body(trainer, capture, run)
     earlier = EarlierVideos(run, notes)
-    if notes.get("video") == _video_identity(capture):
+    if notes.get("video") == capture.identity:
         return _resume_video(arguments, capture, trainer, earlier, notes, console)
     return _add_video(arguments, capture, trainer, earlier, notes, console)
 
@@ -146,7 +145,7 @@ def _add_video(
     unit, _, spent = _budget(arguments, capture, trainer)
     console.info(f"Adding another video to an avatar with {spent:.0f} {unit} of training.")
     earlier.start_new_video(trainer, console)
-    notes["name"], notes["video"] = capture.paths.video.name, _video_identity(capture)
+    notes["name"], notes["video"] = capture.paths.video.name, capture.identity
     _extend_budget(trainer, arguments, capture, spent)
     return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
 
@@ -181,14 +180,6 @@ def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None
             f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
             "with --overwrite."
         )
-
-
-def _video_identity(capture: Capture) -> str:
-    """Return what identifies a video in a checkpoint; each recording of a camera is a new one."""
-    source = capture.source
-    if camera_address(source.path) is not None:
-        return f"{source.path} {source.started_at:.3f}"
-    return str(source.path.resolve())
 
 
 def _announce_duration(

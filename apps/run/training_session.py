@@ -110,7 +110,7 @@ class TrainingSession:
             CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
         ]
         self.held_out: list[HeldOutFrame] = []
-        self._checkpoints = CheckpointWriter(run, recording.shaped)
+        self._checkpoints = CheckpointWriter(run, recording)
         self.meter = StreamMeter(stop, recording.source)
         self.coverage = Coverage(recording.shaped)
         if "coverage" in notes:

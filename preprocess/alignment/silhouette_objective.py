@@ -169,6 +169,7 @@ def sample_masks(
     skin: SkinPoints,
     *,
     count: int = SAMPLED_FRAMES,
+    person_px: int = SILHOUETTE_PERSON_PX,
     excluded_frames: frozenset[int] = frozenset(),
 ) -> SilhouetteObjective:
     """Read a few masks; images are decoded only where their alpha channel is the mask.
@@ -180,6 +181,7 @@ def sample_masks(
         camera_row: From a frame number to its camera.
         skin: The person.
         count: Number of frames to sample.
+        person_px: Height of the person in the reduced masks, px.
         excluded_frames: Frames that cannot be used.
 
     Raises:
@@ -201,8 +203,8 @@ def sample_masks(
             f"None of the masks of {len(frames)} frames of {source.path} shows a person."
         )
     heights = [_mask_height(alpha) for _, alpha in found]
-    longer = max(size_px) * SILHOUETTE_PERSON_PX / max(float(np.median(heights)), 1.0)
-    small = _scaled_size(full, min(longer, 4.0 * SILHOUETTE_PERSON_PX))
+    longer = max(size_px) * person_px / max(float(np.median(heights)), 1.0)
+    small = _scaled_size(full, min(longer, 4.0 * person_px))
     return SilhouetteObjective(
         samples=tuple(
             MaskSample(index=index, camera_row=camera_row(index), alpha=_resize_alpha(alpha, small))

@@ -9,7 +9,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
@@ -31,11 +31,15 @@ class SkinPoints:
         shaped: The person.
         rest: Rest positions, metres.
         weights: Skinning weights.
+        corners: The three vertices that each point lies between.
+        shares: Barycentric coordinates of each point between them.
     """
 
     shaped: ShapedBody
     rest: Float32[np.ndarray, "points 3"]
     weights: Float32[np.ndarray, "points 24"]
+    corners: Int[np.ndarray, "points 3"]
+    shares: Float[np.ndarray, "points 3"]
 
     @classmethod
     def of(cls, shaped: ShapedBody, count: int = SKIN_POINTS) -> "SkinPoints":
@@ -57,7 +61,15 @@ class SkinPoints:
             shaped=shaped,
             rest=np.einsum("pc,pca->pa", shares, shaped.vertices[chosen]).astype(np.float32),
             weights=np.einsum("pc,pcj->pj", shares, shaped.body.weights[chosen]).astype(np.float32),
+            corners=chosen,
+            shares=shares,
         )
+
+    def interpolate(
+        self, values: Float[np.ndarray, "vertices *rest"]
+    ) -> Float[np.ndarray, "points *rest"]:
+        """Values of the vertices at the points."""
+        return np.einsum("pc,pc...->p...", self.shares, values[self.corners])
 
     def posed(self, pose: BodyPose) -> Float32[np.ndarray, "points 3"]:
         """World positions by linear blend skinning (without pose blend shapes), metres."""

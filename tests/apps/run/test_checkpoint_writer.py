@@ -9,7 +9,7 @@ from apps.run.checkpoint_writer import CheckpointWriter
 from apps.run.run_folder import RunFolder
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.capture_session import Capture
 
 TRAINER = Trainer.__new__(Trainer)
 
@@ -19,7 +19,9 @@ def writer(tmp_path, monkeypatch) -> CheckpointWriter:
     monkeypatch.setattr(checkpoint, "detached_state", lambda trainer, notes: dict(notes))
     monkeypatch.setattr(checkpoint_writer, "write_shaped_body", lambda path, shaped: None)
     monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_INTERVAL_S", 0.0)
-    return CheckpointWriter(RunFolder(path=tmp_path), ShapedBody.__new__(ShapedBody))
+    capture = Capture.__new__(Capture)
+    object.__setattr__(capture, "shaped", None)
+    return CheckpointWriter(RunFolder(path=tmp_path), capture)
 
 
 def test_training_goes_on_while_a_checkpoint_is_written(writer, monkeypatch):

@@ -148,6 +148,7 @@ def test_the_names_of_a_checkpoint_are_those_that_are_written():
     names = {
         checkpoint.CHECKPOINT_FILE,
         "person.npz",
+        "fit.npz",
         saved_frames.LAST_RUN_FILE,
         saved_frames.EARLIER_VIDEOS_FILE,
     }

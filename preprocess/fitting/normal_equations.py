@@ -1,0 +1,113 @@
+"""Gauss-Newton equations of a clip: a chain of frames that share a few parameters.
+
+Each frame has its own parameters, coupled to those of the frame before and after it; the shared
+ones (proportions, focal length) are coupled to all frames. The matrix is block tridiagonal with an
+arrow, and is solved exactly in time proportional to the number of frames.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChainEquations:
+    """Normal equations of a chain of frames with shared parameters, filled in place.
+
+    Attributes:
+        blocks: Each frame's own symmetric block.
+        links: Precision of the difference between a frame and the next, parameter by parameter.
+        borders: Coupling of each frame with the shared parameters.
+        shared: Block of the shared parameters.
+        right, right_shared: Right-hand sides.
+    """
+
+    blocks: Float[np.ndarray, "frames n n"]
+    links: Float[np.ndarray, "gaps n"]
+    borders: Float[np.ndarray, "frames n m"]
+    shared: Float[np.ndarray, "m m"]
+    right: Float[np.ndarray, "frames n"]
+    right_shared: Float[np.ndarray, "m"]
+
+    @classmethod
+    def empty(cls, frames: int, own: int, shared: int) -> "ChainEquations":
+        """Equations without terms, for `own` parameters of each frame."""
+        return cls(
+            blocks=np.zeros((frames, own, own)),
+            links=np.zeros((max(frames - 1, 0), own)),
+            borders=np.zeros((frames, own, shared)),
+            shared=np.zeros((shared, shared)),
+            right=np.zeros((frames, own)),
+            right_shared=np.zeros(shared),
+        )
+
+    def add(
+        self,
+        frame: int,
+        own: Float[np.ndarray, "rows n"],
+        shared: Float[np.ndarray, "rows m"],
+        residuals: Float[np.ndarray, "rows"],
+        weights: Float[np.ndarray, "rows"],
+    ) -> None:
+        """Adds weighted residuals of one frame, with their Jacobians."""
+        heavy, heavy_shared = weights[:, None] * own, weights[:, None] * shared
+        self.blocks[frame] += own.T @ heavy
+        self.borders[frame] += own.T @ heavy_shared
+        self.shared[:] += shared.T @ heavy_shared
+        self.right[frame] -= heavy.T @ residuals
+        self.right_shared[:] -= heavy_shared.T @ residuals
+
+    def add_chain(
+        self, state: Float[np.ndarray, "frames n"], links: Float[np.ndarray, "gaps n"]
+    ) -> None:
+        """Adds unit priors around 0 for each frame, and priors of equality between neighbors.
+
+        Args:
+            state: Present parameters.
+            links: Precision of the difference between neighbors.
+        """
+        each = np.arange(state.shape[1])
+        self.links[:] += links
+        self.blocks[:, each, each] += 1.0
+        self.blocks[:-1, each, each] += links
+        self.blocks[1:, each, each] += links
+        apart = np.diff(state, axis=0) * links
+        self.right[:] -= state
+        self.right[:-1] += apart
+        self.right[1:] -= apart
+
+    def add_shared(self, precision: Float[np.ndarray, "m"], state: Float[np.ndarray, "m"]) -> None:
+        """Adds priors around 0 of the shared parameters, whose present values are `state`."""
+        self.shared[np.diag_indices(len(state))] += precision
+        self.right_shared[:] -= precision * state
+
+    def hold(self, shared: Float[np.ndarray, "m"], own: float) -> None:
+        """Keeps parameters from changing by a large precision; 0 lets them move."""
+        self.shared[np.diag_indices(len(shared))] += shared
+        each = np.arange(self.right.shape[1])
+        self.blocks[:, each, each] += own
+
+    def solve(self) -> tuple[Float[np.ndarray, "frames n"], Float[np.ndarray, "m"]]:
+        """The step of the frames' parameters and of the shared ones, by elimination."""
+        count = len(self.right_shared)
+        corner = np.column_stack([self.shared, self.right_shared])
+        factors, reduced = [], []
+        block, carried = np.zeros_like(self.blocks[0]), 0.0
+        for frame, own in enumerate(self.blocks):
+            side = np.column_stack([self.borders[frame], self.right[frame]]) + carried
+            factors.append(cho_factor(own - block, lower=True))
+            reduced.append(cho_solve(factors[-1], side))
+            corner = corner - side[:, :count].T @ reduced[-1]
+            if frame < len(self.links):
+                link = self.links[frame]
+                carried = link[:, None] * reduced[-1]
+                block = link[:, None] * cho_solve(factors[-1], np.diag(link))
+        shared = np.linalg.solve(corner[:, :count], corner[:, count])
+        found, after = np.zeros_like(self.right), np.zeros(self.right.shape[1])
+        for frame in range(len(self.blocks) - 1, -1, -1):
+            after_link = self.links[frame] * after if frame < len(self.links) else 0.0 * after
+            local = reduced[frame][:, count] - reduced[frame][:, :count] @ shared
+            found[frame] = after = local + cho_solve(factors[frame], after_link)
+        return found, shared

@@ -1,0 +1,38 @@
+"""What a fit changes, and that a resumed run reads it again."""
+
+import numpy as np
+import pytest
+
+from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
+
+
+@pytest.fixture
+def fit() -> CaptureFit:
+    corrections = np.zeros((4, 75))
+    corrections[:, 0] = 0.1
+    return CaptureFit(
+        coefficients=np.arange(3.0), focal_factor=1.05, corrections=corrections,
+        error_before_cm=1.6, error_after_cm=0.7, taken=True, fits_body=False,
+    )  # fmt: skip
+
+
+def test_a_fit_is_read_as_it_was_written(fit, tmp_path):
+    fit.save(tmp_path / "fit.npz", "/a/video.mp4")
+    read = load_capture_fit(tmp_path / "fit.npz", "/a/video.mp4")
+    assert read is not None
+    assert np.array_equal(read.corrections, fit.corrections)
+    assert read.as_json() == fit.as_json()
+    assert read.fits_body is False
+
+
+def test_the_fit_of_another_video_is_not_taken(fit, tmp_path):
+    fit.save(tmp_path / "fit.npz", "/a/video.mp4")
+    assert load_capture_fit(tmp_path / "fit.npz", "/another/video.mp4") is None
+    assert load_capture_fit(tmp_path / "none.npz", "/a/video.mp4") is None
+    (tmp_path / "fit.npz").write_bytes(b"damaged")
+    assert load_capture_fit(tmp_path / "fit.npz", "/a/video.mp4") is None
+
+
+def test_the_description_names_quantities_and_units(fit):
+    assert "1.6 cm" in fit.describe()
+    assert "5.7 degrees" in fit.describe()

@@ -1,0 +1,109 @@
+"""The joint alignment of a clip: what comes back of body, poses and focal length."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.camera import Camera
+from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.outlines import OutlineDistances, OutlineModel
+from preprocess.fitting.proportion_space import ProportionSpace
+
+VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
+VIEW[2, 3] = 2.6
+CAMERA = Camera(
+    focal_px=(200.0, 200.0), center_px=(48.0, 80.0), size_px=(96, 160), camera_from_world=VIEW
+)
+FRAMES = 12
+
+
+def turning_motion() -> Motion:
+    """A full turn with the arms held off the body."""
+    joints = np.zeros((FRAMES, 23, 3))
+    joints[:, [0, 1], 2] = 0.2, -0.2
+    joints[:, [15, 16], 2] = -0.8, 0.8
+    roots = np.zeros((FRAMES, 3))
+    roots[:, 1] = 2.0 * np.pi * np.arange(FRAMES) / FRAMES
+    return Motion(
+        root_rotations=roots, root_translations=np.zeros((FRAMES, 3)), joint_rotations=joints,
+        valid=np.ones(FRAMES, dtype=bool), betas=np.zeros(10), body_model="body24",
+    )  # fmt: skip
+
+
+def err_like_a_tracker(motion: Motion) -> Motion:
+    """The motion leaning by 4 degrees, 5 cm farther off, with arms and legs off by 5 degrees."""
+    lean = Rotation.from_rotvec([np.deg2rad(4.0), 0.0, 0.0])
+    joints = motion.joint_rotations.copy()
+    joints[:, [15, 16, 0, 1], 2] += np.deg2rad([5.0, 5.0, -5.0, 4.0])
+    return replace(
+        motion,
+        root_rotations=(lean * Rotation.from_rotvec(motion.root_rotations)).as_rotvec(),
+        root_translations=motion.root_translations + np.array([0.02, 0.0, -0.05]),
+        joint_rotations=joints,
+    )
+
+
+@pytest.fixture(scope="module")
+def space() -> ProportionSpace:
+    return ProportionSpace.around(load_body_model().with_shape())
+
+
+def outlines(space: ProportionSpace, coefficients, motion: Motion) -> list[ClipFrame]:
+    model = OutlineModel(space)
+    model.set_proportions(coefficients)
+    masks = [model.silhouette(pose, CAMERA).astype(np.float32) for pose in motion_poses(motion)]
+    return [
+        ClipFrame(row=row, number=float(row), mask=OutlineDistances.of(mask, CAMERA))
+        for row, mask in enumerate(masks)
+    ]
+
+
+def motion_poses(motion: Motion) -> list[BodyPose]:
+    return [motion[row] for row in range(len(motion))]
+
+
+def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
+    """Mean distance of joints from the truth, relative to the pelvis."""
+    shaped = fitter.model.space.shape(fitter.coefficients)
+    found = []
+    for row in range(len(truth)):
+        ours = shaped.with_pose(fitter.pose(row)).joints()
+        theirs = person.with_pose(truth[row]).joints()
+        found.append(np.linalg.norm((ours - ours[0]) - (theirs - theirs[0]), axis=1))
+    return 100.0 * float(np.mean(found))
+
+
+def test_poses_and_proportions_come_back(space):
+    coefficients = np.zeros(space.count)
+    coefficients[[11, 17, 20, 25]] = 1.5, -1.5, 1.5, 1.0  # thighs, forearms, girths
+    truth, person = turning_motion(), space.shape(coefficients)
+    fitter = ClipFitter(err_like_a_tracker(truth), space, outlines(space, coefficients, truth))
+    before, off = fitter.error_px(), joint_error_cm(fitter, person, truth)
+    for _ in range(8):
+        fitter.iterate()
+    assert fitter.error_px() < 0.4 * before
+    assert joint_error_cm(fitter, person, truth) < 0.6 * off
+
+
+def test_what_is_not_fitted_stays(space):
+    truth = turning_motion()
+    fitter = ClipFitter(
+        err_like_a_tracker(truth), space, outlines(space, np.zeros(space.count), truth)
+    )
+    fitter.iterate(FitParameters(poses=True, proportions=False, focal=False))
+    assert np.abs(fitter.coefficients).max() < 1e-6
+    assert abs(fitter.log_focal) < 1e-6
+    assert np.abs(fitter.corrections).max() > 1e-3
+
+
+def test_exact_poses_hardly_move(space):
+    truth = turning_motion()
+    fitter = ClipFitter(truth, space, outlines(space, np.zeros(space.count), truth))
+    for _ in range(3):
+        fitter.iterate()
+    assert np.degrees(np.abs(fitter.corrections[:, :72]).max()) < 2.0
+    assert np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean()) < 0.5

@@ -1,0 +1,125 @@
+"""Outline residuals: their Jacobian, and what they say about a displaced body."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.camera import Camera
+from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import joint_transforms, rotation_matrices
+from preprocess.fitting.clip_fitting import correct_pose
+from preprocess.fitting.outlines import OutlineDistances, OutlineModel
+from preprocess.fitting.proportion_space import ProportionSpace
+
+VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
+VIEW[2, 3] = 2.6
+CAMERA = Camera(
+    focal_px=(190.0, 190.0), center_px=(48.0, 80.0), size_px=(96, 160),
+    camera_from_world=VIEW,
+)  # fmt: skip
+
+
+def a_pose() -> BodyPose:
+    turns = np.zeros((23, 3))
+    turns[[0, 1], 2] = 0.2, -0.2
+    turns[[15, 16], 2] = -0.8, 0.8
+    turns[17] = 0.1, 0.3, -0.2
+    return BodyPose(
+        root_rotation=np.array([0.1, 0.5, 0.05]), root_translation=np.array([0.02, 0.05, 0.1]),
+        joint_rotations=turns,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def model() -> OutlineModel:
+    return OutlineModel(ProportionSpace.around(load_body_model().with_shape()))
+
+
+def mask_of(model: OutlineModel, pose: BodyPose) -> OutlineDistances:
+    return OutlineDistances.of(model.silhouette(pose, CAMERA).astype(np.float32), CAMERA)
+
+
+def project_rows(model, rows, weights, rest, pose, camera) -> np.ndarray:
+    """Pixels of rest points, skinned from scratch."""
+    space = model.space
+    turns = np.concatenate([pose.root_rotation[None], pose.joint_rotations])
+    moved = joint_transforms(model.joints, space.shaped.body.parents, rotation_matrices(turns))
+    moved[:, :3, 3] += pose.root_translation
+    blended = np.einsum("rj,jab->rab", weights[rows], moved[:, :3])
+    return camera.project(np.einsum("rab,rb->ra", blended[:, :, :3], rest[rows]) + blended[:, :, 3])
+
+
+def test_a_body_fits_its_own_outline_within_a_pixel(model):
+    seen = model.compare(a_pose(), mask_of(model, a_pose()))
+    assert np.abs(np.median(seen.residuals)) < 0.5
+    assert np.percentile(np.abs(seen.residuals), 90) < 1.5
+
+
+def test_a_shift_across_the_view_shows_in_the_residuals(model):
+    mask, shift_m = mask_of(model, a_pose()), 0.01
+    moved = replace(
+        a_pose(), root_translation=a_pose().root_translation + np.array([shift_m, 0.0, 0.0])
+    )
+    seen = model.compare(moved, mask)
+    found = np.linalg.lstsq(
+        seen.pose_jacobian[:, 72:73] * seen.weights[:, None],
+        seen.residuals * seen.weights,
+        rcond=None,
+    )[0]
+    assert found[0] == pytest.approx(shift_m, abs=0.004)
+
+
+@pytest.mark.parametrize("parameter", [0, 1, 2, 3 * 16, 3 * 18 + 1, 3 * 1 + 2, 72, 73, 74])
+def test_the_jacobian_of_a_pose_is_that_of_projected_skin(model, parameter):
+    pose, step = a_pose(), 1e-4
+    chosen = np.arange(0, len(model._rest), 400)
+    normals = np.tile([0.6, 0.8], (len(chosen), 1))
+    jacobian = linearise_at(model, pose, chosen, normals).pose_jacobian
+    change = np.zeros(75)
+    change[parameter] = step
+    weights, rest = model._weights.astype(float), model._rest.astype(float)
+    ends = [
+        project_rows(
+            model, chosen, weights, rest,
+            correct_pose(pose, sign * change, CAMERA.camera_from_world), CAMERA,
+        )
+        for sign in (1.0, -1.0)
+    ]  # fmt: skip
+    slope = ((ends[0] - ends[1]) * normals).sum(axis=1) / (2.0 * step)
+    assert np.allclose(jacobian[:, parameter], slope, atol=0.01 * np.abs(slope).max() + 1e-3)
+
+
+def linearise_at(model, pose, chosen, normals):
+    from preprocess.fitting.outlines import _Matches
+
+    transforms = model._world_from_rest(pose)
+    blended = np.einsum("rj,jab->rab", model._weights[chosen], transforms[:, :3])
+    points = np.einsum("rab,rb->ra", blended[:, :, :3], model._rest[chosen]) + blended[:, :, 3]
+    matches = _Matches(np.arange(len(chosen)), np.zeros(len(chosen)), normals)
+    return model._linearise(points.astype(np.float32), chosen, transforms, CAMERA, matches)
+
+
+def test_the_jacobian_of_the_proportions_is_that_of_projected_skin(model):
+    pose, step, space = a_pose(), 1e-3, model.space
+    chosen = np.arange(0, len(model._rest), 400)
+    normals = np.tile([0.6, 0.8], (len(chosen), 1))
+    jacobian = linearise_at(model, pose, chosen, normals).shape_jacobian
+    for coefficient in (0, 10, 14, 17, 20, space.count - 1):
+        ends = []
+        for sign in (1.0, -1.0):
+            model.set_proportions(sign * step * np.eye(space.count)[coefficient])
+            ends.append(
+                project_rows(
+                    model,
+                    chosen,
+                    model._weights.astype(float),
+                    model._rest.astype(float),
+                    pose,
+                    CAMERA,
+                )
+            )
+        model.set_proportions(np.zeros(space.count))
+        slope = ((ends[0] - ends[1]) * normals).sum(axis=1) / (2.0 * step)
+        assert np.allclose(jacobian[:, coefficient], slope, atol=0.05 * np.abs(slope).max() + 0.02)
