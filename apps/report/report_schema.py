@@ -69,6 +69,7 @@ class TrainingStats:
     Attributes:
         wall_seconds: From the first frame handed to the trainer to the last step.
         cpu_seconds: CPU time of the whole process in that time.
+        step_cpu_seconds: The part of it during training steps.
         cpu_contention_seconds: Time for which threads were ready to run while other programs held
             the cores, summed over threads; a resumed run counts its own part only.
         startup_seconds: Before training: imports, opening and checking the capture, kernels.
@@ -81,6 +82,7 @@ class TrainingStats:
 
     wall_seconds: float
     cpu_seconds: float
+    step_cpu_seconds: float
     cpu_contention_seconds: float
     startup_seconds: float
     steps: int

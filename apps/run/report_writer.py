@@ -319,6 +319,7 @@ def _training_stats(result: TrainingResult, startup_seconds: float) -> TrainingS
     return TrainingStats(
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
+        step_cpu_seconds=trainer.step_cpu_seconds,
         cpu_contention_seconds=result.cpu_time.waited_s,
         startup_seconds=startup_seconds,
         steps=trainer.steps,

@@ -27,8 +27,8 @@ KEYS = {
     "stream package coverage earlier_videos cameras",
     "machine": "device backend threads",
     "frames": "read used held_out dropped near_duplicates not_replayed",
-    "training": "wall_seconds cpu_seconds cpu_contention_seconds startup_seconds steps rays "
-    "rays_per_second samples_per_ray peak_memory_mb",
+    "training": "wall_seconds cpu_seconds step_cpu_seconds cpu_contention_seconds startup_seconds "
+    "steps rays rays_per_second samples_per_ray peak_memory_mb",
     "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses",
     "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
     "lateness_ms inbox_depth",

@@ -56,6 +56,7 @@ def report(**changes):
         ),
         "training": TrainingStats(
             wall_seconds=60.0,
+            step_cpu_seconds=1.0,
             cpu_seconds=61.0,
             cpu_contention_seconds=0.5,
             startup_seconds=3.0,

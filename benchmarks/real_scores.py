@@ -1,0 +1,160 @@
+"""Scores of a run against the truth of a phone-like capture: poses, proportions, novel poses."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.training import checkpoint
+from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
+from avatar.training.trainer import Trainer
+from capture.camera import Camera
+from preprocess.body.body_file import load_body_model, read_shaped_body
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.cameras.camera_file import read_cameras
+from preprocess.capture_session import CaptureInputs
+from preprocess.observation import Observation
+from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion
+from preprocess.poses.root_placement import place_by_pixels
+
+TRACKED_JOINTS = 22
+"""Joints that are compared, the root included: without the hands' inner joints."""
+
+
+class NovelPoseFit(NamedTuple):
+    """Mean PSNR of the volume renderer in poses never filmed, dB, on white.
+
+    Attributes:
+        placed: At the true joint rotations, the root placed so that the joints appear where the
+            truth's do: nothing is fitted to the pictures.
+        fitted: After the product's own fitting of held-out poses, which started from these.
+        fitted_mask: The same where the person is.
+        fitted_ssim: SSIM of the same.
+    """
+
+    placed: float
+    fitted: float
+    fitted_mask: float
+    fitted_ssim: float
+
+
+def joint_error_cm(run: Path, capture: Path) -> float:
+    """Mean distance of the rest joints that were learnt on to the truth's, pelvis on pelvis, cm."""
+    learnt = read_shaped_body(run / "checkpoint" / "person.npz", load_body_model()).joints
+    return rest_joint_distance_cm(learnt, _true_body(capture).joints)
+
+
+def rest_joint_distance_cm(
+    one: Float[np.ndarray, "24 3"], other: Float[np.ndarray, "24 3"]
+) -> float:
+    """Mean distance of rest joints but the pelvis, which is laid on the other's, cm."""
+    away = ((one - one[0]) - (other - other[0]))[1:TRACKED_JOINTS]
+    return float(100.0 * np.linalg.norm(away, axis=1).mean())
+
+
+def given_pose_error_deg(capture: Path) -> float:
+    """Mean error of the poses that the user has, degrees, over joints and frames."""
+    given, truth = (read_motion(folder / "poses.npz") for folder in (capture, capture / "truth"))
+    cameras = [_camera(folder / "cameras.npz") for folder in (capture, capture / "truth")]
+    return float(
+        np.mean([
+            pose_error_deg((given[row], cameras[0]), (truth[row], cameras[1]))
+            for row in range(len(truth))
+        ])
+    )  # fmt: skip
+
+
+def learnt_pose_error_deg(run: Path, capture: Path) -> float:
+    """Mean error of the corrected poses of the frames that were trained on, degrees."""
+    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    truth = read_motion(capture / "truth" / "poses.npz")
+    true_camera = _camera(capture / "truth" / "cameras.npz")
+    saved = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE)
+    errors = []
+    for frame in saved.replay_frames:
+        pose = corrected_pose(trainer, frame.index, frame.pose)
+        errors.append(pose_error_deg((pose, frame.view.camera), (truth[frame.index], true_camera)))
+    return float(np.mean(errors))
+
+
+def corrected_pose(trainer: Trainer, index: int, given: BodyPose) -> BodyPose:
+    """The pose of a frame after the corrections of training."""
+    poses = PoseOptimizer(trainer.avatar.rig, 1, torch.device("cpu"))
+    poses.set_pose(0, given, correction=trainer.pose_corrections.get(index))
+    return poses.pose(0)
+
+
+def pose_error_deg(one: tuple[BodyPose, Camera], other: tuple[BodyPose, Camera]) -> float:
+    """Mean angle between two poses, degrees: the root's in the camera, joints' to their parents."""
+    a, b = _camera_rotations(*one), _camera_rotations(*other)
+    vectors = axis_angles_from_matrices(np.swapaxes(a, -1, -2) @ b)
+    return float(np.rad2deg(np.linalg.norm(vectors, axis=-1)).mean())
+
+
+def score_novel_poses(run: Path, capture: Path) -> NovelPoseFit:
+    """How well the avatar shows the true pictures of poses that were never filmed."""
+    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    person = read_shaped_body(run / "checkpoint" / "person.npz", load_body_model())
+    novel = _novel_observations(capture)
+    placed = [
+        HeldOutFrame(observation=place_in_true_view(seen, person, _true_body(capture)))
+        for seen in novel
+    ]
+    before = [score_frame(trainer.avatar, frame) for frame in placed]
+    fitted = [score for _, score in fit_test_poses(trainer, placed, given=before)]
+    return NovelPoseFit(
+        placed=float(np.mean([score.psnr for score in before])),
+        fitted=float(np.mean([score.psnr for score in fitted])),
+        fitted_mask=float(np.mean([score.psnr_mask for score in fitted])),
+        fitted_ssim=float(np.mean([score.ssim for score in fitted])),
+    )
+
+
+def place_in_true_view(seen: Observation, person: ShapedBody, true_body: ShapedBody) -> Observation:
+    """The observation with its pose's root moved for a person of other proportions.
+
+    Args:
+        seen: With the true pose and camera.
+        person: Whom the avatar was learnt on: its joints are to appear where the truth's do.
+        true_body: Whose pose it is.
+    """
+    camera = seen.camera
+    view = camera.camera_from_world
+    pixels = camera.project(true_body.with_pose(seen.pose).joints())
+    joints = person.with_pose(seen.pose).joints() @ view[:3, :3].T + view[:3, 3]
+    shift = view[:3, :3].T @ place_by_pixels(joints, pixels, camera)
+    moved = dataclasses.replace(seen.pose, root_translation=seen.pose.root_translation + shift)
+    return dataclasses.replace(seen, pose=moved)
+
+
+def _novel_observations(capture: Path) -> list[Observation]:
+    inputs = CaptureInputs(video=capture / "truth" / "novel", body=capture / "truth" / "body.npz")
+    return [seen for seen in open_capture(inputs).observations() if isinstance(seen, Observation)]
+
+
+def _true_body(capture: Path) -> ShapedBody:
+    return load_body_model(capture / "truth" / "body.npz").with_shape()
+
+
+def _camera(path: Path) -> Camera:
+    with np.load(path) as arrays:
+        size_px = int(arrays["width"]), int(arrays["height"])
+    return read_cameras(path, size_px)[0]
+
+
+def _camera_rotations(pose: BodyPose, camera: Camera) -> Float[np.ndarray, "22 3 3"]:
+    """Rotations of the root in the camera, and of the joints relative to their parents."""
+    vectors = np.concatenate([pose.root_rotation[None], pose.joint_rotations])[:TRACKED_JOINTS]
+    rotations = rotation_matrices(vectors)
+    rotations[0] = camera.camera_from_world[:3, :3] @ rotations[0]
+    return rotations
