@@ -12,9 +12,10 @@ from studio.lighting import LAMP_RGB, lamp_visibility
 
 WINDOW_FROM = np.array([-0.75, 0.50, 0.45]) / np.linalg.norm([-0.75, 0.50, 0.45])
 """Direction of the window, from the actor, in the world (the camera is on +z)."""
-WINDOW_STRENGTH = 0.55
-AMBIENT_STRENGTH = 0.85
-WRAP = 0.25
+WINDOW_STRENGTH = 0.40
+"""As a factor of color. An avatar whose light turns with it comes to 31 dB of the film at best."""
+AMBIENT_STRENGTH = 0.92
+WRAP = 0.4
 """A window is wide: it still lights surfaces this far (cosine) beyond the right angle."""
 
 
