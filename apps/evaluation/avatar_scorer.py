@@ -85,7 +85,7 @@ class AvatarScorer:
     def _score_in_fitted_poses(self, observations: Sequence[Observation]) -> None:
         trainer = self._trainer
         assert trainer is not None
-        for held, _ in fit_test_poses(
+        for held in fit_test_poses(
             trainer, [HeldOutFrame(observation=seen) for seen in observations]
         ):
             draw = partial(_render_exposed, trainer, held)

@@ -110,6 +110,8 @@ class HeldOutStats:
         lpips: Not measured.
         background: Color behind the alpha.
         poses: Poses that the frames were rendered in: given, or fitted.
+        whole_images: Number of frames of which the whole image was scored. The scores of the others
+            are estimates from a sample of their pixels, and `ssim` leaves them out.
     """
 
     frames: tuple[int, ...]
@@ -123,6 +125,7 @@ class HeldOutStats:
     lpips: float | None = None
     background: str = "white"
     poses: str = "given"
+    whole_images: int = 0
 
     @classmethod
     def of(cls, scores: tuple[HeldOutScore, ...], size: tuple[int, int] | None) -> "HeldOutStats":
@@ -136,6 +139,7 @@ class HeldOutStats:
             verdict=overall_verdict(scores),
             blur=median_blur(score.blur for score in scores),
             overlap=median_overlap(score.overlap for score in scores),
+            whole_images=sum(not math.isnan(score.ssim) for score in scores),
         )
 
 

@@ -1,6 +1,5 @@
 """Writes checkpoints on a thread of their own, at a rate that what they cost allows."""
 
-import os
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, final
@@ -15,7 +14,8 @@ from preprocess.capture_session import Capture
 CHECKPOINT_INTERVAL_S = 5.0
 """Shortest time between two checkpoints, seconds."""
 CHECKPOINT_COST_SHARE = 0.02
-"""Largest share of the cores' time that checkpoints take; where they cost more, they are rarer."""
+"""Largest share of the run's CPU time that checkpoints take; where they cost more, they are rarer.
+"""
 
 
 @final
@@ -35,12 +35,12 @@ class CheckpointWriter:
         self._run, self._capture, self._body_written = run, capture, False
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[float] | None = None
-        self._copy_cost_s = self._interval_s = 0.0
-        self._last = time.perf_counter()
+        self._copy_cost_s = self._cpu_interval_s = 0.0
+        self.restart_interval()
 
     def restart_interval(self) -> None:
         """Counts the time to the next checkpoint from now."""
-        self._last = time.perf_counter()
+        self._last, self._cpu_last = time.perf_counter(), time.process_time()
 
     def is_due(self) -> bool:
         """Whether the last checkpoint is written and old enough.
@@ -52,8 +52,9 @@ class CheckpointWriter:
             if not self._pending.done():
                 return False
             self._take_result()
-        waited = time.perf_counter() - self._last
-        return waited > max(CHECKPOINT_INTERVAL_S, self._interval_s)
+        if time.perf_counter() - self._last < CHECKPOINT_INTERVAL_S:
+            return False
+        return time.process_time() - self._cpu_last > self._cpu_interval_s
 
     def begin(self, trainer: Trainer, notes: dict[str, Any], *, trains_on: bool = True) -> None:
         """Start to write a checkpoint, after the one before it.
@@ -72,7 +73,7 @@ class CheckpointWriter:
         state = get_state(trainer, notes=notes)
         self._copy_cost_s = time.thread_time() - began
         self._pending = self._thread.submit(self._write, state)
-        self._last = time.perf_counter()
+        self.restart_interval()
 
     def wait(self) -> None:
         """Wait until the last checkpoint is written.
@@ -91,8 +92,7 @@ class CheckpointWriter:
     def _take_result(self) -> None:
         assert self._pending is not None
         done, self._pending = self._pending, None
-        cost_s = self._copy_cost_s + done.result()
-        self._interval_s = cost_s / (CHECKPOINT_COST_SHARE * (os.cpu_count() or 1))
+        self._cpu_interval_s = (self._copy_cost_s + done.result()) / CHECKPOINT_COST_SHARE
 
     def _write(self, state: dict[str, Any]) -> float:
         """Write a state, and body and fit beside the first; return the CPU time it took."""

@@ -55,9 +55,7 @@ class HeldOutFrame:
             ground_truth_on_white(self.observation), self.observation.alpha > MASK_THRESHOLD
         )
 
-    def expose(
-        self, rendering: Float32[np.ndarray, "height width 4"]
-    ) -> Float32[np.ndarray, "height width 4"]:
+    def expose(self, rendering: Float32[np.ndarray, "*shape 4"]) -> Float32[np.ndarray, "*shape 4"]:
         """A premultiplied rendering in the frame's exposure."""
         if self.gain is None:
             return rendering

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.evaluation.pixel_sample import score_fine_sample
 from avatar.events import HeldOutScore
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction
@@ -34,31 +35,28 @@ def score_with_fitted_poses(
     trainer: Trainer,
     frames: list[HeldOutFrame],
     *,
-    given: Sequence[HeldOutScore] | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[HeldOutScore, ...]:
-    """Scores of held-out frames in poses fitted to them (`fit_test_poses`)."""
-    fitted = fit_test_poses(trainer, frames, given=given, progress=progress)
-    return tuple(score for _, score in fitted)
+    """Scores of whole images of held-out frames in poses fitted to them (`fit_test_poses`)."""
+    fitted = fit_test_poses(trainer, frames, progress=progress)
+    return tuple(score_frame(trainer.avatar, frame) for frame in fitted)
 
 
 def fit_test_poses(
     trainer: Trainer,
     frames: list[HeldOutFrame],
     *,
-    given: Sequence[HeldOutScore] | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> Iterator[tuple[HeldOutFrame, HeldOutScore]]:
-    """Held-out frames in poses and exposures fitted to them, each with its score.
+) -> Iterator[HeldOutFrame]:
+    """Held-out frames in poses and exposures fitted to them.
 
     The avatar is frozen; only poses and exposures are optimized, starting from those of neighboring
     frames. Each correction uses a few hundred rays, so an exact pose ends about a millimetre off;
-    the given pose, or exposure, is kept where it scores higher.
+    the given pose, or exposure, is kept where it scores higher on a sample of the pixels.
 
     Args:
         trainer: Trainer of the avatar; the gradients of its field are overwritten.
         frames: Frames that were never trained on.
-        given: Their scores in the given poses, if these have been measured already.
         progress: Receives the completed share, from 0 to 1.
     """
     if not frames:
@@ -75,13 +73,11 @@ def fit_test_poses(
         moved = HeldOutFrame(
             observation=replace(frame.observation, pose=pose), correspondences=cells, gain=gain
         )
-        before = score_frame(avatar, frame) if given is None else given[slot]
-        options = [(frame, before), (moved, score_frame(avatar, moved))]
+        options = [frame, moved]
         if np.abs(gain - 1.0).max() > MIN_SCORED_GAIN:
-            exposed = replace(frame, gain=gain)
-            options.append((exposed, score_frame(avatar, exposed)))
+            options.append(replace(frame, gain=gain))
         progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
-        yield max(options, key=lambda scored: scored[1].psnr)
+        yield max(options, key=lambda option: score_fine_sample(avatar, option).psnr)
 
 
 def _fit_frames(

@@ -14,6 +14,7 @@ import torch
 
 from apps.evaluation import final_scoring
 from apps.run import checkpoint_writer, report_writer
+from apps.run.checkpoint_writer import CheckpointWriter
 from apps.run.report_writer import diagnose_failure
 from apps.run.run_folder import RunFolder
 from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
@@ -29,7 +30,8 @@ KEYS = {
     "frames": "read used held_out dropped near_duplicates not_replayed",
     "training": "wall_seconds cpu_seconds step_cpu_seconds cpu_contention_seconds startup_seconds "
     "steps rays rays_per_second samples_per_ray peak_memory_mb",
-    "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses",
+    "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses "
+    "whole_images",
     "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
     "lateness_ms inbox_depth",
     "package": "path bytes seconds psnr_to_renderer",
@@ -216,6 +218,13 @@ def test_a_full_disk_keeps_the_checkpoint_before(
 ):
     monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_INTERVAL_S", 0.0)
     monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_COST_SHARE", 1e6)
+    begin = CheckpointWriter.begin
+
+    def written_at_once(writer, *args, **options):
+        begin(writer, *args, **options)
+        writer.settle()
+
+    monkeypatch.setattr(CheckpointWriter, "begin", written_at_once)
     save, written = torch.save, []
 
     def full_after_one(state, file):
@@ -229,7 +238,7 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     assert outcome.code == 3
     assert "--resume" in outcome.complaint()
     left = {file.name for file in (tmp_path / "run").rglob("*") if file.is_file()}
-    assert left == {"person.npz", "state.pt", LIST}
+    assert left == {"person.npz", "state.pt", "fit.npz", LIST}
     trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint", torch.device("cpu"))
     assert trainer.steps == 1
 

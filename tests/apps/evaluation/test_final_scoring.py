@@ -1,13 +1,21 @@
-"""Final scores: all held-out frames, or as many as time allows, spread over the video."""
+"""Final scores: whole images as long as time allows, then samples of their pixels."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from apps.cli.console import Console
 from apps.evaluation import final_scoring
-from apps.evaluation.final_scoring import KEPT_RENDERINGS, MIN_SCORED_FRAMES, score_finally
+from apps.evaluation.final_scoring import (
+    FRAMES_PER_FIT,
+    KEPT_RENDERINGS,
+    MIN_WHOLE_IMAGES,
+    score_finally,
+)
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame
+from avatar.evaluation.held_out import HeldOutFrame, score_rendering
+from avatar.evaluation.pixel_sample import PixelSample
 from avatar.field.avatar_model import Avatar
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
@@ -43,14 +51,18 @@ def held_out() -> list[HeldOutFrame]:
 def score(held_out, monkeypatch):
     """Scores black renderings, in no time or after all time is spent."""
 
-    def scored(*, steps: int | None, limit_s: float):
+    def scored(*, steps: int | None, limit_s: float, fit_poses: bool = False):
         black = np.zeros((24, 16, 4), dtype=np.float32)
         black[..., 3] = held_out[0].observation.alpha
+        worse = replace(score_rendering(black, held_out[0]), psnr=0.0)
         monkeypatch.setattr(final_scoring, "render", lambda *_, **__: black)
+        monkeypatch.setattr(PixelSample, "score", lambda sample, _: sample.score_rendering(black))
+        monkeypatch.setattr(final_scoring, "fit_test_poses", lambda trainer, frames: iter(frames))
+        monkeypatch.setattr(final_scoring, "score_frame", lambda *_: worse)
         monkeypatch.setattr(final_scoring, "SCORING_LIMIT_S", limit_s)
         trainer = Trainer.__new__(Trainer)
         trainer.config, trainer.avatar = TrainConfig(steps=steps), Avatar.__new__(Avatar)
-        return score_finally(trainer, held_out, Console(), fit_poses=False)
+        return score_finally(trainer, held_out, Console(), fit_poses=fit_poses)
 
     return scored
 
@@ -67,15 +79,33 @@ def test_with_enough_time_all_frames_are_scored(score, held_out):
     assert len(scores.renderings) == KEPT_RENDERINGS
 
 
-def test_without_time_a_few_frames_are_that_are_spread_over_the_video(score, held_out):
-    frames = frames_of(score(steps=None, limit_s=0.0).given)
-    assert len(frames) == MIN_SCORED_FRAMES
+def test_without_time_all_frames_are_scored_but_few_as_whole_images(score, held_out):
+    """The frames are so small that a sample holds all pixels that differ."""
+    exact, scores = score(steps=None, limit_s=1e9), score(steps=None, limit_s=0.0)
+    assert frames_of(scores.given) == frames_of(exact.given)
+    whole = [score.frame for score in scores.given if not np.isnan(score.ssim)]
+    assert len(whole) == MIN_WHOLE_IMAGES
+    assert np.diff(whole).max() <= 10 * COUNT // 2  # spread over the video
+    assert list(scores.renderings) == whole
+    for one, other in zip(scores.given, exact.given, strict=True):
+        assert one.psnr_mask == pytest.approx(other.psnr_mask, abs=1e-4)
+        assert one.psnr == pytest.approx(other.psnr, abs=1e-4)
+
+
+def test_without_time_poses_are_fitted_to_some_frames_that_are_spread_over_the_video(score):
+    frames = frames_of(score(steps=None, limit_s=0.0, fit_poses=True).fitted)
+    assert len(frames) == FRAMES_PER_FIT
     assert frames == sorted(frames)
     assert np.diff(frames).max() <= 10 * (COUNT // 4)
 
 
+def test_a_frame_that_scores_lower_in_its_fitted_pose_keeps_the_given_one(score):
+    scores = score(steps=10, limit_s=0.0, fit_poses=True)
+    assert scores.fitted == scores.given
+
+
 def test_a_run_with_counted_steps_does_not_depend_on_the_machine(score):
-    assert len(score(steps=10, limit_s=0.0).given) == COUNT
+    assert not np.isnan([one.ssim for one in score(steps=10, limit_s=0.0).given]).any()
 
 
 def test_a_sample_of_all_pixels_scores_like_the_whole_image(score):
