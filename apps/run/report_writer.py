@@ -179,7 +179,9 @@ def print_results(
     if held_out.psnr is not None:
         score = f"held-out PSNR {format_psnr(held_out.psnr, held_out.verdict)}"
     if fitted is not None and fitted.psnr is not None:
-        score += f", with poses fitted to those frames {format_psnr(fitted.psnr, fitted.verdict)}"
+        some = "" if len(fitted.frames) == len(held_out.frames) else f"{len(fitted.frames)} of "
+        fitted_score = format_psnr(fitted.psnr, fitted.verdict)
+        score += f", with poses fitted to {some}those frames {fitted_score}"
     training = report.training
     console.info(f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}.")
     if report.package is not None:
