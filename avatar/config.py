@@ -97,6 +97,8 @@ class TrainConfig:
     """Steps between updates of the occupancy grid."""
     refine_poses: bool = True
     """Whether the frames' poses are corrected during training."""
+    estimate_shading: bool = True
+    """Whether the light of the room is separated from the colors of the person who turns in it."""
     estimate_exposures: bool = True
     """Whether a gain of each color channel is estimated for each frame."""
     replay_capacity: int = 200

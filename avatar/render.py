@@ -17,6 +17,7 @@ from torch import Tensor
 from avatar.deformation.correspondence_check import CorrespondenceCheck
 from avatar.deformation.correspondence_grid import CorrespondenceGrid, cull_cells, screen_bounds
 from avatar.field.avatar_model import Avatar
+from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
@@ -80,6 +81,7 @@ class PosedAvatar:
         tables: Correspondence grid of the pose, without cells that lead to unoccupied space.
         check: Finds spurious samples.
         bounds: Rows and columns of the image outside of which nothing is seen.
+        shaded: Whether the light of the room falls on the avatar; its colors are neutral otherwise.
     """
 
     avatar: Avatar
@@ -89,6 +91,7 @@ class PosedAvatar:
     tables: CorrespondenceTables
     check: CorrespondenceCheck
     bounds: tuple[slice, slice]
+    shaded: bool = False
 
     @classmethod
     def of(
@@ -98,6 +101,7 @@ class PosedAvatar:
         camera: Camera,
         *,
         cells: CorrespondenceGrid | None = None,
+        shaded: bool = False,
     ) -> "PosedAvatar":
         """Culls the correspondence grid of a pose, and solves it unless it is given."""
         device = avatar.field.table.device
@@ -113,6 +117,7 @@ class PosedAvatar:
             tables=correspondence_tables(cells, device),
             check=CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device),
             bounds=screen_bounds(cells, camera, world_from_body),
+            shaded=shaded,
         )
 
     @torch.no_grad()
@@ -120,15 +125,25 @@ class PosedAvatar:
         """Premultiplied RGBA in [0, 1] at image points, px."""
         field = self.avatar.field
         rays = BodyFrameRays.through(pixels, self.camera, self.world_from_body)
-        colors = trace_rays(
-            field, ray_batch(rays, field.table.device), self.tables,
-            grid=self.grid, check=self.check, sample_step_m=self.avatar.sample_step_m,
+        shading = self.avatar.shading
+        shading = shading if self.shaded and not shading.is_neutral else None
+        colors, normals = trace_rays(
+            field, ray_batch(rays, field.table.device), self.tables, grid=self.grid,
+            check=self.check, sample_step_m=self.avatar.sample_step_m, shading=shading,
         )  # fmt: skip
+        if shading is not None:
+            rotation = torch.from_numpy(self.world_from_body[:3, :3]).to(normals)
+            colors[:, :3] *= shading.factor(normals @ rotation.T)
         return colors.cpu().numpy()
 
 
 def render(
-    avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid | None = None
+    avatar: Avatar,
+    pose: BodyPose,
+    camera: Camera,
+    *,
+    cells: CorrespondenceGrid | None = None,
+    shaded: bool = False,
 ) -> Float32[np.ndarray, "height width 4"]:
     """Renders an avatar in one pose as a premultiplied RGBA image in [0, 1].
 
@@ -141,8 +156,10 @@ def render(
         pose: Pose in the camera's world frame.
         camera: Camera and size of the image.
         cells: Correspondence grid of the pose, if it has been solved already.
+        shaded: Whether the light of the room in which the person was filmed falls on the avatar;
+            otherwise its colors are neutral, as in the package.
     """
-    posed = PosedAvatar.of(avatar, pose, camera, cells=cells)
+    posed = PosedAvatar.of(avatar, pose, camera, cells=cells, shaded=shaded)
     width, height = camera.size_px
     picture = np.zeros((height, width, 4), dtype=np.float32)
     rows, columns = posed.bounds
@@ -171,8 +188,9 @@ def trace_rays(
     grid: DensityGrid,
     check: CorrespondenceCheck,
     sample_step_m: float,
-) -> Float32[Tensor, "rays 4"]:
-    """Premultiplied color and alpha along rays.
+    shading: OrientationShading | None = None,
+) -> tuple[Float32[Tensor, "rays 4"], Float32[Tensor, "rays 3"]]:
+    """Premultiplied neutral color and alpha along rays, and the normals of what they see.
 
     Args:
         field: Radiance field to render.
@@ -181,7 +199,9 @@ def trace_rays(
         grid: Occupancy outside which the field is taken to be empty.
         check: Finds spurious samples, whose density is taken to be zero.
         sample_step_m: Distance between samples, metres.
+        shading: Has the normals, in the body frame; all are zero without it.
     """
+    normals = torch.zeros(len(rays.slots), 3, device=rays.origins.device)
     colors = torch.zeros(len(rays.slots), 4, device=rays.origins.device)
     alive = torch.arange(len(colors), device=colors.device)
     while len(alive):
@@ -192,12 +212,15 @@ def trace_rays(
         raw = field.raw_outputs_at(samples.points)
         raw[check.find_spurious(samples, rays), 3] = EMPTY_LOG_DENSITY
         part = field.backend.composite(raw, samples, sample_step_m)
+        if shading is not None:
+            found = shading.body_normals(field.backend, rays, samples, raw, cells, sample_step_m)
+            normals[alive] += (1.0 - nearer[:, 3:]) * found
         nearer = nearer + (1.0 - nearer[:, 3:]) * part
         colors[alive] = nearer
         on = ((samples.counts == most) & (nearer[:, 3] < 1.0 - MIN_TRANSMITTANCE)).nonzero()[:, 0]
         rays = RayBatch(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
         alive = alive[on]
-    return colors
+    return colors, normals
 
 
 def ray_batch(rays: BodyFrameRays, device: torch.device) -> RayBatch:

@@ -75,7 +75,9 @@ class AvatarScorer:
     def _score_frame(self, observation: Observation) -> None:
         trainer, self.size_px = self._trainer, observation.camera.size_px
         if trainer is not None:
-            draw = partial(render, trainer.avatar, observation.pose, observation.camera)
+            draw = partial(
+                render, trainer.avatar, observation.pose, observation.camera, shaded=True
+            )
             self._given.scores.append(score_frame(observation, draw))
         for tier, player in self._players.items():
             self._played[tier].scores.append(
@@ -125,7 +127,7 @@ def evaluate_avatar(
 
 def _render_exposed(trainer: Trainer, held: HeldOutFrame) -> PremultipliedImage:
     seen = held.observation
-    return held.expose(render(trainer.avatar, seen.pose, seen.camera))
+    return held.expose(render(trainer.avatar, seen.pose, seen.camera, shaded=True))
 
 
 def _render_with_player(player: Player, observation: Observation) -> PremultipliedImage:

@@ -116,7 +116,7 @@ def _score_in_given_poses(
             yield _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
             continue
         seen = frame.observation
-        picture = render(avatar, seen.pose, seen.camera, cells=frame.correspondences)
+        picture = render(avatar, seen.pose, seen.camera, cells=frame.correspondences, shaded=True)
         white = np.clip(composite_on_white(picture), 0.0, 1.0)
         sampled = PixelSample.of(frame).score_rendering(picture)
         shown = (white * 255.0 + 0.5).astype(np.uint8)

@@ -72,7 +72,9 @@ class HeldOutFrame:
 def score_frame(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
     """Renders a held-out frame and compares it with the ground truth."""
     observation = frame.observation
-    picture = render(avatar, observation.pose, observation.camera, cells=frame.correspondences)
+    picture = render(
+        avatar, observation.pose, observation.camera, cells=frame.correspondences, shaded=True
+    )
     return score_rendering(picture, frame)
 
 

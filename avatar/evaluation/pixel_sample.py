@@ -88,7 +88,7 @@ class PixelSample:
         """Renders the pixels and compares them with the frame."""
         seen = self.frame.observation
         cells = self.correspondences or self.frame.correspondences
-        posed = PosedAvatar.of(avatar, seen.pose, seen.camera, cells=cells)
+        posed = PosedAvatar.of(avatar, seen.pose, seen.camera, cells=cells, shaded=True)
         rows, columns = np.divmod(self.places, seen.camera.size_px[0])
         return self.score_colors(
             posed.colors_at(np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64))

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
+from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import activate
@@ -22,12 +23,14 @@ class Avatar:
         field: Canonical color and density.
         occupancy: Occupied canonical cells.
         sample_step_m: Distance between samples along a ray in training, metres.
+        shading: Light of the room in which the person was filmed.
     """
 
     rig: Rig
     field: RadianceField
     occupancy: OccupancyGrid
     sample_step_m: float
+    shading: OrientationShading
 
     def rendering_grid(self) -> DensityGrid:
         """Occupancy for rendering, grown so that images have no holes."""

@@ -61,6 +61,7 @@ def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> d
         "gains": {
             frame: torch.from_numpy(gain) for frame, gain in trainer.exposures.by_frame.items()
         },
+        "shading": trainer.learner.shading.coefficients,
         "notes": notes or {},
     }
 
@@ -134,6 +135,8 @@ def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
     }
     gains = state.get("gains", {})  # checkpoints before 2026-11-22 have none
     trainer.exposures.restore({frame: gain.numpy() for frame, gain in gains.items()})
+    if "shading" in state:
+        trainer.learner.shading.restore(state["shading"])
     for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])
     return trainer

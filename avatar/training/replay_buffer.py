@@ -51,10 +51,12 @@ class TrainingBatch(NamedTuple):
     Attributes:
         rays: Rays in the body frames of their slots.
         target: Premultiplied color and alpha, in [0, 1].
+        world_from_body: Rotations from the rays' body frames to the world.
     """
 
     rays: RayBatch
     target: Float32[Tensor, "rays 4"]
+    world_from_body: Float32[Tensor, "rays 3 3"]
 
 
 class _RunTable(NamedTuple):
@@ -92,6 +94,7 @@ class ReplayBuffer:
         self._origins = torch.zeros(capacity, 3, device=device)
         self._body_from_camera = np.zeros((capacity, 3, 3))
         self._turns = torch.zeros(capacity, 3, 3, device=device)
+        self._world_from_camera = torch.zeros(capacity, 3, 3, device=device)
         self._low = torch.zeros(capacity, 3, device=device)
         self._shape = torch.ones(capacity, 3, dtype=torch.int32, device=device)
         self._index = torch.zeros(capacity, 1, dtype=torch.int32, device=device)
@@ -185,7 +188,8 @@ class ReplayBuffer:
             uniform(count),
         )
         color = self._colors[slot, torch.minimum(pixel, near - 1)].float() / 255.0
-        return TrainingBatch(rays, color * (pixel < near)[:, None])
+        world_from_body = self._world_from_camera[slot] @ self._turns[slot].transpose(1, 2)
+        return TrainingBatch(rays, color * (pixel < near)[:, None], world_from_body)
 
     def update_errors(self, slots: Int64[Tensor, "rays"], loss: Float32[Tensor, "rays"]) -> None:
         """Updates the running error of the frames that the rays came from."""
@@ -234,6 +238,10 @@ class ReplayBuffer:
         self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
         self._body_from_camera[slot] = frame.body_from_camera
         self._turns[slot] = torch.from_numpy(frame.body_from_camera).to(self.device)
+        camera_from_world = frame.view.camera.camera_from_world[:3, :3]
+        self._world_from_camera[slot] = torch.from_numpy(camera_from_world.T.copy()).to(
+            self._world_from_camera
+        )
         self._near[slot] = frame.pixels.near_count
         self._far[slot] = frame.pixels.count - frame.pixels.near_count
 

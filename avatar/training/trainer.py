@@ -16,6 +16,7 @@ from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.field.avatar_model import Avatar
 from avatar.field.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
+from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import Backend
 from avatar.kernels.hash_levels import HashLevels
@@ -78,6 +79,7 @@ class Trainer:
             field=self.field,
             occupancy=OccupancyGrid(rig, device),
             sample_step_m=config.sample_step_m,
+            shading=OrientationShading(rig, device),
         )
         self.sampler: RaySampler = OccupancySampler(self.backend, self.learner.occupancy, config)
         self.avatar = replace(self.learner, field=self.field.clone())
@@ -155,9 +157,9 @@ class Trainer:
         batch = self.replay.sample_rays(config.rays, self.generator)
         refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
         refines = refines and self.poses.freeze_converged(self.steps)
+        neutral = self.exposures.neutralize(batch)
         result = compute_gradients(
-            self.learner, self.sampler, self.replay.correspondences,
-            self.exposures.neutralize(batch), config,
+            self.learner, self.sampler, self.replay.correspondences, neutral, config,
             hard_surface_share=hard_surface_share,
             surface_share=1.0 - falling,
             caches_density=self.steps % config.occupancy_interval < 2,
@@ -175,6 +177,8 @@ class Trainer:
         self.replay.update_errors(batch.rays.slots.long(), result.loss)
         if config.estimate_exposures:
             self.exposures.observe(batch, result.rendered)
+        if config.estimate_shading:
+            self.learner.shading.observe(result.normals, neutral.target, result.rendered)
         if self.steps % config.occupancy_interval == 0:
             self._update_occupancy(1.0 - falling)
         self.steps += 1

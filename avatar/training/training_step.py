@@ -67,12 +67,14 @@ class StepResult(NamedTuple):
 
     Attributes:
         loss: Loss of each ray.
-        rendered: Premultiplied color and alpha of each ray.
+        rendered: Premultiplied color and alpha of each ray, shaded.
+        normals: World normal of what each ray sees.
         sample_count: Samples of all rays together.
     """
 
     loss: Float32[Tensor, "rays"]
     rendered: PremultipliedPixels
+    normals: Float32[Tensor, "rays 3"]
     sample_count: int
 
 
@@ -112,8 +114,14 @@ def compute_gradients(
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
     background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
+    normals = learner.shading.body_normals(
+        field.backend, batch.rays, samples, raw, correspondences, config.sample_step_m
+    )
+    normals = (batch.world_from_body @ normals[..., None])[..., 0]
+    shade = learner.shading.factor(normals)
+    lit = torch.cat([shade.expand(-1, 3), torch.ones_like(shade)], dim=1)
     rendered, loss, grad = field.backend.composite_loss(
-        raw, samples, config.sample_step_m, batch.target, background,
+        raw, samples, config.sample_step_m, batch.target / lit, background,
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
@@ -126,7 +134,7 @@ def compute_gradients(
         log_density = raw[:, 3].contiguous()
         grid = learner.occupancy.density_grid
         field.backend.scatter_max_density(seen.points[:count], log_density, grid)
-    return StepResult(loss, rendered, count)
+    return StepResult(loss, rendered * lit, normals, count)
 
 
 def _regularization_points(

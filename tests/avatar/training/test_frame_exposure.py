@@ -32,7 +32,8 @@ def rays_of(gains, generator, *, rays=4000):
     rendered[:, 3] = (torch.rand(rays, generator=generator) > 0.3).float()
     filmed = torch.cat([rendered[:, :3] * gains[slots], rendered[:, 3:]], dim=1)
     empty = torch.zeros(rays, 3)
-    batch = TrainingBatch(RayBatch(empty, empty, slots.int(), empty[:, 0]), filmed)
+    turns = torch.eye(3).expand(rays, 3, 3)
+    batch = TrainingBatch(RayBatch(empty, empty, slots.int(), empty[:, 0]), filmed, turns)
     return batch, rendered
 
 

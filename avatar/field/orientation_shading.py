@@ -1,0 +1,170 @@
+"""Shading by orientation: light that stays in the room while the person turns.
+
+The field's colors move with the skin. What the room's light adds depends on where the skin faces in
+the world: one factor per direction, in spherical harmonics of the first order (a second order won
+nothing). Its four numbers are shared by all frames and found by linear least squares from running
+sums. The field and the package hold neutral colors.
+"""
+
+import math
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import (
+    Backend,
+    CorrespondenceTables,
+    PremultipliedPixels,
+    RawOutputs,
+    RayBatch,
+    RaySamples,
+)
+
+HARMONICS = 4
+"""Spherical harmonics up to the first order."""
+MIN_ALPHA = 0.9
+"""Alpha, of the frame and of the rendering, from which a ray counts."""
+MIN_NORMAL_LENGTH = 0.5
+"""Length of a ray's mean normal below which it has no direction."""
+MEMORY_RAYS = 60_000.0
+"""Rays after which an earlier one weighs 1/e."""
+MIN_RAYS = 10_000.0
+"""Rays before the first estimate; the field is fog until about then."""
+RIDGE = 0.02
+"""Weight of the constant factor 1, as a share of the rays."""
+UNEXPLAINED_SHARE, EXPLAINED_SHARE = 0.02, 0.06
+"""Share of the squared error that shading has to explain: below the first it is not believed, from
+the second on it is believed in full."""
+MIN_OPTICAL_DEPTH = 0.02
+"""Optical depth of a sample below which its normal does not count."""
+MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
+"""Bounds of the factor."""
+OBSERVATION_INTERVAL = 4
+"""Steps between observations while no shading has been found; from then on every step is one."""
+NORMAL_SCALE = 0.4995
+"""Scale of normals that are composited as colors, which keeps them inside (0, 1)."""
+
+
+@final
+class OrientationShading:
+    """The room's light on the person.
+
+    Attributes:
+        coefficients: Coefficients of the factor of the neutral color, for `_harmonics`.
+        is_neutral: Whether no shading has been found; the factor is then 1 everywhere.
+    """
+
+    def __init__(self, rig: Rig, device: torch.device) -> None:
+        """Starts from light that is the same from everywhere."""
+        distance = np.where(rig.inside_skin, -rig.skin_distance, rig.skin_distance)
+        distance = gaussian_filter(distance.astype(np.float32), 1.0)
+        slope = np.stack([np.gradient(distance, axis=axis) for axis in range(3)], axis=-1)
+        slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-6)
+        self._normals = torch.from_numpy(slope.astype(np.float32)).to(device)
+        self._low = torch.from_numpy(rig.box_low).to(device)
+        cells_per_m = np.array(distance.shape, dtype=np.float32) / (rig.box_high - rig.box_low)
+        self._cells_per_m = torch.from_numpy(cells_per_m).to(device)
+        self._gram: Float64[Tensor, "harmonics harmonics"] = torch.zeros(
+            HARMONICS, HARMONICS, dtype=torch.float64, device=device
+        )
+        self._moments = torch.zeros_like(self._gram[0])
+        self._power, self._rays = self._moments[0].clone(), self._moments[0].clone()
+        self.coefficients = self._gram[0].float()
+        self.coefficients[0] = 1.0
+        self.is_neutral = True
+        self._steps = 1  # not an observation's turn, where none is ever asked for
+
+    def body_normals(
+        self,
+        backend: Backend,
+        rays: RayBatch,
+        samples: RaySamples,
+        raw: RawOutputs,
+        cells: CorrespondenceTables,
+        step_m: float,
+    ) -> Float32[Tensor, "rays 3"]:
+        """Mean normal of what each ray sees, in the body frame; shorter than 1 where it is thin.
+
+        Normals of the skin's distance volume, through the warp, composited like colors. All are
+        zero in steps that need none.
+        """
+        if self.is_neutral and self._steps % OBSERVATION_INTERVAL:
+            return torch.zeros(len(rays.slots), 3, device=raw.device)
+        last = torch.tensor(self._normals.shape[:3], device=raw.device) - 1
+        dense = (raw[:, 3] > math.log(MIN_OPTICAL_DEPTH / step_m)).nonzero()[:, 0]
+        cell = ((samples.points[dense] - self._low) * self._cells_per_m).long().clamp(min=0)
+        normals = self._normals[torch.minimum(cell, last).unbind(dim=1)]
+        slots = torch.repeat_interleave(rays.slots.long(), samples.counts.long())[dense]
+        warp = cells.roots[slots, samples.root_rows.long()[dense], 3:].unflatten(1, (3, 3))
+        normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)
+        encoded = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], dim=1)
+        encoded[dense, :3] = torch.logit(0.5 + NORMAL_SCALE * normals)
+        mean = backend.composite(encoded, samples, step_m)
+        return (mean[:, :3] - 0.5 * mean[:, 3:]) / NORMAL_SCALE
+
+    def factor(self, normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 1"]:
+        """Factor of the neutral color of surfaces with these world normals; 1 without one."""
+        length = normals.norm(dim=1, keepdim=True)
+        shade = _harmonics(normals / length.clamp(min=1e-6)) @ self.coefficients[:, None]
+        return torch.where(
+            length > MIN_NORMAL_LENGTH, shade.clamp(MIN_FACTOR, MAX_FACTOR), torch.ones_like(shade)
+        )
+
+    def restore(self, coefficients: Float32[Tensor, "harmonics"]) -> None:
+        """Continues from coefficients that were found earlier."""
+        self.coefficients = coefficients.to(self.coefficients)
+        self.is_neutral = not bool(self.coefficients[1:].any())
+
+    def observe(
+        self,
+        normals: Float32[Tensor, "rays 3"],
+        target: PremultipliedPixels,
+        rendered: PremultipliedPixels,
+    ) -> None:
+        """Updates the coefficients.
+
+        Args:
+            normals: World normals.
+            target: Pixels, at neutral exposure.
+            rendered: Shaded rendering of the same rays.
+        """
+        self._steps += 1
+        length = normals.norm(dim=1, keepdim=True)
+        alpha = torch.minimum(target[:, 3:], rendered[:, 3:])
+        counts = (alpha > MIN_ALPHA) & (length > MIN_NORMAL_LENGTH)
+        basis = (_harmonics(normals / length.clamp(min=1e-6)) * counts).double()
+        before = (rendered[:, :3].mean(dim=1, keepdim=True) / self.factor(normals)).double()
+        after = (target[:, :3].mean(dim=1, keepdim=True) * counts).double()
+        basis, rays = basis * before, counts.sum()
+        kept = torch.exp(-rays / MEMORY_RAYS)
+        self._gram = kept * self._gram + basis.T @ basis
+        self._moments = kept * self._moments + (basis.T @ after)[:, 0]
+        self._power = kept * self._power + after.square().sum()
+        self._rays = kept * self._rays + rays
+        if float(self._rays) > MIN_RAYS:
+            self.restore(self._solve().float())
+
+    def _solve(self) -> Float64[Tensor, "harmonics"]:
+        """Coefficients of least squares, drawn to 1; their mean over the rays is 1."""
+        unit = torch.zeros_like(self._moments)
+        unit[0] = 1.0
+        ridge = RIDGE * self._gram[0, 0] * torch.eye(HARMONICS, device=unit.device)
+        ridge[0, 0] = 0.0
+        found = torch.linalg.solve(self._gram + ridge, self._moments)
+        level = self._moments[0] / self._gram[0, 0]
+        constant = self._power - level * self._moments[0]
+        rest = self._power - 2.0 * found @ self._moments + found @ self._gram @ found
+        explained = 1.0 - rest / constant.clamp(min=1e-12)
+        belief = (explained - UNEXPLAINED_SHARE) / (EXPLAINED_SHARE - UNEXPLAINED_SHARE)
+        found = found / ((self._gram[0] @ found) / self._gram[0, 0])
+        return unit + belief.clamp(0.0, 1.0) * (found - unit)
+
+
+def _harmonics(normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 4"]:
+    """Spherical harmonics up to the first order, not normalized."""
+    return torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
