@@ -16,8 +16,6 @@ PRIOR_SIGMA_RAD = 0.05
 """Prior standard deviation of a tracker's rotations, radians."""
 PRIOR_SIGMA_M = 0.025
 """Prior standard deviation of the root's position, metres."""
-OVERRELAXATION = 1.6
-"""Factor of the Gauss-Newton step, above 1 because the field follows the pose."""
 MIN_EVIDENCE = 1.5
 """Evidence, averaged over the frame and all frames, up to which a pose does not move. Of exact
 poses 5 % reach 1.8, with a mean of 1.2; poses off by 2° reach 3 to 6."""
@@ -51,7 +49,6 @@ def gauss_newton_step(
     shared_evidence: float,
     *,
     prior: PosePrior = UNINFORMATIVE_PRIOR,
-    overrelaxation: float = OVERRELAXATION,
 ) -> GaussNewtonStep:
     """The step towards the pose at which the rays fit, in the directions that they determine.
 
@@ -62,7 +59,6 @@ def gauss_newton_step(
         shared_evidence: Mean evidence of all frames, which one tracker produced; infinite if the
             pose is to move in any case.
         prior: Prior of the correction.
-        overrelaxation: Factor of the Gauss-Newton step.
     """
     scale = np.full((25, 3), PRIOR_SIGMA_RAD, dtype=np.float32)
     scale[24] = PRIOR_SIGMA_M
@@ -84,14 +80,14 @@ def gauss_newton_step(
         1.0,
     )
 
-    def asked(length: float, believed: PosePrior) -> Float[np.ndarray, "25 3"]:
+    def asked(believed: PosePrior) -> Float[np.ndarray, "25 3"]:
         stiff = believed.precision * given
         back = stiff * (axes.T @ ((correction - believed.mean) / scale).reshape(75))
-        found = axes @ ((length * wish + back) / (determined + stiff))
+        found = axes @ ((wish + back) / (determined + stiff))
         return found.reshape(25, 3).astype(np.float64)
 
-    change = -share * scale * asked(overrelaxation, prior)
+    change = -share * scale * asked(prior)
     shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
     return GaussNewtonStep(
-        shortened * change, evidence, correction / scale - asked(1.0, UNINFORMATIVE_PRIOR)
+        shortened * change, evidence, correction / scale - asked(UNINFORMATIVE_PRIOR)
     )

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import SkinningVolume
-from avatar.pose.gauss_newton import MIN_EVIDENCE, OVERRELAXATION, gauss_newton_step
+from avatar.pose.gauss_newton import MIN_EVIDENCE, gauss_newton_step
 from avatar.pose.temporal_prior import TemporalPosePrior
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, rotation_matrices
@@ -39,6 +39,10 @@ MAX_JOINT_STEP_M = 0.04
 """Largest motion of a joint in one correction, metres; the roots must be able to follow it."""
 RESOLVE_DISTANCE_M = 0.08
 """Motion of a joint after which the frame's correspondences are solved again, metres."""
+STEP_DAMPING = 0.5
+"""Factor of the Gauss-Newton steps while the avatar is trained. Gradients are up to fifty steps
+old, and a field whose poses overshoot turns to fog, which asks for still larger steps: whole steps
+cost 0.6 to 0.9 dB."""
 MEAN_CORRECTION_DECAY = 0.2
 """Share of the mean correction that is removed from a frame's at each of its corrections."""
 FIRST_CORRECTION_STEPS = 60
@@ -96,12 +100,12 @@ class PoseOptimizer:
             capacity: Number of slots.
             device: Device that accumulates the gradients.
             avatar_frozen: Whether only the poses are optimized. A pose cannot blur a fixed avatar,
-                so all poses move, without overrelaxation, and a correction that they share is not a
-                change of the canonical body.
+                so all poses make whole steps, and a correction that they share is not a change of
+                the canonical body.
         """
         self.rig = rig
-        self._mean_decay, self._overrelaxation = (
-            (0.0, 1.0) if avatar_frozen else (MEAN_CORRECTION_DECAY, OVERRELAXATION)
+        self._mean_decay, self._damping = (
+            (0.0, 1.0) if avatar_frozen else (MEAN_CORRECTION_DECAY, STEP_DAMPING)
         )
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
@@ -228,7 +232,6 @@ class PoseOptimizer:
         step = gauss_newton_step(
             self.pose_gradients(slot), loss, self.corrections[slot], self._evidence,
             prior=self._temporal_prior.prior_for(slot, self.corrections),
-            overrelaxation=self._overrelaxation,
         )  # fmt: skip
         self._ray_counts[slot] = 0
         self._temporal_prior.record_estimate(slot, step.unregularized)
@@ -244,7 +247,9 @@ class PoseOptimizer:
             return None
         held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
         mean = self.corrections[held].mean(axis=0)
-        moved = self.corrections[slot] + rate * step.change - self._mean_decay * mean
+        moved = (
+            self.corrections[slot] + self._damping * rate * step.change - self._mean_decay * mean
+        )
         self._apply_correction(slot, np.clip(moved, -MAX_CORRECTION, MAX_CORRECTION))
         return slot
 

@@ -21,7 +21,7 @@ from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.fitting.proportion_space import ProportionSpace
 from preprocess.observe import associate_cameras, associate_masks
 
-KEY_FRAMES = 60
+KEY_FRAMES = 120
 """Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""
 MAX_ITERATIONS = 10
 """Gauss-Newton iterations."""
