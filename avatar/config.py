@@ -30,6 +30,8 @@ MAX_LOG_DENSITY_STEP = 4.0
 """Largest unpenalised change of log density across a finest cell."""
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that stand for one second where steps are counted; two cores make about these."""
+MAX_SAMPLE_STEP_M = 0.015
+"""Largest distance between samples along a ray, metres; limbs are five times as thick."""
 HELD_OUT_STRIDE = 10
 """Default stride between held-out frames."""
 
@@ -47,6 +49,8 @@ class TrainConfig:
     """Rays per step."""
     sample_step_m: float = 0.01
     """Distance between samples along a ray, metres."""
+    initial_step_factor: float = 3.0
+    """Factor of that distance at the beginning, when the field is fog; it falls to 1."""
     opaque_margin_m: float = 0.06
     """Distance that a ray is marched past the depth at which it is opaque, metres."""
     max_samples: int = 128
@@ -118,6 +122,11 @@ class TrainConfig:
         """Largest unpenalised slope of the log density, 1/m."""
         return MAX_LOG_DENSITY_STEP / self.finest_m
 
+    def sample_step_at(self, detail_share: float) -> float:
+        """Distance between samples along a ray at a progress from fog to detail, in [0, 1], m."""
+        factor = 1.0 + (self.initial_step_factor - 1.0) * (1.0 - detail_share)
+        return max(min(factor * self.sample_step_m, MAX_SAMPLE_STEP_M), self.sample_step_m)
+
     def density_tv_weight_at(self, surface_share: float) -> float:
         """Weight of the total variation at a progress towards firm surfaces, in [0, 1]."""
         return self.density_tv_weight * self.initial_density_tv_factor ** (1.0 - surface_share)
@@ -162,7 +171,7 @@ class TrainConfig:
         return cls(
             seconds=seconds,
             steps=steps,
-            sample_step_m=min(max(1.2 * footprint_m, 0.004), 0.015),
+            sample_step_m=min(max(1.2 * footprint_m, 0.004), MAX_SAMPLE_STEP_M),
             finest_m=finest_m,
             table_size=size,
             density_tv_weight=cls.density_tv_weight * few * scant**3,

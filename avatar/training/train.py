@@ -111,6 +111,7 @@ def _train_step(trainer: Trainer, stream: "_FrameIntake", now: float) -> Stepped
         rate=min(falling, stream.highest_rate),
         pose_rate=falling,
         hard_surface_share=min(1.0, 4.0 * now / trainer.config.seconds),
+        detail_share=1.0 - cosine_decay(now / trainer.config.seconds),
     )
     trainer.step_wall_seconds += time.perf_counter() - wall
     trainer.step_cpu_seconds += time.process_time() - cpu

@@ -142,7 +142,12 @@ class Trainer:
             self.paused_cpu_seconds += time.process_time() - cpu
 
     def step(
-        self, *, rate: float, hard_surface_share: float, pose_rate: float | None = None
+        self,
+        *,
+        rate: float,
+        hard_surface_share: float,
+        pose_rate: float | None = None,
+        detail_share: float = 1.0,
     ) -> StepResult:
         """Makes one gradient step on a batch of rays, and updates poses, occupancy and mean.
 
@@ -151,8 +156,9 @@ class Trainer:
             hard_surface_share: Share of the hard-surface loss's weight, in [0, 1].
             pose_rate: Factor of the pose corrections, in (0, 1]; `rate` if None. Surfaces are made
                 firm as it falls.
+            detail_share: Progress from coarse samples along rays to fine ones, in [0, 1].
         """
-        config, field = self.config, self.field
+        config, field = self._config_at(detail_share), self.field
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
         refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
@@ -186,6 +192,13 @@ class Trainer:
         self.rays += config.rays
         self.samples += result.sample_count
         return result
+
+    def _config_at(self, detail_share: float) -> TrainConfig:
+        """The configuration with the samples' distance of this step; baselines keep theirs."""
+        if not isinstance(self.sampler, OccupancySampler):
+            return self.config
+        self.sampler.sample_step_m = self.config.sample_step_at(detail_share)
+        return replace(self.config, sample_step_m=self.sampler.sample_step_m)
 
     def _discard_old_corrections(self) -> None:
         """Drops corrections of frames that replay no longer holds, to bound the memory."""

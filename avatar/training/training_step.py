@@ -41,20 +41,28 @@ class RaySampler(Protocol):
 
 @final
 class OccupancySampler:
-    """Samples occupied canonical cells, up to the cached surface that makes a ray opaque."""
+    """Samples occupied canonical cells, up to the cached surface that makes a ray opaque.
+
+    Attributes:
+        sample_step_m: Distance between samples along a ray, metres; may be changed at any time.
+    """
 
     def __init__(self, backend: Backend, occupancy: OccupancyGrid, config: TrainConfig) -> None:
         """Reads `occupancy` at every call; its owner keeps it up to date."""
         self._backend = backend
         self._occupancy = occupancy
-        self._march_settings = MarchSettings(
-            config.sample_step_m, config.opaque_margin_m, config.max_samples
-        )
+        self._config = config
+        self.sample_step_m = config.sample_step_m
 
     def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
         """Canonical samples in occupied cells, until the cached optical depth ends the ray."""
         return self._backend.march(
-            rays, correspondences, self._occupancy.density_grid, self._march_settings
+            rays,
+            correspondences,
+            self._occupancy.density_grid,
+            MarchSettings(
+                self.sample_step_m, self._config.opaque_margin_m, self._config.max_samples
+            ),
         )
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:

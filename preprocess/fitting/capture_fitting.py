@@ -23,8 +23,10 @@ from preprocess.observe import associate_cameras, associate_masks
 
 KEY_FRAMES = 120
 """Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""
-MAX_ITERATIONS = 10
-"""Gauss-Newton iterations."""
+MIN_ITERATIONS = 6
+"""Fewest Gauss-Newton iterations; the first ones may overshoot."""
+MAX_ITERATIONS = 12
+"""Most Gauss-Newton iterations."""
 PROPORTION_ITERATIONS = 4
 """Iterations that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
@@ -79,9 +81,12 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     for _ in range(PROPORTION_ITERATIONS):
         fitter.iterate(without_poses)
     explained, everything = fitter.error_px(), without_poses._replace(poses=True)
-    errors = [np.inf, fitter.iterate(everything)]
-    while len(errors) <= MAX_ITERATIONS and errors[-1] < (1.0 - MIN_ERROR_DECREASE) * errors[-2]:
+    errors: list[float] = []
+    while len(errors) < MAX_ITERATIONS:
         errors.append(fitter.iterate(everything))
+        settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
+        if len(errors) >= MIN_ITERATIONS and settled:
+            break
     after = fitter.error_px()
     turned = np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean())
     geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avatar.config import TrainConfig
+from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
 from avatar.field import field_priors
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RaySamples
@@ -153,3 +153,11 @@ def test_the_learning_rate_falls_from_one_to_a_twentieth():
     assert cosine_decay(-1.0) == cosine_decay(0.0) == 1.0
     assert cosine_decay(0.5) == pytest.approx(0.5)
     assert cosine_decay(1.0) == cosine_decay(2.0) == 0.05
+
+
+def test_samples_are_coarse_at_first_and_fine_at_last():
+    config = TrainConfig(sample_step_m=0.004, initial_step_factor=3.0)
+    assert config.sample_step_at(0.0) == pytest.approx(0.012)
+    assert config.sample_step_at(1.0) == pytest.approx(0.004)
+    assert TrainConfig(sample_step_m=0.01).sample_step_at(0.0) == MAX_SAMPLE_STEP_M
+    assert TrainConfig(sample_step_m=0.02).sample_step_at(0.0) == 0.02  # never finer than stated
