@@ -25,19 +25,20 @@ from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
 from export.bake.field_grid import FieldFunction
 from export.bake.fine_tuning import (
+    THICK_FIELD_PICTURES,
     ExportProgress,
     FineTuningInputs,
     FineTuningResult,
     fine_tune,
     is_below_target,
 )
-from export.bake.render_targets import PosedView, RenderFunction, RgbaPicture
+from export.bake.render_targets import PictureCache, PosedView, RenderFunction, RgbaPicture
 from export.graph.player_graph import build_graph
 from export.package.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
 from export.package.package_file import AvatarPackage, PackageWriter
 from export.package.player_tables import PlayerTables
-from export.package.render_settings import QUALITY_TIERS, RenderSettings
-from export.package.table_codec import TableLayout
+from export.package.render_settings import QUALITY_TIERS, THICK_FIELD_TIERS, RenderSettings
+from export.package.table_codec import TableLayout, estimate_brick_bytes
 from export.package_checks import (
     CHECK_PX,
     check_graph,
@@ -170,25 +171,28 @@ def export_field(
         baked = executor.submit(bake_tables, grid, rig, config)
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
-        def bake_finer() -> PlayerTables:
-            finer = config.with_finer_voxels()
+        def bake_again(tables: PlayerTables) -> PlayerTables:
+            fitting = config.within_bytes(estimate_brick_bytes(tables.bricks))
+            if fitting == config:
+                return tables
             return bake_tables(
-                sample_field(field_at, rig, occupied=occupied, config=finer), rig, finer
+                sample_field(field_at, rig, occupied=occupied, config=fitting), rig, fitting
             )
 
         tuned = _fine_tune(
             FineTuningInputs(
-                tables=baked.result(), rig=rig, settings=QUALITY_TIERS["hq"], renderer=renderer,
-                views=views, executor=executor,
+                tables=baked.result(), rig=rig,
+                settings={tier: QUALITY_TIERS[tier] for tier in config.tiers},
+                renderer=PictureCache(renderer), views=views, executor=executor,
             ),
-            bake_finer, config.fine_tuning_pictures,
+            bake_again, config.fine_tuning_pictures,
             lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
         )  # fmt: skip
         compressed = executor.submit(writer.add_tables, tuned.tables)
-        settings = {tier: QUALITY_TIERS[tier] for tier in config.tiers} | {"hq": tuned.settings}
         interrupted = config.fine_tuning_pictures > 0 and tuned.psnr is None
         package = _checked_package(
-            _unchecked_package(tuned.tables, settings, rig, views, metrics), views, exact, executor,
+            _unchecked_package(tuned.tables, tuned.settings, rig, views, metrics), views, exact,
+            executor,
             warnings=[INTERRUPTED_WARNING] if interrupted else [],
         )  # fmt: skip
         compressed.result()
@@ -207,25 +211,28 @@ def export_field(
 
 def _fine_tune(
     inputs: FineTuningInputs,
-    bake_finer: Callable[[], PlayerTables],
+    bake_again: Callable[[PlayerTables], PlayerTables],
     max_pictures: int,
     progress: ExportProgress,
 ) -> FineTuningResult:
-    """Fine-tune bricks, finer ones where the player is far from the renderer, until Ctrl-C.
+    """Fine-tune bricks until Ctrl-C; where the player is far from the renderer, all tiers'.
 
     Args:
         inputs: What is tuned, against what.
-        bake_finer: Bakes tables with finer voxels.
+        bake_again: Bakes tables whose bricks take about `BRICK_BYTES`, unless the given ones do.
         max_pictures: Pictures to learn from; 0 for no fine-tuning.
         progress: Receives the fraction of the fine-tuning that is done.
     """
     if max_pictures:
         with suppress(KeyboardInterrupt):
-            below = is_below_target(inputs)
-            inputs = replace(inputs, tables=bake_finer()) if below else inputs
-            return fine_tune(
-                inputs, max_pictures=max_pictures, may_add_layers=below, progress=progress
-            )
+            if is_below_target(inputs):
+                settings = {tier: THICK_FIELD_TIERS[tier] for tier in inputs.settings}
+                inputs = replace(
+                    inputs, tables=bake_again(inputs.tables), settings=settings,
+                    tuned_tiers=tuple(settings),
+                )  # fmt: skip
+                max_pictures = min(max_pictures, THICK_FIELD_PICTURES)
+            return fine_tune(inputs, max_pictures=max_pictures, progress=progress)
     return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)
 
 

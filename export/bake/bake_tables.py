@@ -95,9 +95,16 @@ MIN_VOXEL_M = 0.0038
 """Smallest voxel that follows from a field's cells, metres."""
 MAX_VOXEL_M = 0.006
 """Largest voxel, metres."""
-FINER_VOXEL_FACTOR = 0.62
-"""Factor on the voxel size where the player is too far from the renderer: gains 1 to 1.5 dB for
-twice the bytes. An avatar trained on few photographs weighs less than others."""
+BRICK_BYTES = 2_800_000
+"""Deflated size of the bricks of a thick field, about: a package of less than 4 MB."""
+BYTES_EXPONENT = 2.5
+"""Bytes of the bricks grow with this power of the number of voxels along a metre."""
+VOXEL_FACTORS = (0.62, 1.6)
+"""Bounds of the factor by which voxels of a thick field are finer or coarser. An avatar of few
+photographs is light: finer voxels gain 1 to 1.5 dB. In fog they gain 0.3 dB for three times the
+bytes."""
+VOXEL_FACTOR_TOLERANCE = 0.05
+"""Deviation of that factor from 1 that is not worth baking again."""
 QUICK_VOXEL_FACTOR = 1.5
 """Factor on voxel size and surfel spacing of a quick package."""
 POSITION_CODE_STEP = 32
@@ -139,9 +146,17 @@ class BakeConfig:
         voxel_m = float(np.clip(VOXEL_TO_CELL_RATIO * finest_cell_m, MIN_VOXEL_M, MAX_VOXEL_M))
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
-    def with_finer_voxels(self) -> "BakeConfig":
-        """Return the configuration with voxels smaller by `FINER_VOXEL_FACTOR`."""
-        return replace(self, voxel_m=FINER_VOXEL_FACTOR * self.voxel_m)
+    def within_bytes(self, brick_bytes: float) -> "BakeConfig":
+        """Return the configuration with the voxels whose bricks take about `BRICK_BYTES`.
+
+        Args:
+            brick_bytes: Deflated size of the bricks with this configuration.
+        """
+        factor = (brick_bytes / BRICK_BYTES) ** (1.0 / BYTES_EXPONENT)
+        factor = float(np.clip(factor, *VOXEL_FACTORS))
+        if abs(factor - 1.0) < VOXEL_FACTOR_TOLERANCE:
+            return self
+        return replace(self, voxel_m=factor * self.voxel_m)
 
     def quick(self) -> "BakeConfig":
         """Return the configuration of a coarser package of one tier, without fine-tuning."""

@@ -5,7 +5,7 @@ are not the ones that look most like the field. Rays of the player are compared 
 same rays of the renderer, and each shares its error among the voxels that it has read (SIRT).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -30,7 +30,7 @@ from export.package.player_tables import (
 from export.package.render_settings import RenderSettings
 from export.package.table_codec import add_border_voxels
 from export.player_limits import fit_camera
-from export.reference.compositor import VoxelCodes, back_project
+from export.reference.compositor import SirtUpdate, VoxelCodes, back_project
 
 TRAINING_PX = 540
 """Longer side of the pictures that bricks are tuned on, pixels."""
@@ -57,14 +57,13 @@ CAMERA_TILT_RAD = 0.2
 NOVEL_POSES = 2
 """Novel poses that judge besides the views."""
 TARGET_DB = 39.0
-"""PSNR to the renderer near the views, dB, below which voxels are baked finer and further layers
-are tried."""
+"""PSNR to the renderer near the views, dB, below which a field counts as thick: it is drawn with
+`THICK_FIELD_TIERS`, and its voxels follow from their bytes."""
+THICK_FIELD_PICTURES = 10
+"""Pictures on which the bricks of a thick field are tuned, at most: more gain 0.1 dB there, and
+each takes twice as long to draw."""
 PROBE_PICTURES = 6
 """Pictures near the views that are compared with `TARGET_DB`."""
-DEEPER_SETTINGS = {"layers": 3, "other_sheet_gap_m": -0.015}
-"""Settings with a further layer: 6 % of a picture's time; a decibel and more where limbs touch."""
-MIN_DEEPER_GAIN_DB = 0.2
-"""Least gain in novel poses for which `DEEPER_SETTINGS` are chosen."""
 
 ExportProgress = Callable[[float], None]
 """Receives the fraction of the work that is done, from 0 to 1."""
@@ -77,7 +76,8 @@ class FineTuningInputs:
     Attributes:
         tables: As baked.
         rig: What moves them.
-        settings: How the player draws them.
+        settings: How the player draws them, by tier; "hq" is always among them.
+        tuned_tiers: Tiers whose rays are learnt from, in turn, and that judge.
         renderer: Renders the exact picture, on the caller's thread alone.
         views: Poses and cameras of the avatar.
         executor: Traces the player's rays meanwhile.
@@ -85,7 +85,8 @@ class FineTuningInputs:
 
     tables: PlayerTables
     rig: Rig
-    settings: RenderSettings
+    settings: Mapping[str, RenderSettings]
+    tuned_tiers: Sequence[str] = ("hq",)
     renderer: RenderFunction
     views: Sequence[PosedView]
     executor: Executor
@@ -137,13 +138,13 @@ class FineTuningResult:
 
     Attributes:
         tables: The best tables seen; the given ones if no others were better.
-        settings: The given settings, or `DEEPER_SETTINGS` on top of them.
+        settings: Settings by tier that they are drawn with.
         psnr: To the renderer before and after, dB, on pictures that were not trained on; None if
-            nothing was tuned.
+            nothing was tuned. The mean over the tuned tiers.
     """
 
     tables: PlayerTables
-    settings: RenderSettings
+    settings: Mapping[str, RenderSettings]
     psnr: tuple[float, float] | None
 
 
@@ -153,14 +154,14 @@ def is_below_target(inputs: FineTuningInputs) -> bool:
     near = inputs.perturbed_views(
         PROBE_PICTURES, POSE_NOISE_RAD, np.random.default_rng(1), VALIDATION_PX
     )
-    return builder.psnr(builder.build(near, inputs.settings), inputs.settings) < TARGET_DB
+    settings = inputs.settings["hq"]
+    return builder.psnr(builder.build(near, settings), settings) < TARGET_DB
 
 
 def fine_tune(
     inputs: FineTuningInputs,
     *,
     max_pictures: int,
-    may_add_layers: bool = False,
     progress: ExportProgress = lambda _: None,
 ) -> FineTuningResult:
     """Fine-tune bricks until the player shows more of what the renderer shows.
@@ -171,47 +172,55 @@ def fine_tune(
     Args:
         inputs: What is tuned, against what.
         max_pictures: Pictures to train on, at most.
-        may_add_layers: Whether to try `DEEPER_SETTINGS`.
         progress: Receives the fraction that is done.
     """
-    tables, settings, generator = inputs.tables, inputs.settings, np.random.default_rng(0)
+    tables, generator = inputs.tables, np.random.default_rng(0)
     training = inputs.perturbed_views(max_pictures, POSE_NOISE_RAD, generator, TRAINING_PX)
     novel = inputs.perturbed_views(NOVEL_POSES, NOVEL_POSE_NOISE_RAD, generator, VALIDATION_PX)
     asked = [
         (pose, fit_camera(camera, VALIDATION_PX, max_upscale=MAX_UPSCALE))
         for pose, camera in inputs.views
     ]
-    total = len(training) + len(asked) + 3 * NOVEL_POSES + ROUNDS
+    tiers = [inputs.settings[tier] for tier in inputs.tuned_tiers]
+    total = len(training) + len(tiers) * (len(asked) + len(novel)) + ROUNDS
     steps = iter(range(1, total + 1))
     builder = inputs.target_builder(lambda: progress(next(steps) / total))
-    if may_add_layers:
-        settings = _choose_layers(builder, settings, novel)
-    judge, targets = builder.build(asked + novel, settings), builder.build(training, settings)
+    judges = [(builder.build(asked + novel, each), each) for each in tiers]
+    learnt = [
+        (builder.build(part, each), each)
+        for part, each in zip(_in_turn(training, len(tiers), len(inputs.views)), tiers, strict=True)
+    ]
+
+    def judge(codes: VoxelCodes) -> float:
+        return float(np.mean([targets.psnr(tables, each, codes) for targets, each in judges]))
+
     baked = best = builder.codes
-    first = score = judge.psnr(tables, settings, baked)
-    for latent in _sirt_rounds(targets, tables, settings, baked):
+    first = score = judge(baked)
+    for latent in _sirt_rounds(learnt, tables, baked):
         quantized = _quantize_codes(latent, baked)
-        reached = judge.psnr(tables, settings, quantized)
+        reached = judge(quantized)
         progress(next(steps) / total)
         if reached < score + MIN_GAIN_DB:
             break
         best, score = quantized, reached
     if best is not baked:
         tables = replace(tables, bricks=_bricks_from_codes(tables.bricks, best))
-    return FineTuningResult(tables=tables, settings=settings, psnr=(first, score))
+    return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, score))
 
 
-def _choose_layers(
-    builder: TargetBuilder, settings: RenderSettings, novel: Sequence[PosedView]
-) -> RenderSettings:
-    """Return the settings with a further layer if novel poses gain enough by it."""
-    deeper = replace(settings, **DEEPER_SETTINGS)
-    before, after = (builder.psnr(builder.build(novel, each), each) for each in (settings, deeper))
-    return deeper if after >= before + MIN_DEEPER_GAIN_DB else settings
+def _in_turn(
+    training: Sequence[PosedView], tiers: int, num_views: int
+) -> list[Sequence[PosedView]]:
+    """Deal pictures out to tiers, so that each gets some of every view, from which they follow."""
+    turns = np.arange(len(training))
+    tier_of = (turns + turns // num_views) % tiers
+    return [[training[turn] for turn in np.flatnonzero(tier_of == tier)] for tier in range(tiers)]
 
 
 def _sirt_rounds(
-    targets: RenderTargets, tables: PlayerTables, settings: RenderSettings, baked: VoxelCodes
+    learnt: Sequence[tuple[RenderTargets, RenderSettings]],
+    tables: PlayerTables,
+    baked: VoxelCodes,
 ) -> Iterator[VoxelCodes]:
     """Yield the codes after each round, not yet quantized."""
     codes, density = baked, baked.density
@@ -220,9 +229,11 @@ def _sirt_rounds(
         np.minimum(density + MAX_DENSITY_CODE_CHANGE, 255.0),
     )
     for _ in range(ROUNDS):
-        update = back_project(
-            targets.segments, settings, tables.bricks, codes, targets.target_colors
-        )
+        updates = [
+            back_project(targets.segments, each, tables.bricks, codes, targets.target_colors)
+            for targets, each in learnt
+        ]
+        update = SirtUpdate(*map(sum, zip(*updates, strict=True)))
         color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
         density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
         color, density = codes.color - color_step, codes.density - density_step

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -26,6 +27,25 @@ RgbaPicture = Float32[np.ndarray, "height width 4"]
 """Premultiplied RGBA in [0, 1]."""
 RenderFunction = Callable[[BodyPose, Camera], RgbaPicture]
 """Renders the exact picture of the avatar."""
+
+
+@final
+class PictureCache:
+    """A renderer that draws each pose and camera once; several tiers look at the same pictures."""
+
+    def __init__(self, renderer: RenderFunction) -> None:
+        """Draw nothing yet."""
+        self._renderer = renderer
+        self._drawn: list[tuple[BodyPose, Camera, RgbaPicture]] = []
+
+    def __call__(self, pose: BodyPose, camera: Camera) -> RgbaPicture:
+        """Return the picture of this very pose and camera, objects compared by identity."""
+        for known_pose, known_camera, picture in self._drawn:
+            if known_pose is pose and known_camera is camera:
+                return picture
+        picture = self._renderer(pose, camera)
+        self._drawn.append((pose, camera, picture))
+        return picture
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

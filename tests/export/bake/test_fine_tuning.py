@@ -4,11 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.bake.bake_tables import FINER_VOXEL_FACTOR
-from export.bake.fine_tuning import DEEPER_SETTINGS, FineTuningInputs, fine_tune
+from export.bake.bake_tables import BRICK_BYTES, VOXEL_FACTORS, BakeConfig
+from export.bake.fine_tuning import FineTuningInputs, fine_tune
+from export.bake.render_targets import PictureCache
 from export.build import export_field
 from export.package.package_file import read_package
-from export.package.render_settings import QUALITY_TIERS
+from export.package.render_settings import QUALITY_TIERS, THICK_FIELD_TIERS
 from export.reference.compositor import VoxelCodes, back_project, composite_segments
 from export.reference.reference_player import PlayerInputs, draw_reference, trace_picture
 
@@ -58,17 +59,18 @@ def spoilt(tables):
 
 @pytest.fixture(scope="module")
 def tune(stand_in, views):
-    def call(tables, renderer, **more):
+    def call(tables, renderer, progress=lambda _: None, **more):
         with ThreadPoolExecutor(1) as executor:
             inputs = FineTuningInputs(
                 tables=tables,
                 rig=stand_in.rig,
-                settings=SETTINGS,
+                settings=QUALITY_TIERS,
                 renderer=renderer,
                 views=list(views.values()),
                 executor=executor,
+                **more,
             )
-            return fine_tune(inputs, max_pictures=6, **more)
+            return fine_tune(inputs, max_pictures=6, progress=progress)
 
     return call
 
@@ -184,23 +186,38 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
+def test_tiers_share_the_pictures_and_both_gain(
+    stand_in, tune, renderer, spoilt, bent, camera, tables
+):
+    asked = []
+
+    def counted(pose, camera):
+        asked.append(pose)
+        return renderer(pose, camera)
+
+    after = tune(spoilt, PictureCache(counted), tuned_tiers=("hq", "lite"))
+    assert len(asked) == 10  # four judge both tiers, six are learnt from by one of them each
+    assert after.psnr[1] > after.psnr[0] + 1.0
+    unseen = inputs_of(stand_in.rig, bent, camera(96, 120, distance_m=2.6))
+    for settings in QUALITY_TIERS.values():
+        exact, before, now = (
+            draw_reference(each, settings, unseen) for each in (tables, spoilt, after.tables)
+        )
+        assert ((now - exact) ** 2).mean() < 0.8 * ((before - exact) ** 2).mean()
+
+
+def test_voxels_follow_from_the_bytes_of_a_thick_field():
+    config = BakeConfig(voxel_m=0.004)
+    assert config.within_bytes(1.05 * BRICK_BYTES) is config
+    assert config.within_bytes(2.0**2.5 * BRICK_BYTES).voxel_m == pytest.approx(
+        VOXEL_FACTORS[1] * 0.004
+    )
+    assert config.within_bytes(1.3**2.5 * BRICK_BYTES).voxel_m == pytest.approx(1.3 * 0.004)
+    assert config.within_bytes(1e3).voxel_m == pytest.approx(VOXEL_FACTORS[0] * 0.004)
+
+
 @pytest.mark.slow
-def test_more_of_what_lies_behind_is_drawn_only_where_it_is_worth_its_time(tune, tables, stand_in):
-    more = replace(SETTINGS, **DEEPER_SETTINGS)
-
-    def deeper(pose, camera):
-        return draw_reference(tables, more, inputs_of(stand_in.rig, pose, camera))
-
-    def as_asked(pose, camera):
-        return draw_reference(tables, SETTINGS, inputs_of(stand_in.rig, pose, camera))
-
-    assert tune(tables, deeper).settings == SETTINGS
-    assert tune(tables, deeper, may_add_layers=True).settings == more
-    assert tune(tables, as_asked, may_add_layers=True).settings == SETTINGS
-
-
-@pytest.mark.slow
-def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
+def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
     stand_in, renderer, coarse, views, tables, tmp_path
 ):
     def paler(pose, camera):
@@ -219,8 +236,13 @@ def test_voxels_are_finer_where_the_player_is_far_from_the_renderer(
             renderer=exact,
             config=replace(coarse, fine_tuning_pictures=2),
         )
-        return read_package(report.path).tables["hq"].bricks.voxel_m
+        return read_package(report.path)
 
-    usual = tables.bricks.voxel_m
-    assert exported(renderer) == pytest.approx(usual)
-    assert exported(paler) == pytest.approx(FINER_VOXEL_FACTOR * usual)
+    usual, thick = exported(renderer), exported(paler)
+    voxel_m = tables.bricks.voxel_m
+    assert usual.tables["hq"].bricks.voxel_m == pytest.approx(voxel_m)
+    assert usual.manifest.tiers["hq"].settings == SETTINGS
+    assert thick.tables["hq"].bricks.voxel_m == pytest.approx(VOXEL_FACTORS[0] * voxel_m)
+    assert {tier: each.settings for tier, each in thick.manifest.tiers.items()} == (
+        {tier: THICK_FIELD_TIERS[tier] for tier in thick.manifest.tiers}
+    )

@@ -1,4 +1,5 @@
 import dataclasses
+import zlib
 
 import numpy as np
 import pytest
@@ -16,7 +17,13 @@ from export.package.player_tables import (
     SurfelTable,
     encode_density,
 )
-from export.package.table_codec import TableLayout, cumsum_cubes, decode_tables, encode_tables
+from export.package.table_codec import (
+    TableLayout,
+    cumsum_cubes,
+    decode_tables,
+    encode_tables,
+    estimate_brick_bytes,
+)
 
 
 def random_tables(
@@ -128,3 +135,9 @@ def test_sums_of_cubes_are_cumulative_sums_along_three_axes(rng):
     np.testing.assert_array_equal(cumsum_cubes(codes), expected)
     full = np.full((1, 8, 8, 8), 255, dtype=np.uint8)
     np.testing.assert_array_equal(cumsum_cubes(full)[0, 7, 7, 7], np.uint8(255 * 512 % 256))
+
+
+def test_the_bytes_of_bricks_are_estimated_from_an_eighth_of_them():
+    tables = random_tables(5, surfels=10, counts=(6, 6, 6), share=0.8)
+    exact = len(zlib.compress(encode_tables(tables)["voxels"]))
+    assert estimate_brick_bytes(tables.bricks) == pytest.approx(exact, rel=0.05)
