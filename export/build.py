@@ -172,11 +172,9 @@ def export_field(
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
         def bake_again(tables: PlayerTables) -> PlayerTables:
-            fitting = config.within_bytes(estimate_brick_bytes(tables.bricks))
-            if fitting == config:
-                return tables
+            thick = config.for_thick_field(estimate_brick_bytes(tables.bricks))
             return bake_tables(
-                sample_field(field_at, rig, occupied=occupied, config=fitting), rig, fitting
+                sample_field(field_at, rig, occupied=occupied, config=thick), rig, thick
             )
 
         tuned = _fine_tune(
@@ -219,7 +217,7 @@ def _fine_tune(
 
     Args:
         inputs: What is tuned, against what.
-        bake_again: Bakes tables whose bricks take about `BRICK_BYTES`, unless the given ones do.
+        bake_again: Bakes the tables of a thick field, whose bricks take about `BRICK_BYTES`.
         max_pictures: Pictures to learn from; 0 for no fine-tuning.
         progress: Receives the fraction of the fine-tuning that is done.
     """

@@ -85,8 +85,8 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
     return codes.astype(np.uint16)
 
 
-FAINT_DENSITY_FRACTION = 0.1
-"""Upper bound of the surface's level as a fraction of the 99th percentile of visible density."""
+THICK_FAINT_FRACTION = 0.04
+"""`BakeConfig.faint_fraction` of thick fields: haze of 10/m about a core of 120/m is seen."""
 BRICK_MARGIN_M = 0.012
 """Distance outside the surface that bricks cover, metres."""
 VOXEL_TO_CELL_RATIO = 0.53
@@ -95,7 +95,7 @@ MIN_VOXEL_M = 0.0038
 """Smallest voxel that follows from a field's cells, metres."""
 MAX_VOXEL_M = 0.006
 """Largest voxel, metres."""
-BRICK_BYTES = 2_800_000
+BRICK_BYTES = 2.4e6
 """Deflated size of the bricks of a thick field, about: a package of less than 4 MB."""
 BYTES_EXPONENT = 2.5
 """Bytes of the bricks grow with this power of the number of voxels along a metre."""
@@ -103,8 +103,6 @@ VOXEL_FACTORS = (0.62, 1.6)
 """Bounds of the factor by which voxels of a thick field are finer or coarser. An avatar of few
 photographs is light: finer voxels gain 1 to 1.5 dB. In fog they gain 0.3 dB for three times the
 bytes."""
-VOXEL_FACTOR_TOLERANCE = 0.05
-"""Deviation of that factor from 1 that is not worth baking again."""
 QUICK_VOXEL_FACTOR = 1.5
 """Factor on voxel size and surfel spacing of a quick package."""
 POSITION_CODE_STEP = 32
@@ -130,6 +128,8 @@ class BakeConfig:
             be numbered.
         surface_density: Density of the surface's level set, 1/m; less where the whole field is
             faint.
+        faint_fraction: Upper bound of that level as a fraction of the 99th percentile of visible
+            density.
         tiers: Quality tiers of the package; "hq" is always among them.
         fine_tuning_pictures: Pictures on which bricks are fine-tuned; 0 for no fine-tuning.
     """
@@ -137,6 +137,7 @@ class BakeConfig:
     voxel_m: float = 0.004
     surfel_spacing_m: float = 0.006
     surface_density: float = 20.0
+    faint_fraction: float = 0.1
     tiers: tuple[str, ...] = tuple(QUALITY_TIERS)
     fine_tuning_pictures: int = 0
 
@@ -146,17 +147,15 @@ class BakeConfig:
         voxel_m = float(np.clip(VOXEL_TO_CELL_RATIO * finest_cell_m, MIN_VOXEL_M, MAX_VOXEL_M))
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
-    def within_bytes(self, brick_bytes: float) -> "BakeConfig":
-        """Return the configuration with the voxels whose bricks take about `BRICK_BYTES`.
+    def for_thick_field(self, brick_bytes: float) -> "BakeConfig":
+        """Return the configuration with haze, and voxels whose bricks take about `BRICK_BYTES`.
 
         Args:
             brick_bytes: Deflated size of the bricks with this configuration.
         """
         factor = (brick_bytes / BRICK_BYTES) ** (1.0 / BYTES_EXPONENT)
         factor = float(np.clip(factor, *VOXEL_FACTORS))
-        if abs(factor - 1.0) < VOXEL_FACTOR_TOLERANCE:
-            return self
-        return replace(self, voxel_m=factor * self.voxel_m)
+        return replace(self, voxel_m=factor * self.voxel_m, faint_fraction=THICK_FAINT_FRACTION)
 
     def quick(self) -> "BakeConfig":
         """Return the configuration of a coarser package of one tier, without fine-tuning."""
@@ -233,7 +232,8 @@ def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySu
     visible = grid.density[grid.density > MIN_DENSITY]
     if visible.size == 0:
         raise ExportRefused(EMPTY_AVATAR_MESSAGE)
-    level = min(config.surface_density, FAINT_DENSITY_FRACTION * float(np.percentile(visible, 99)))
+    faint = config.faint_fraction * float(np.percentile(visible, 99))
+    level = min(config.surface_density, faint)
     spacing_m = config.surfel_spacing_m
     while True:
         surface = extract_proxy_surface(grid, level=level, spacing_m=spacing_m)

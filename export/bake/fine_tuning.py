@@ -59,7 +59,7 @@ NOVEL_POSES = 2
 TARGET_DB = 39.0
 """PSNR to the renderer near the views, dB, below which a field counts as thick: it is drawn with
 `THICK_FIELD_TIERS`, and its voxels follow from their bytes."""
-THICK_FIELD_PICTURES = 10
+THICK_FIELD_PICTURES = 8
 """Pictures on which the bricks of a thick field are tuned, at most: more gain 0.1 dB there, and
 each takes twice as long to draw."""
 PROBE_PICTURES = 6
@@ -208,13 +208,12 @@ def fine_tune(
     return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, score))
 
 
-def _in_turn(
-    training: Sequence[PosedView], tiers: int, num_views: int
-) -> list[Sequence[PosedView]]:
+def _in_turn(training: Sequence[PosedView], tiers: int, num_views: int) -> list[list[PosedView]]:
     """Deal pictures out to tiers, so that each gets some of every view, from which they follow."""
-    turns = np.arange(len(training))
-    tier_of = (turns + turns // num_views) % tiers
-    return [[training[turn] for turn in np.flatnonzero(tier_of == tier)] for tier in range(tiers)]
+    parts: list[list[PosedView]] = [[] for _ in range(tiers)]
+    for turn, view in enumerate(training):
+        parts[(turn + turn // num_views) % tiers].append(view)
+    return parts
 
 
 def _sirt_rounds(
@@ -233,7 +232,7 @@ def _sirt_rounds(
             back_project(targets.segments, each, tables.bricks, codes, targets.target_colors)
             for targets, each in learnt
         ]
-        update = SirtUpdate(*map(sum, zip(*updates, strict=True)))
+        update = SirtUpdate(*(np.sum(part, axis=0) for part in zip(*updates, strict=True)))
         color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
         density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
         color, density = codes.color - color_step, codes.density - density_step

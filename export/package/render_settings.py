@@ -118,4 +118,5 @@ THICK_FIELD_TIERS = {
     ),
 }
 """The same for fields that the usual settings cut short: haze in front of the surface, light that
-passes through a limb, limbs that touch. HQ +1.1 to 1.7 dB, lite +2 dB, for more time."""
+passes through a limb, limbs that touch. HQ +1.1 to 1.7 dB, lite +2 dB, for a
+tenth more time, in deep fog half as much again."""

@@ -4,7 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.bake.bake_tables import BRICK_BYTES, VOXEL_FACTORS, BakeConfig
+from export.bake.bake_tables import (
+    BRICK_BYTES,
+    THICK_FAINT_FRACTION,
+    VOXEL_FACTORS,
+    BakeConfig,
+    bake_field,
+)
 from export.bake.fine_tuning import FineTuningInputs, fine_tune
 from export.bake.render_targets import PictureCache
 from export.build import export_field
@@ -208,12 +214,26 @@ def test_tiers_share_the_pictures_and_both_gain(
 
 def test_voxels_follow_from_the_bytes_of_a_thick_field():
     config = BakeConfig(voxel_m=0.004)
-    assert config.within_bytes(1.05 * BRICK_BYTES) is config
-    assert config.within_bytes(2.0**2.5 * BRICK_BYTES).voxel_m == pytest.approx(
-        VOXEL_FACTORS[1] * 0.004
-    )
-    assert config.within_bytes(1.3**2.5 * BRICK_BYTES).voxel_m == pytest.approx(1.3 * 0.004)
-    assert config.within_bytes(1e3).voxel_m == pytest.approx(VOXEL_FACTORS[0] * 0.004)
+    for brick_bytes, factor in (
+        (BRICK_BYTES, 1.0),
+        (1.3**2.5 * BRICK_BYTES, 1.3),
+        (1e9, VOXEL_FACTORS[1]),
+        (1e3, VOXEL_FACTORS[0]),
+    ):
+        assert config.for_thick_field(brick_bytes).voxel_m == pytest.approx(factor * 0.004)
+
+
+def test_haze_about_a_faint_core_is_inside_the_surface_of_a_thick_field(stand_in):
+    def hazy(points):
+        rgb, density = stand_in.field_at(points)
+        return rgb, 120.0 * (density > 0) * (1.0 - 0.93 * (density < 0.5 * density.max()))
+
+    usual = BakeConfig(voxel_m=0.008, surfel_spacing_m=0.012)
+    surfaces = [
+        bake_field(hazy, stand_in.rig, occupied=stand_in.occupied, config=config).surfels
+        for config in (usual, replace(usual, faint_fraction=THICK_FAINT_FRACTION))
+    ]
+    assert len(surfaces[1]) > 1.01 * len(surfaces[0])
 
 
 @pytest.mark.slow
