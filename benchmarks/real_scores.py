@@ -111,7 +111,7 @@ def score_novel_poses(run: Path, capture: Path) -> NovelPoseFit:
         for seen in novel
     ]
     before = [score_frame(trainer.avatar, frame) for frame in placed]
-    fitted = [score for _, score in fit_test_poses(trainer, placed, given=before)]
+    fitted = [score_frame(trainer.avatar, frame) for frame in fit_test_poses(trainer, placed)]
     return NovelPoseFit(
         placed=float(np.mean([score.psnr for score in before])),
         fitted=float(np.mean([score.psnr for score in fitted])),

@@ -23,6 +23,9 @@ from preprocess.body.body_pose import BodyPose
 
 NEAR_PERSON_RAY_SHARE = 0.9
 """Share of the rays that pass through pixels near the person."""
+HEAD_RAY_SHARE = 0.15
+"""Share of the rays near the person that are drawn from the rows of the head alone, where people
+look; the others are drawn from all rows."""
 ERROR_EMA_DECAY = 0.9
 """Decay of each frame's running error."""
 PIXEL_KEYS_PER_SLOT = 1 << 32
@@ -90,6 +93,7 @@ class ReplayBuffer:
         self._error = torch.zeros(capacity, device=device)
         self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
+        self._head = torch.zeros(capacity, 2, dtype=torch.int64, device=device)
         self._given_origins = np.zeros((capacity, 3))
         self._origins = torch.zeros(capacity, 3, device=device)
         self._body_from_camera = np.zeros((capacity, 3, 3))
@@ -179,7 +183,10 @@ class ReplayBuffer:
         near, far = self._near[slot], self._far[slot]
         wants_near = (uniform(count) < NEAR_PERSON_RAY_SHARE) | (far == 0)
         place = uniform(count)
+        first, last = self._head[slot].unbind(dim=1)
+        wants_head = wants_near & (last > first) & (uniform(count) < HEAD_RAY_SHARE)
         pixel = torch.where(wants_near, (place * near).long(), near + (place * far).long())
+        pixel = torch.where(wants_head, first + (place * (last - first)).long(), pixel)
         pixel = torch.minimum(pixel, near + far - 1)
         rays = RayBatch(
             self._origins[slot],
@@ -244,6 +251,7 @@ class ReplayBuffer:
         )
         self._near[slot] = frame.pixels.near_count
         self._far[slot] = frame.pixels.count - frame.pixels.near_count
+        self._head[slot] = torch.tensor(frame.head_pixels)
 
     def _store_rows(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
         """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""

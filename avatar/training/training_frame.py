@@ -5,16 +5,23 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import body_from_rest
 from preprocess.observation import Observation
 
 NEAR_MASK_SHARE = 0.035
 """Distance from the mask within which pixels are near the person, in image heights."""
+HEAD_JOINT = 15
+"""Joint at the base of the skull."""
+HEAD_UP_M = 0.08
+"""Distance of the head's middle above that joint, metres."""
+HEAD_RADIUS_M = 0.16
+"""Half of the height of the image rows that hold the head, metres."""
 BOX_MARGIN_SHARE = 0.04
 """Margin of the training pixels around the near ones, in image heights."""
 
@@ -78,6 +85,8 @@ class TrainingFrame:
         origin: Origin of the rays, body frame, metres.
         body_from_camera: Rotation of the rays.
         pixels: Training pixels.
+        head_pixels: Numbers of the first pixel near the person in the rows of the head, and of the
+            first one behind them.
         colors: Premultiplied RGBA of those near the person; that of the others is zero.
         view: View from which the frame can be rebuilt with its colors alone.
     """
@@ -88,6 +97,7 @@ class TrainingFrame:
     origin: Float32[np.ndarray, "3"]
     body_from_camera: Float32[np.ndarray, "3 3"]
     pixels: PixelRuns
+    head_pixels: tuple[int, int]
     colors: UInt8[np.ndarray, "near 4"]
     view: RayView
 
@@ -135,9 +145,30 @@ def _assemble_frame(
         origin=origin.astype(np.float32),
         body_from_camera=np.ascontiguousarray(camera_from_body.T, dtype=np.float32),
         pixels=pixels,
+        head_pixels=_head_pixels(near, camera, world_from_body, pose, rig),
         colors=colors[: pixels.near_count],  # earlier versions saved the others' zeros, too
         view=view,
     )
+
+
+def _head_pixels(
+    near: Bool[np.ndarray, "height width"],
+    camera: Camera,
+    world_from_body: Float[np.ndarray, "4 4"],
+    pose: BodyPose,
+    rig: Rig,
+) -> tuple[int, int]:
+    """Numbers of the pixels near the person in the image rows that hold the head."""
+    head = body_from_rest(rig.rest_joints, rig.parents, pose.joint_rotations)[HEAD_JOINT]
+    middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, HEAD_UP_M, 0.0])
+    placed = camera.camera_from_world @ world_from_body @ head @ np.append(middle, 1.0)
+    if placed[2] < HEAD_RADIUS_M:
+        return 0, 0
+    row = camera.focal_px[1] * placed[1] / placed[2] + camera.center_px[1]
+    reach = camera.focal_px[1] * HEAD_RADIUS_M / placed[2]
+    first, last = np.clip(np.rint([row - reach, row + reach]), 0, len(near)).astype(int)
+    before = np.count_nonzero(near[:first])
+    return int(before), int(before + np.count_nonzero(near[first:last]))
 
 
 def _premultiplied_rgba(

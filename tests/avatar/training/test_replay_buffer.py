@@ -8,7 +8,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from avatar.training.replay_buffer import NEAR_PERSON_RAY_SHARE, ReplayBuffer
+from avatar.training.replay_buffer import HEAD_RAY_SHARE, NEAR_PERSON_RAY_SHARE, ReplayBuffer
 from avatar.training.training_frame import PixelRuns, prepare_frame
 from preprocess.body.body_pose import BodyPose
 
@@ -35,7 +35,7 @@ def cut(frame, near, far):
     places, count = frame.pixels.flat_indices(), frame.pixels.near_count
     masks[0, places[:near]] = masks[1, places[count : count + far]] = True
     pixels = PixelRuns.of(*masks.reshape(2, height, width))
-    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near])
+    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near], head_pixels=(0, 0))
 
 
 def posed(frame, index, *, knee):
@@ -234,3 +234,22 @@ def test_cached_distances_are_those_computed_afresh(frames, rng):
     expected = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
     np.fill_diagonal(expected, np.inf)
     np.testing.assert_allclose(replay._descriptor_distances, expected)
+
+
+def test_the_head_gets_more_rays_than_its_pixels(frames):
+    replay = store(frames)
+    batch = replay.sample_rays(8000, torch.Generator().manual_seed(0))
+    found = places(batch, frames)
+    for slot, frame in enumerate(frames):
+        first, last = frame.head_pixels
+        mine = found[(batch.rays.slots == slot).numpy()]
+        natural = (last - first) / frame.pixels.near_count
+        expected = NEAR_PERSON_RAY_SHARE * (HEAD_RAY_SHARE + (1.0 - HEAD_RAY_SHARE) * natural)
+        assert np.mean((mine >= first) & (mine < last)) == pytest.approx(expected, abs=0.04)
+
+
+def test_the_rows_of_the_head_are_those_at_the_top_of_a_standing_person(frames):
+    for frame in frames:
+        first, last = frame.head_pixels
+        assert first < 0.03 * frame.pixels.near_count
+        assert 0.05 < (last - first) / frame.pixels.near_count < 0.4
