@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import rescale_motion, scale_to_height
+from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
@@ -42,6 +43,8 @@ MIN_FRAMES = 4
 def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = None) -> Capture:
     """The capture with the changes of a fit, and a note about them.
 
+    A static camera shows only the ratio of size and distance: the person keeps its size.
+
     Args:
         capture: The capture that was fitted.
         fit: Its fit.
@@ -52,6 +55,8 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
     shaped = fit.shape(capture.shaped)
+    if height_m is None and not cameras.is_moving:
+        height_m = body_height_m(shaped) * _size_ratio(capture.shaped, shaped)
     if height_m is not None:
         sized = scale_to_height(shaped, height_m)
         there = CaptureGeometry.of(motion, cameras, capture.source)
@@ -60,6 +65,12 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
         capture, motion=motion, shaped=shaped, cameras=cameras, fit=fit,
         notes=(*capture.notes, fit.describe()),
     )  # fmt: skip
+
+
+def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
+    """How many times as large one person is as another, by least squares over their joints."""
+    a, b = one.joints - one.joints[0], other.joints - other.joints[0]
+    return float((a * b).sum() / (b * b).sum())
 
 
 def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:

@@ -1,0 +1,63 @@
+"""A capture with the changes of a fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from preprocess.capture_session import CaptureInputs
+from preprocess.fitting.capture_fit import CaptureFit
+from preprocess.fitting.capture_fitting import apply_fit, fit_capture
+from preprocess.fitting.proportion_space import ProportionSpace
+from preprocess.open_capture import open_capture
+from studio.shoot import ShootConfig, film_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fit") / "capture"
+    film_capture(folder, ShootConfig(frames=12, size=64))
+    return open_capture(CaptureInputs(video=folder))
+
+
+@pytest.fixture
+def fit(capture) -> CaptureFit:
+    coefficients = np.zeros(ProportionSpace.around(capture.shaped).count)
+    coefficients[[0, 11, 17]] = 0.5, 1.0, -1.0  # size, thighs, forearms
+    corrections = np.zeros((len(capture.motion), 75))
+    corrections[:, 1] = 0.1
+    return CaptureFit(
+        coefficients=coefficients, focal_factor=1.1, corrections=corrections, error_before_cm=2.0,
+        error_after_cm=1.0, taken=True, fits_body=True,
+    )  # fmt: skip
+
+
+def size_of(shaped, like) -> float:
+    a, b = shaped.joints - shaped.joints[0], like.joints - like.joints[0]
+    return float((a * b).sum() / (b * b).sum())
+
+
+def test_proportions_and_focal_length_change_but_not_the_size(capture, fit):
+    fitted = apply_fit(capture, fit)
+    raw = fit.shape(capture.shaped)
+    assert abs(size_of(raw, capture.shaped) - 1.0) > 0.02
+    assert size_of(capture.shaped, fitted.shaped) == pytest.approx(1.0, abs=1e-9)
+    assert fitted.cameras[0].focal_px[0] == pytest.approx(1.1 * capture.cameras[0].focal_px[0])
+    assert fitted.fit is fit
+
+
+def test_a_stated_height_stays(capture, fit):
+    fitted = apply_fit(capture, fit, height_m=1.9)
+    assert np.ptp(fitted.shaped.vertices[:, 1]) == pytest.approx(1.9)
+
+
+def test_a_fit_that_is_not_taken_changes_nothing(capture, fit):
+    kept = apply_fit(capture, replace(fit, taken=False))
+    assert kept.motion is capture.motion
+    assert kept.shaped is capture.shaped
+
+
+def test_exact_poses_are_left_alone(capture):
+    found = fit_capture(capture)
+    assert found is not None
+    assert not found.taken
