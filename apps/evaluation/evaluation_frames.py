@@ -87,7 +87,7 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     inputs = given.capture_inputs()
     if given.cameras == "solve" and run.cameras.is_file():
         inputs = replace(inputs, cameras=str(run.cameras), poses=run.poses)
-    recording = _open_as_trained(inputs, run, height_m=inputs.height_m)
+    recording = _open_as_trained(inputs, run)
     own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
     numbers = report["held_out"]["frames"]
     if not numbers:
@@ -99,13 +99,13 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     )
 
 
-def _open_as_trained(inputs: CaptureInputs, run: RunFolder, *, height_m: float | None) -> Capture:
+def _open_as_trained(inputs: CaptureInputs, run: RunFolder) -> Capture:
     """Open a run's own capture with the body and the poses that it was trained with."""
     recording = open_capture(inputs)
     fit = load_capture_fit(run.fit_file, recording.identity)
     if run.body_file.is_file() and (fit is None or not fit.fits_body):
         recording = open_capture(inputs, avatar_body=run.body_file)
-    return recording if fit is None else apply_fit(recording, fit, height_m=height_m)
+    return recording if fit is None else apply_fit(recording, fit, height_m=inputs.height_m)
 
 
 def trained_longer_side_px(run: RunFolder) -> int | None:

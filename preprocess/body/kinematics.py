@@ -70,6 +70,17 @@ def body_from_rest(
     return joint_transforms(rest_joints, parents, rotations)
 
 
+def descendant_matrix(parents: Int[np.ndarray, "joints"]) -> Float[np.ndarray, "joints joints"]:
+    """1 where a joint (row) moves a bone (column): its own, and all below it."""
+    below = np.eye(len(parents))
+    for bone in range(len(parents)):
+        joint = int(parents[bone])
+        while joint >= 0:
+            below[joint, bone] = 1.0
+            joint = int(parents[joint])
+    return below
+
+
 def world_from_body(
     pelvis: Float[np.ndarray, "3"],
     root_rotation: Float[np.ndarray, "3"],

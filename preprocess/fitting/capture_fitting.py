@@ -1,7 +1,7 @@
 """Aligns an opened capture to its masks: body, poses and focal length at once.
 
-Exact poses are left alone: where proportions and focal length alone bring the outlines as close to
-the masks as corrected poses do, nothing is changed.
+Exact poses are left alone: nothing is changed where the roots would hardly turn, or where
+proportions and focal length alone bring the outlines as close to the masks as corrected poses do.
 """
 
 from dataclasses import replace
@@ -43,7 +43,8 @@ MIN_FRAMES = 4
 def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = None) -> Capture:
     """The capture with the changes of a fit, and a note about them.
 
-    A static camera shows only the ratio of size and distance: the person keeps its size.
+    A static camera shows only the ratio of size and distance: the person keeps its size. The
+    person of a finished avatar does not change at all.
 
     Args:
         capture: The capture that was fitted.
@@ -54,10 +55,10 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
         return replace(capture, fit=fit)
     geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
-    shaped = fit.shape(capture.shaped)
+    shaped = fit.shape(capture.shaped) if fit.fits_body else capture.shaped
     if height_m is None and not cameras.is_moving:
         height_m = body_height_m(shaped) * _size_ratio(capture.shaped, shaped)
-    if height_m is not None:
+    if height_m is not None and fit.fits_body:
         sized = scale_to_height(shaped, height_m)
         there = CaptureGeometry.of(motion, cameras, capture.source)
         motion, shaped = rescale_motion(there, shaped, sized), sized

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.kinematics import joint_transforms, rotation_matrices
+from preprocess.body.kinematics import descendant_matrix, joint_transforms, rotation_matrices
 from preprocess.body.silhouette import SkinPoints, signed_distance_px, splat_silhouette
 from preprocess.fitting.proportion_space import ProportionSpace
 
@@ -102,7 +102,7 @@ class OutlineModel:
         self._skin = SkinPoints.of(space.shaped, OUTLINE_SKIN_POINTS)
         self._weights = self._skin.weights
         self._rest_directions = self._skin.interpolate(space.vertex_directions).astype(np.float32)
-        self._below = _descendants(space.shaped.body.parents)
+        self._below = descendant_matrix(space.shaped.body.parents)
         self.set_proportions(np.zeros(space.count))
 
     def set_proportions(self, coefficients: Float[np.ndarray, "coefficients"]) -> None:
@@ -271,14 +271,3 @@ def _sample(
     value = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
     slope = np.column_stack([(1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)])
     return value, slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 0.3)
-
-
-def _descendants(parents: Int[np.ndarray, "24"]) -> Float[np.ndarray, "24 24"]:
-    """1 where a joint (row) moves a bone (column)."""
-    below = np.eye(24)
-    for bone in range(24):
-        joint = int(parents[bone])
-        while joint >= 0:
-            below[joint, bone] = 1.0
-            joint = int(parents[joint])
-    return below

@@ -51,6 +51,12 @@ def test_a_stated_height_stays(capture, fit):
     assert np.ptp(fitted.shaped.vertices[:, 1]) == pytest.approx(1.9)
 
 
+def test_the_person_of_a_finished_avatar_does_not_change(capture, fit):
+    fitted = apply_fit(capture, replace(fit, fits_body=False), height_m=1.9)
+    assert fitted.shaped is capture.shaped
+    assert not np.allclose(fitted.motion.root_rotations, capture.motion.root_rotations)
+
+
 def test_a_fit_that_is_not_taken_changes_nothing(capture, fit):
     kept = apply_fit(capture, replace(fit, taken=False))
     assert kept.motion is capture.motion
