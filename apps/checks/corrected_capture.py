@@ -66,6 +66,7 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
         _write_masks(check, healed, part)
         claim = _to_film_frames(healed, frames)
         motion = renumber_motion(claim, frames, resampled="frame_rate" in check.causes)
+        motion = replace(motion, keypoints=None)  # of the film as it was
         if missing and motion.frames is not None:
             kept = np.flatnonzero(~np.isin(motion.frames, list(missing)))
             motion = motion.select_rows(kept, motion.frames[kept])

@@ -6,6 +6,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from preprocess.tracking.keypoint_track import KeypointTrack
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyPose:
@@ -84,6 +86,9 @@ class Motion:
         space: "world", or "camera": each row in the camera of its frame.
         camera_from_world: The camera of each row, if the file holds them.
         interpolated: Rows that the tracker had lost, filled in between their neighbors.
+        proportions: Coefficients of `ProportionSpace` around the mean of the embedded body, if the
+            poses were fitted together with them; then they are the person's shape, not the betas.
+        keypoints: Key points in the video's frames that the poses were made of, if there are any.
         note: What a user should know about how the file was read.
     """
 
@@ -102,6 +107,8 @@ class Motion:
     space: PoseSpace = "world"
     camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
     interpolated: Bool[np.ndarray, "poses"] | None = None
+    proportions: Float[np.ndarray, "coefficients"] | None = None
+    keypoints: KeypointTrack | None = None
     note: str | None = None
 
     def __len__(self) -> int:
@@ -119,7 +126,7 @@ class Motion:
     def select_rows(
         self, rows: Int[np.ndarray, "some"], frames: Int[np.ndarray, "some"] | None = None
     ) -> "Motion":
-        """Some of its rows, for frames of other numbers.
+        """Some of its rows, for frames of other numbers; without the key points.
 
         Args:
             rows: Which ones, in their new order.
@@ -136,4 +143,5 @@ class Motion:
             times_s=None,
             camera_from_world=None if cameras is None else cameras[rows],
             interpolated=None if bridged is None else bridged[rows],
+            keypoints=None,
         )

@@ -103,20 +103,6 @@ class PosedBody:
         return np.einsum("jab,jb->ja", transforms[:, :3, :3], rest) + transforms[:, :3, 3]
 
 
-def shape_for_motion(body: BodyModel, motion: Motion) -> ShapedBody:
-    """The person that a motion's tracker had in mind, as nearly as the body allows.
-
-    A body that is not SMPL's takes the rest joints of SMPL's mean shape if the poses are SMPL's:
-    then its joints move exactly as SMPL's do. Its skin goes along, each vertex with its joints.
-    """
-    shaped = body.with_shape(betas_for_motion(body, motion))
-    return (
-        shaped
-        if body.family == "smpl" or motion.body_model == body.family
-        else with_smpl_joints(shaped)
-    )
-
-
 def betas_for_motion(body: BodyModel, motion: Motion) -> Float[np.ndarray, "betas"]:
     """The motion's betas if they were made for this family of bodies, else zeros.
 

@@ -11,10 +11,10 @@ from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.file_content import read_npz
 from preprocess.fitting.clip_fitting import correct_pose
-from preprocess.fitting.proportion_space import ProportionSpace
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -14,12 +14,12 @@ from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.alignment.silhouette_objective import sample_masks
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
-from preprocess.fitting.proportion_space import ProportionSpace
 from preprocess.observe import associate_cameras, associate_masks
 
 KEY_FRAMES = 120

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
-from preprocess.fitting.proportion_space import ProportionSpace
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""

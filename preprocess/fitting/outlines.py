@@ -17,8 +17,8 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
 from preprocess.body.kinematics import descendant_matrix, joint_transforms, rotation_matrices
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.body.silhouette import SkinPoints, signed_distance_px, splat_silhouette
-from preprocess.fitting.proportion_space import ProportionSpace
 
 OUTLINE_PERSON_PX = 128
 """Height of a person in the reduced masks, px: a pixel is about 1.4 cm."""

@@ -17,6 +17,7 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.poses.motion_builder import MotionByPerson
 from preprocess.poses.pose_file import CAMERA_KEYS, POSE_KEY_LAYOUTS, motion_from_arrays
+from preprocess.tracking.keypoint_track import KEYPOINT_SHAPES
 
 KEY_ALIASES = {
     "global_orient": ("root_orient", "root_pose", "poses_root"),
@@ -41,7 +42,7 @@ SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
 """What may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
     *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
-    "time", "valid", "K", "model", "space", "scale",
+    "time", "valid", "K", "model", "space", "scale", "proportions", *KEYPOINT_SHAPES,
 )  # fmt: skip
 """What is taken of a file; whatever else is in it is left there."""
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")

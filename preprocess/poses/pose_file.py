@@ -11,6 +11,7 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion, PoseSpace
 from preprocess.body.rotations import stack_axis_angles
 from preprocess.file_content import read_npz
+from preprocess.tracking.keypoint_track import KeypointTrack
 
 POSE_KEY_LAYOUTS = (
     ("global_orient", "body_pose", "transl"),
@@ -25,6 +26,9 @@ CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 MAX_MAGNITUDE = 1e9
 """Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 
+MAX_PROPORTION = 100.0
+"""Largest magnitude of a coefficient of proportions, in prior standard deviations."""
+
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
@@ -34,8 +38,9 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
     (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model, space ("world", or "camera":
-    each row is in the camera of its frame). Rows with NaN are marked as not valid. Rotations may be
-    3x3 matrices; a body_pose of 63 numbers has no hands.
+    each row is in the camera of its frame), proportions (see `Motion`), and the arrays of
+    `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3 matrices; a
+    body_pose of 63 numbers has no hands.
 
     A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
     a last line that is half written is left out.
@@ -97,6 +102,8 @@ def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body
         intrinsic=_intrinsic(arrays, path),
         camera_from_world=_cameras(arrays, count, path),
         space=_space(arrays, path),
+        proportions=_proportions(arrays, path),
+        keypoints=KeypointTrack.from_arrays(arrays, path),
     )
 
 
@@ -132,6 +139,8 @@ def write_motion(path: Path, motion: Motion) -> None:
         "K": motion.intrinsic,
         "camera": motion.camera_from_world,
         "space": None if motion.space == "world" else np.array(motion.space),
+        "proportions": motion.proportions,
+        **({} if motion.keypoints is None else motion.keypoints.as_arrays()),
     }
     present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
     np.savez_compressed(path, **present)
@@ -195,6 +204,15 @@ def _betas(arrays: Arrays, path: Path) -> Float[np.ndarray, "betas"]:
     if not len(rows):
         raise InputError(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
     return rows.mean(axis=0)
+
+
+def _proportions(arrays: Arrays, path: Path) -> Float[np.ndarray, "coefficients"] | None:
+    if "proportions" not in arrays:
+        return None
+    proportions = _read_numbers(arrays, "proportions", path)
+    if proportions.ndim != 1 or not (np.abs(proportions) < MAX_PROPORTION).all():
+        raise InputError(f"`proportions` in {path} are no coefficients; expected finite numbers.")
+    return proportions
 
 
 def _frame_numbers(arrays: Arrays, count: int, path: Path) -> Int[np.ndarray, "poses"] | None:

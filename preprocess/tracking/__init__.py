@@ -1,1 +1,1 @@
-"""Tracking of the person in a video: key points and masks by networks, poses by a fit of the body."""
+"""Tracking of the person in a video: key points and masks by networks, poses by a fit."""

@@ -2,11 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from capture.input_error import InputError
 from preprocess.tracking.keypoints import PersonKeypoints
+
+KEYPOINT_SHAPES = {
+    "keypoint_frames": (-1,), "keypoints_px": (-1, 33, 2), "keypoints_m": (-1, 33, 3),
+    "keypoint_visibility": (-1, 33), "keypoint_presence": (-1,), "keypoint_image_size": (2,),
+    "keypoint_times": (-1,),
+}  # fmt: skip
+"""Arrays that hold key points in a file, and their shapes (-1: one row a frame)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,17 +73,37 @@ class KeypointTrack:
         return arrays if self.times_s is None else {**arrays, "keypoint_times": self.times_s}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Shaped[np.ndarray, "..."]]) -> "KeypointTrack | None":
-        """What `as_arrays` returned; None if a file's arrays do not hold it."""
+    def from_arrays(
+        cls, arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path
+    ) -> "KeypointTrack | None":
+        """What `as_arrays` returned; None if a file's arrays do not hold it.
+
+        Raises:
+            InputError: If they hold something else under its keys; `path` is for the message.
+        """
         if "keypoint_frames" not in arrays:
             return None
-        width, height = arrays["keypoint_image_size"]
+        count = arrays["keypoint_frames"].size
+        found: dict[str, Shaped[np.ndarray, ...]] = {}
+        for key, shape in KEYPOINT_SHAPES.items():
+            if key == "keypoint_times" and key not in arrays:
+                continue
+            if key not in arrays or arrays[key].dtype.kind not in "iuf":
+                raise InputError(f"{path} holds key points without numbers in `{key}`.")
+            wanted = tuple(count if length < 0 else length for length in shape)
+            if arrays[key].shape != wanted or not np.isfinite(arrays[key]).all():
+                raise InputError(f"`{key}` in {path} must be finite numbers of the shape {wanted}.")
+            found[key] = arrays[key].astype(np.float64)
+        frames = found["keypoint_frames"]
+        if (np.diff(frames) <= 0.0).any():
+            raise InputError(f"`keypoint_frames` in {path} do not ascend.")
+        width, height = found["keypoint_image_size"]
         return cls(
-            frames=arrays["keypoint_frames"].astype(np.int64),
-            image_px=arrays["keypoints_px"].astype(np.float64),
-            world_m=arrays["keypoints_m"].astype(np.float64),
-            visibility=arrays["keypoint_visibility"].astype(np.float64),
-            presence=arrays["keypoint_presence"].astype(np.float64),
+            frames=frames.astype(np.int64),
+            image_px=found["keypoints_px"],
+            world_m=found["keypoints_m"],
+            visibility=found["keypoint_visibility"],
+            presence=found["keypoint_presence"],
             size_px=(int(width), int(height)),
-            times_s=arrays.get("keypoint_times"),
+            times_s=found.get("keypoint_times"),
         )

@@ -7,7 +7,6 @@ eyes, 7-8 ears, 9-10 mouth, 11-12 shoulders, 13-14 elbows, 15-16 wrists, 17-22 f
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
@@ -37,6 +36,8 @@ class CroppedMask:
             frame_px: Width and height of the frame.
             size_px: Width and height of the mask to make.
         """
+        import cv2  # heavy, and players, which read poses, do without
+
         scale = np.array(size_px) / np.array(frame_px)
         there = self.image_from_crop * scale[:, None]
         there[:, 2] += 0.5 * there[:, :2].sum(axis=1) - 0.5  # to OpenCV's pixels, middles at 0

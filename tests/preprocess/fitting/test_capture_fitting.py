@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
-from preprocess.fitting.proportion_space import ProportionSpace
 from preprocess.open_capture import open_capture
 from studio.shoot import ShootConfig, film_capture
 

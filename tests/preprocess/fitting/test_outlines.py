@@ -9,9 +9,9 @@ from capture.camera import Camera
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
+from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import correct_pose
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
-from preprocess.fitting.proportion_space import ProportionSpace
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEW[2, 3] = 2.6

@@ -8,6 +8,7 @@ import pytest
 from capture.input_error import InputError
 from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.tracking.keypoint_track import KeypointTrack
 
 
 @pytest.fixture
@@ -55,6 +56,51 @@ def test_what_is_written_is_read(tmp_path, motion):
         path = tmp_path / f"{number}.npz"
         write_motion(path, wanted)
         assert_same(read_motion(path), wanted)
+
+
+@pytest.fixture
+def keypoints(rng):
+    """Key points in four of seven frames."""
+    return KeypointTrack(
+        frames=np.array([0, 1, 4, 6]),
+        image_px=rng.uniform(0.0, 500.0, (4, 33, 2)),
+        world_m=rng.normal(size=(4, 33, 3)),
+        visibility=rng.uniform(size=(4, 33)),
+        presence=rng.uniform(size=4),
+        size_px=(270, 480),
+        times_s=np.array([0.0, 0.5, 2.0, 3.0]),
+    )
+
+
+def test_proportions_and_key_points_are_read_by_every_reader(tmp_path, motion, keypoints):
+    path, wanted = tmp_path / "poses.npz", replace(motion, proportions=np.linspace(-1, 1, 28))
+    write_motion(path, replace(wanted, keypoints=keypoints))
+    for read in (read_motion(path), read_poses(path)):
+        np.testing.assert_array_equal(read.proportions, wanted.proportions)
+        assert read.keypoints.size_px == (270, 480)
+        np.testing.assert_array_equal(read.keypoints.frames, keypoints.frames)
+        for name in ("image_px", "world_m", "visibility", "presence", "times_s"):
+            there, here = getattr(read.keypoints, name), getattr(keypoints, name)
+            np.testing.assert_allclose(there, here, rtol=1e-6)
+    assert read_motion(path).select_rows(np.array([1]), np.array([0])).keypoints is None
+    write_motion(path, motion)
+    assert read_motion(path).keypoints is None
+    assert read_motion(path).proportions is None
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        ({"keypoints_px": np.zeros((3, 33, 2))}, "keypoints_px"),
+        ({"keypoint_visibility": np.full((4, 33), np.nan)}, "keypoint_visibility"),
+        ({"keypoint_frames": np.array([0, 4, 1, 6])}, "ascend"),
+        ({"keypoint_image_size": np.array(["a", "b"])}, "keypoint_image_size"),
+        ({"proportions": np.array([0.0, np.nan])}, "proportions"),
+    ],
+)
+def test_damaged_key_points_are_refused(write, keypoints, damage, named):
+    with pytest.raises(InputError, match=named):
+        read_motion(write(**{**keypoints.as_arrays(), **damage}))
 
 
 def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
