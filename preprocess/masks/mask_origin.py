@@ -3,9 +3,7 @@
 The segmenter may be this project's own or one that another package registers as an entry point.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -14,16 +12,14 @@ from jaxtyping import Float32
 
 from capture.camera import Camera
 from capture.frame import Frame
-from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.plugins import make_plugin
 
 SEGMENTER_PREFIX = "segmenter:"
 """What precedes a segmenter's name in --masks."""
 DEFAULT_SEGMENTER = "grabcut"
 """Name of this project's own segmenter."""
-ENTRY_POINT_GROUP = "instant_avatar.segmenters"
-"""Entry points of other packages: NAME = "module:make", where make(shaped) returns a Segmenter."""
 
 
 @runtime_checkable
@@ -43,9 +39,6 @@ class Segmenter(Protocol):
         ...
 
 
-SegmenterFactory = Callable[[ShapedBody], Segmenter]
-
-
 def segmenter_name(masks: object) -> str | None:
     """The name after `segmenter:` in --masks; None if it names a file or nothing."""
     text = str(masks)
@@ -55,6 +48,8 @@ def segmenter_name(masks: object) -> str | None:
 def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
     """Make this project's segmenter, or one of an installed package.
 
+    Another package's entry point `make(shaped)` returns a Segmenter.
+
     Raises:
         InputError: If no package registers that name, or its segmenter cannot be loaded.
     """
@@ -62,18 +57,8 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
         from preprocess.masks.grabcut import GrabCutSegmenter
 
         return GrabCutSegmenter(shaped)
-    registered = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
-    if name not in registered:
-        raise InputError(
-            f"--masks {SEGMENTER_PREFIX}{name}: there is no such segmenter; installed are "
-            f"{', '.join([DEFAULT_SEGMENTER, *registered])}. Others come with packages that have "
-            f"an entry point in the group {ENTRY_POINT_GROUP!r} (docs/formats.md)."
-        )
-    try:
-        make: SegmenterFactory = registered[name].load()
-        return make(shaped)
-    except Exception as cause:  # code of another package
-        raise InputError(f"The segmenter {name!r} could not be loaded: {cause}.") from cause
+    option = f"--masks {SEGMENTER_PREFIX}{name}"
+    return make_plugin("segmenter", name, shaped, own=DEFAULT_SEGMENTER, option=option)
 
 
 @dataclass(frozen=True, kw_only=True)

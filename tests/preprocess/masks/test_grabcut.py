@@ -9,10 +9,10 @@ import pytest
 from capture.camera import Camera
 from capture.frame import Frame
 from capture.input_error import InputError
+from preprocess import plugins
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.silhouette import MeshSilhouette, signed_distance_px
-from preprocess.masks import mask_origin
 from preprocess.masks.clothing_offset import FOOT_JOINTS, ClothedBody, ClothingOffset, solid_hair
 from preprocess.masks.color_models import (
     FOREGROUND_MIN_DIFFERENCE,
@@ -415,7 +415,7 @@ def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):
     def load():
         return lambda body: made.append(body) or (lambda frame, pose, camera: frame)
 
-    monkeypatch.setattr(mask_origin, "entry_points", lambda group: [Point("rembg", load)])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [Point("rembg", load)])
     assert make_segmenter("rembg", shaped)(1, None, None) == 1
     assert made == [shaped]
     with pytest.raises(InputError, match="installed are grabcut, rembg"):
@@ -426,6 +426,6 @@ def test_a_segmenter_that_cannot_be_loaded_is_named(monkeypatch, shaped):
     def load():
         raise ImportError("no module named rembg")
 
-    monkeypatch.setattr(mask_origin, "entry_points", lambda group: [Point("rembg", load)])
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [Point("rembg", load)])
     with pytest.raises(InputError, match=r"'rembg' could not be loaded: no module named rembg"):
         make_segmenter("rembg", shaped)
