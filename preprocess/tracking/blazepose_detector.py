@@ -4,7 +4,7 @@ For each of 2,254 anchors, evenly spread over the picture, the network says how 
 person there, and where that person's middle and size are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -20,6 +20,9 @@ MAX_OVERLAP = 0.3
 """Largest intersection over union of two persons' boxes."""
 SAME_PERSON_DISTANCE = 0.12
 """Two detections whose middles are nearer than this share of their squares' side are one person."""
+SMALL_PERSON = 0.6
+"""A person whose square is smaller than this share of the searched one is searched again, larger:
+the network was made for persons who fill the picture."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,6 +81,43 @@ class BlazePoseDetector:
             if not any(is_same_person(detection, other) for other in found):
                 found.append(detection)
         return found
+
+    def find_all(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
+        """Find the persons in a frame, small ones as well."""
+        whole = PersonSquare.of_frame(rgb)
+        found = self(rgb, whole)
+        if not found:
+            whole = replace(whole, side=float(min(rgb.shape[:2])))
+            for part in parts_of_frame(rgb):
+                for detection in self(rgb, part):
+                    if not any(is_same_person(detection, other) for other in found):
+                        found.append(detection)
+        return [
+            self._look_closer(rgb, each) if each.square.side < SMALL_PERSON * whole.side else each
+            for each in found
+        ]
+
+    def _look_closer(
+        self, rgb: UInt8[np.ndarray, "height width 3"], detection: PersonDetection
+    ) -> PersonDetection:
+        """The same person, found in a smaller area."""
+        square = detection.square
+        closer = self(rgb, replace(square, angle=0.0))
+        return min(
+            closer,
+            key=lambda each: np.hypot(each.square.x - square.x, each.square.y - square.y),
+            default=detection,
+        )
+
+
+def parts_of_frame(rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonSquare]:
+    """Three squares that cover a frame, as high or as wide as it is."""
+    height, width = rgb.shape[:2]
+    side = float(min(width, height))
+    places = np.linspace(side / 2, max(width, height) - side / 2, 3)
+    if width > height:
+        return [PersonSquare(x=float(place), y=side / 2, side=side) for place in places]
+    return [PersonSquare(x=side / 2, y=float(place), side=side) for place in places]
 
 
 def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:

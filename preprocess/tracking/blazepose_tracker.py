@@ -7,12 +7,17 @@ key points of this one, and the detector is needed only when the person is lost.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from capture.input_error import InputError
-from preprocess.tracking.blazepose_detector import BlazePoseDetector, PersonDetection
+from preprocess.tracking.blazepose_detector import (
+    SAME_PERSON_DISTANCE,
+    BlazePoseDetector,
+    PersonDetection,
+)
 from preprocess.tracking.blazepose_landmarks import BlazePoseLandmarks, FoundLandmarks
 from preprocess.tracking.keypoints import PersonKeypoints
+from preprocess.tracking.person_looks import PersonLooks, colors_of
 from preprocess.tracking.person_square import PersonSquare
 
 MIN_PRESENCE = 0.5
@@ -25,6 +30,16 @@ MAX_STEP_AFTER_LOSS = 0.1
 """How much farther than `MAX_STEP` a lost person may be, for each frame since."""
 SEARCH_SIDE = 1.5
 """Side of the area around the last place that is searched, in sides of the person's square."""
+WATCH_INTERVAL = 5
+"""Frames from one look for other persons to the next."""
+NEAR = 0.6
+"""Distance of another person, in sides of the square, within which the two may be mixed up."""
+OVERLAPPING = 0.3
+"""Distance within which two persons hide each other."""
+MAX_COLOR_DISTANCE = 8.0
+"""Largest difference of a person's colors, in units of CIELAB, if the others' are not known."""
+CROWD_MEMORY = 20
+"""Frames after which another person who was near and is not seen any more does not count."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +57,9 @@ class LastPlace:
     def strangeness(self, square: PersonSquare) -> float:
         """How unlikely it is that a square shows the same person; above 1 it does not."""
         reach = MAX_STEP + MAX_STEP_AFTER_LOSS * (self.frames_ago - 1)
-        step = np.hypot(square.x - self.square.x, square.y - self.square.y) / self.square.side
+        step = distance_in_sides(self.square, square)
         growth = abs(np.log(square.side / self.square.side)) / np.log(MAX_GROWTH)
-        return max(float(step) / reach, float(growth) * MAX_STEP / reach)
+        return max(step / reach, float(growth) * MAX_STEP / reach)
 
 
 class BlazePoseTracker:
@@ -54,8 +69,8 @@ class BlazePoseTracker:
         """Loads the networks.
 
         Args:
-            person: Whom to follow, counted from left to right from 1, in the first frame that
-                shows so many; the largest one if it is not given.
+            person: Whom to follow, counted from left to right from 1, in the first frame with
+                that many persons; the largest one if it is not given.
 
         Raises:
             InputError: If that number is below 1.
@@ -66,29 +81,41 @@ class BlazePoseTracker:
         self._find_landmarks = BlazePoseLandmarks()
         self._person = person
         self._last: LastPlace | None = None
+        self._looks, self._company = PersonLooks(), PersonLooks()
+        self._frames_to_watch = 0
+        self._crowded_frames = 0
+        self._has_company = False
 
     def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
         found = self._follow(rgb) or self._find(rgb)
-        if found is not None:
-            self._last = LastPlace(square=found.square)
-            return found.keypoints
-        if self._last is not None:
-            self._last = replace(self._last, frames_ago=self._last.frames_ago + 1)
-        return None
+        if found is None:
+            if self._last is not None:
+                self._last = replace(self._last, frames_ago=self._last.frames_ago + 1)
+            return None
+        self._last = LastPlace(square=found.square)
+        self._watch(rgb, found)
+        return replace(found.keypoints, crowded=self._crowded_frames > 0)
 
     def _follow(self, rgb: UInt8[np.ndarray, "height width 3"]) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""
         if self._last is None or self._last.frames_ago > 1:
             return None
-        return self._accept(self._find_landmarks(rgb, self._last.square))
+        return self._accept(rgb, self._find_landmarks(rgb, self._last.square))
 
-    def _accept(self, found: FoundLandmarks) -> FoundLandmarks | None:
+    def _accept(
+        self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks
+    ) -> FoundLandmarks | None:
         """What was found, if it is a person, and the same one as before."""
         if found.keypoints.presence < MIN_PRESENCE:
             return None
-        if self._last is not None and self._last.strangeness(found.square) > 1:
+        if self._last is None:
+            return found
+        if self._last.strangeness(found.square) > 1:
             return None
+        # Clothes change their looks with light, so they decide only where places do not.
+        if self._crowded_frames > 0 or (self._has_company and self._last.frames_ago > 1):
+            return found if self._looks_right(colors_of(rgb, found.keypoints)) else None
         return found
 
     def _find(self, rgb: UInt8[np.ndarray, "height width 3"]) -> FoundLandmarks | None:
@@ -98,7 +125,7 @@ class BlazePoseTracker:
             rough = self._find_landmarks(rgb, detection.square)
             if rough.keypoints.presence < MIN_PRESENCE:
                 continue
-            found = self._accept(self._find_landmarks(rgb, rough.square))
+            found = self._accept(rgb, self._find_landmarks(rgb, rough.square))
             if found is not None:
                 return found
         return None
@@ -107,10 +134,12 @@ class BlazePoseTracker:
         """Detections that may be the person, the most likely one first."""
         last = self._last
         if last is None:
-            return self._choose(self._search(rgb))
+            return self._choose(self._detect.find_all(rgb))
         around = replace(last.square, side=SEARCH_SIDE * last.square.side, angle=0.0)
-        for detections in (self._detect(rgb), self._detect(rgb, around)):
+        for area in (None, around):
+            detections = self._detect(rgb, area)
             likely = [each for each in detections if last.strangeness(each.square) <= 1]
+            self._has_company |= len(likely) < len(detections)
             if likely:
                 return sorted(likely, key=lambda each: last.strangeness(each.square))
         return []
@@ -122,6 +151,47 @@ class BlazePoseTracker:
         from_left = sorted(detections, key=lambda each: each.square.x)
         return from_left[self._person - 1 : self._person]
 
-    def _search(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
-        """All persons in a frame."""
-        return self._detect(rgb)
+    def _watch(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> None:
+        """Look for other persons every few frames; while there are none, learn this one's looks."""
+        self._crowded_frames = max(0, self._crowded_frames - 1)
+        self._frames_to_watch -= 1
+        if self._frames_to_watch > 0:
+            return
+        self._frames_to_watch = WATCH_INTERVAL
+        nearest = 1.0
+        for other in self._detect(rgb):
+            apart = distance_in_sides(found.square, other.square)
+            if apart > SAME_PERSON_DISTANCE:
+                self._has_company = True
+                nearest = min(nearest, apart)
+                if OVERLAPPING < apart < NEAR:
+                    self._learn_company(rgb, found.square, other.square)
+        if nearest < NEAR:
+            self._crowded_frames = CROWD_MEMORY
+        is_clear = nearest > OVERLAPPING and self._crowded_frames in (0, CROWD_MEMORY)
+        if is_clear or not self._looks.is_known:
+            self._looks.learn(colors_of(rgb, found.keypoints))
+
+    def _learn_company(
+        self,
+        rgb: UInt8[np.ndarray, "height width 3"],
+        person: PersonSquare,
+        other: PersonSquare,
+    ) -> None:
+        """Remember the looks of another person who is near."""
+        found = self._find_landmarks(rgb, other)
+        is_other = distance_in_sides(person, found.square) > OVERLAPPING
+        if is_other and found.keypoints.presence >= MIN_PRESENCE:
+            self._company.learn(colors_of(rgb, found.keypoints))
+
+    def _looks_right(self, colors: Float[np.ndarray, "numbers"]) -> bool:
+        """Whether colors are rather the person's than those of another one."""
+        distance = self._looks.distance(colors)
+        if self._company.is_known:
+            return distance < self._company.distance(colors)
+        return distance < MAX_COLOR_DISTANCE
+
+
+def distance_in_sides(a: PersonSquare, b: PersonSquare) -> float:
+    """Distance of the middles of two squares, in sides of the first."""
+    return float(np.hypot(a.x - b.x, a.y - b.y) / a.side)

@@ -58,6 +58,7 @@ class PersonKeypoints:
         visibility: Probability that a key point is in the frame and not hidden.
         presence: Probability that a person is there at all.
         mask: How far each pixel is person.
+        crowded: Whether another person is so near that the two may be mixed up.
     """
 
     image_px: Float[np.ndarray, "33 2"]
@@ -65,3 +66,4 @@ class PersonKeypoints:
     visibility: Float[np.ndarray, "33"]
     presence: float
     mask: CroppedMask
+    crowded: bool = False

@@ -15,8 +15,8 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
 
     Args:
         name: The tracker's.
-        person: Whom to follow, counted from left to right from 1, in the first frame that shows
-            so many; the largest one if it is not given.
+        person: Whom to follow, counted from left to right from 1, in the first frame with that
+            many persons; the largest one if it is not given.
 
     Raises:
         InputError: If no package registers that name, or its tracker cannot be loaded.

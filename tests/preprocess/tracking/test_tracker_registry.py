@@ -10,9 +10,9 @@ from preprocess.tracking.tracker_registry import make_tracker
 
 
 class FakeEntryPoint:
-    """Another package's tracker, which finds nobody."""
+    """Another package's tracker, which finds no person."""
 
-    name = "nobody"
+    name = "empty_room"
 
     def __init__(self, group):
         self.group = group
@@ -23,8 +23,10 @@ class FakeEntryPoint:
 
 def test_another_packages_tracker_is_made_for_the_person(monkeypatch):
     monkeypatch.setattr(plugins, "entry_points", lambda group: [FakeEntryPoint(group)])
-    assert make_tracker("nobody", 2)(7) == ("instant_avatar.trackers", 2, 7)
-    with pytest.raises(InputError, match=r"--tracker vitpose: .*installed are blazepose, nobody"):
+    assert make_tracker("empty_room", 2)(7) == ("instant_avatar.trackers", 2, 7)
+    with pytest.raises(
+        InputError, match=r"--tracker vitpose: .*installed are blazepose, empty_room"
+    ):
         make_tracker("vitpose")
 
 
