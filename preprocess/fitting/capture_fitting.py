@@ -13,14 +13,18 @@ from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.proportion_space import ProportionSpace
+from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
 from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
-from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.keypoint_rows import ClipKeypoints
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
+from preprocess.fitting.pose_priors import HumanPosePrior
 from preprocess.observe import associate_cameras, associate_masks
+from preprocess.tracking.keypoint_track import KeypointTrack
 
 KEY_FRAMES = 120
 """Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""
@@ -28,6 +32,16 @@ MIN_ITERATIONS = 6
 """Fewest Gauss-Newton iterations; the first ones may overshoot."""
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
+TRACKED_KEY_FRAMES = 80
+"""The same for poses that were made of key points, which tell the poses between them."""
+KEYPOINT_ITERATIONS = 5
+"""Iterations with key points alone, after which the body is near its outline."""
+TRACKED_ITERATIONS = (3, 5)
+"""Fewest and most iterations with outlines after that."""
+SIGMA_LOG_ASSUMED_FOCAL = 0.2
+"""Prior standard deviation of the logarithm of a focal length that is merely assumed."""
+USUAL_FPS = 30.0
+"""Frames per second of a film that does not say."""
 PROPORTION_ITERATIONS = 4
 """Iterations that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
@@ -74,51 +88,143 @@ def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
     return float((a * b).sum() / (b * b).sum())
 
 
-def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:
-    """Fit a capture to the masks of a few frames.
+def fit_capture(
+    capture: Capture, *, fit_body: bool = True, keypoints: KeypointTrack | None = None
+) -> CaptureFit | None:
+    """Fit a capture to the masks of a few frames, and to key points where there are any.
 
     Args:
-        capture: A recording with masks.
+        capture: A recording with masks. If its motion holds key points, its poses are a first
+            guess made of these alone, and always give way.
         fit_body: Whether proportions may change; not where an avatar's person is given.
+        keypoints: Key points as further evidence for given poses.
 
     Returns:
-        The changes; None if there are no masks that could be fitted.
+        The changes; None if there are no masks that could be fitted, or if the poses' file holds
+        proportions: then they were fitted before.
     """
-    fitter = _make_fitter(capture)
+    tracked = capture.motion.keypoints is not None
+    if fit_body and capture.motion.proportions is not None:
+        return None
+    fitter = make_fitter(capture, keypoints)
     if fitter is None:
         return None
     before = fitter.error_px()
     focal = not capture.cameras.is_moving
-    without_poses = FitParameters(poses=False, proportions=fit_body, focal=focal)
-    for _ in range(PROPORTION_ITERATIONS):
-        fitter.iterate(without_poses)
-    explained, everything = fitter.error_px(), without_poses._replace(poses=True)
-    errors: list[float] = []
-    while len(errors) < MAX_ITERATIONS:
-        errors.append(fitter.iterate(everything))
-        settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
-        if len(errors) >= MIN_ITERATIONS and settled:
-            break
+    everything = FitParameters(proportions=fit_body, focal=focal)
+    if tracked:
+        explained = np.inf
+        for _ in range(KEYPOINT_ITERATIONS):
+            fitter.iterate(everything._replace(outlines=False))
+        _iterate_until_settled(fitter, everything, TRACKED_ITERATIONS)
+    else:
+        for _ in range(PROPORTION_ITERATIONS):
+            fitter.iterate(everything._replace(poses=False))
+        explained = fitter.error_px()
+        _iterate_until_settled(fitter, everything, (MIN_ITERATIONS, MAX_ITERATIONS))
     after = fitter.error_px()
-    turned = np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean())
-    geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
+    corrections = fitter.corrections
+    turned = np.degrees(np.linalg.norm(corrections[:, :3], axis=1).mean())
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
     return CaptureFit(
         coefficients=fitter.coefficients,
         focal_factor=float(np.exp(fitter.log_focal)),
-        corrections=_interpolate_corrections(fitter, geometry),
+        corrections=_interpolate_corrections(capture, fitter, corrections),
         error_before_cm=before * pixel_cm,
         error_after_cm=after * pixel_cm,
-        taken=bool(after < MAX_ERROR_RATIO * explained and turned > MIN_ROOT_TURN_DEG),
+        taken=tracked or bool(after < MAX_ERROR_RATIO * explained and turned > MIN_ROOT_TURN_DEG),
         fits_body=fit_body,
     )
 
 
-def _make_fitter(capture: Capture) -> ClipFitter | None:
-    """The problem of a capture's evenly spread masks; None without enough of them."""
-    if capture.live is not None or (capture.masks is None and not capture.source.has_alpha):
+def _iterate_until_settled(
+    fitter: ClipFitter, fitted: FitParameters, bounds: tuple[int, int]
+) -> None:
+    """Iterates until the error hardly decreases, between a fewest and a most times."""
+    errors: list[float] = []
+    while len(errors) < bounds[1]:
+        errors.append(fitter.iterate(fitted))
+        settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
+        if len(errors) >= bounds[0] and settled:
+            break
+
+
+def make_fitter(capture: Capture, keypoints: KeypointTrack | None = None) -> ClipFitter | None:
+    """The problem of a capture's evenly spread masks and its key points.
+
+    Args:
+        capture: A recording with masks.
+        keypoints: Key points; None for those that its poses were made of, if any.
+
+    Returns:
+        The problem, at its start; None without enough masks.
+    """
+    has_masks = capture.masks is not None or capture.source.has_alpha
+    if capture.live is not None or not (has_masks or capture.motion.keypoints):
         return None
-    geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
+    tracked, geometry = capture.motion.keypoints, _geometry(capture)
+    keypoints = keypoints or tracked
+    count = TRACKED_KEY_FRAMES if tracked else KEY_FRAMES
+    outlines = _read_outlines(capture, geometry, count) if has_masks else {}
+    if len(outlines) < MIN_FRAMES and (keypoints is None or len(keypoints) < MIN_FRAMES):
+        return None
+    size_px = next((each.camera.size_px for each in outlines.values()), capture.source.size_px)
+    numbers = set(outlines) | {
+        int(each) for each in ([] if keypoints is None else keypoints.frames)
+    }
+    camera_row, frames = associate_cameras(capture.cameras, capture.source), []
+    for number in sorted(numbers - capture.cameras.frames_without_camera):
+        row = geometry.row_for_frame(number)
+        if row is not None:
+            mask = outlines.get(number)
+            camera = geometry.camera_at(camera_row(number), size_px)
+            frames.append(ClipFrame(row=row, number=float(number), camera=camera, mask=mask))
+    space = ProportionSpace.around(capture.shaped)
+    if keypoints is None:
+        return ClipFitter(capture.motion, space, frames)
+    cameras = [frame.camera for frame in frames]
+    found = ClipKeypoints.of(
+        keypoints, [int(frame.number) for frame in frames], cameras, capture.shaped.joints
+    )
+    if tracked is None:
+        return ClipFitter(capture.motion, space, frames, keypoints=found)
+    rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
+    sigma = SIGMA_LOG_FOCAL if capture.paths.cameras is not None else SIGMA_LOG_ASSUMED_FOCAL
+    times = _times_s(keypoints, [int(frame.number) for frame in frames])
+    return ClipFitter(
+        capture.motion, space, frames, keypoints=found, prior=HumanPosePrior(rotations, times),
+        sigma_log_focal=sigma,
+    )  # fmt: skip
+
+
+def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
+    """What a pose file should hold of tracked poses after their fit: with proportions and K.
+
+    Args:
+        capture: What was fitted: poses made of key points, for the mean body.
+        fit: Its fit.
+    """
+    moved = fit.correct_motion(_geometry(capture))
+    betas = SIGMA_BETA * fit.coefficients[: capture.shaped.body.shape_directions.shape[-1]]
+    intrinsic = fit.scale_focal_lengths(capture.cameras)[0].intrinsic
+    return replace(moved, betas=betas, proportions=fit.coefficients, intrinsic=intrinsic)
+
+
+def _times_s(track: KeypointTrack, numbers: list[int]) -> Float[np.ndarray, "frames"]:
+    """Times of frames, of which each may lie between those of the key points."""
+    if track.times_s is None:
+        return np.array(numbers) / USUAL_FPS
+    return np.interp(numbers, track.frames, track.times_s)
+
+
+def _geometry(capture: Capture) -> CaptureGeometry:
+    return CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
+
+
+def _read_outlines(
+    capture: Capture, geometry: CaptureGeometry, count: int
+) -> dict[int, OutlineDistances]:
+    """Outlines of evenly spread masks, by frame."""
     try:
         objective = sample_masks(
             capture.source,
@@ -126,34 +232,31 @@ def _make_fitter(capture: Capture) -> ClipFitter | None:
             associate_masks(capture.masks, capture.source),
             associate_cameras(capture.cameras, capture.source),
             SkinPoints.of(capture.shaped, 1),
-            count=KEY_FRAMES,
+            count=count,
             person_px=OUTLINE_PERSON_PX,
             excluded_frames=capture.cameras.frames_without_camera,
         )
     except InputError:  # parts that do not fit are reported elsewhere
-        return None
-    frames = []
-    for sample in objective.samples:
-        row = geometry.row_for_frame(sample.index)
-        if row is not None:
-            camera = geometry.camera_at(sample.camera_row, objective.size_px)
-            mask = OutlineDistances.of(sample.alpha, camera)
-            frames.append(ClipFrame(row=row, number=float(sample.index), mask=mask))
-    if len(frames) < MIN_FRAMES:
-        return None
-    return ClipFitter(capture.motion, ProportionSpace.around(capture.shaped), frames)
+        return {}
+    return {
+        sample.index: OutlineDistances.of(
+            sample.alpha, geometry.camera_at(sample.camera_row, objective.size_px)
+        )
+        for sample in objective.samples
+        if geometry.row_for_frame(sample.index) is not None
+    }
 
 
 def _reduction(capture: Capture, fitter: ClipFitter) -> float:
     """Size of a pixel of the reduced masks, in pixels that training sees."""
     longer = max(capture.source.size_px)
-    return min(capture.size_px or longer, longer) / max(fitter.frames[0].mask.distance.shape)
+    return min(capture.size_px or longer, longer) / max(fitter.frames[0].camera.size_px)
 
 
 def _interpolate_corrections(
-    fitter: ClipFitter, geometry: CaptureGeometry
+    capture: Capture, fitter: ClipFitter, corrections: Float[np.ndarray, "frames 75"]
 ) -> Float[np.ndarray, "poses 75"]:
     """A correction for each row of the motion, linear in time between the fitted frames."""
     numbers = np.array([frame.number for frame in fitter.frames])
-    rows = np.nan_to_num(geometry.row_frames)
-    return np.column_stack([np.interp(rows, numbers, each) for each in fitter.corrections.T])
+    rows = np.nan_to_num(_geometry(capture).row_frames)
+    return np.column_stack([np.interp(rows, numbers, each) for each in corrections.T])

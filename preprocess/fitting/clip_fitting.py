@@ -17,8 +17,11 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.proportion_space import ProportionSpace
+from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, KeypointModel
 from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
+from preprocess.fitting.pose_priors import POSE_SIGMA, ClipPrior, GivenPosePrior
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""
@@ -26,66 +29,42 @@ INDEPENDENT_ROWS = 60.0
 """Independent distances along one outline; neighbors on it err alike."""
 FRAMES_PER_PRIOR = 10.0
 """Frames of one person that count as one for the proportions: their clothes err alike."""
-SIGMA_ROOT_RAD = 0.12
-"""Prior standard deviation of the root's rotation, radians."""
-SIGMA_SIDE_M = 0.05
-"""Prior standard deviation of the root's position across the view, metres."""
-SIGMA_DEPTH_M = 0.25
-"""Prior standard deviation of the root's distance, metres."""
 SIGMA_LOG_FOCAL = 0.08
-"""Prior standard deviation of the logarithm of the focal length."""
-JOINT_SIGMAS_RAD = (
-    (0.10, (1, 2)), (0.10, (4, 5)), (0.08, (7, 8)), (0.01, (10, 11)), (0.04, (3, 6, 9)),
-    (0.07, (12, 15)), (0.05, (13, 14)), (0.12, (16, 17)), (0.12, (18, 19)), (0.08, (20, 21)),
-    (0.01, (22, 23)),
-)  # fmt: skip
-"""Prior standard deviation of joints' rotations, radians: of hips, knees, ankles, toes, spine, neck
-and head, collars, shoulders, elbows, wrists and hands."""
-CHANGE_PER_FRAME = 0.15
-"""Standard deviation of a correction's change from a frame to the next, in prior standard
-deviations; over n frames it grows with the root of n."""
-MAX_POSE_STEP = 0.25
-"""Largest change of a parameter of a pose in one iteration, radians or metres."""
-MAX_LOG_FOCAL_STEP = 0.05
+"""Prior standard deviation of the logarithm of a stated focal length."""
+MAX_TURN_STEP_RAD = 0.25
+"""Largest change of a rotation's component in one iteration, radians."""
+MAX_PLACE_STEP_M = 0.5
+"""Largest change of the root's place in one iteration, metres."""
+MAX_LOG_FOCAL_STEP = 0.1
 """Largest change of the logarithm of the focal length in one iteration."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
 
-def _pose_sigma() -> Float[np.ndarray, "75"]:
-    sigma = np.zeros((25, 3))
-    sigma[0] = SIGMA_ROOT_RAD
-    for value, joints in JOINT_SIGMAS_RAD:
-        sigma[list(joints)] = value
-    sigma[24] = SIGMA_SIDE_M, SIGMA_SIDE_M, SIGMA_DEPTH_M
-    return sigma.ravel()
-
-
-POSE_SIGMA = _pose_sigma()
-"""Prior standard deviation of a frame's correction: root and joint rotations, root position."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClipFrame:
-    """A frame whose mask is fitted.
+    """A frame whose pose is fitted.
 
     Attributes:
         row: Row of the motion.
         number: Frame number.
-        mask: Outline of its mask.
+        camera: Its camera, of the reduced masks' size.
+        mask: Outline of its mask; None if it is not compared.
     """
 
     row: int
     number: float
-    mask: OutlineDistances
+    camera: Camera
+    mask: OutlineDistances | None = None
 
 
 class FitParameters(NamedTuple):
-    """Which parameters an iteration fits."""
+    """Which parameters and which evidence an iteration takes."""
 
     poses: bool = True
     proportions: bool = True
     focal: bool = True
+    outlines: bool = True
 
 
 ALL_PARAMETERS = FitParameters()
@@ -101,33 +80,56 @@ class ClipFitter:
         model: The person.
         coefficients: Proportions, in prior standard deviations.
         log_focal: Logarithm of the focal length's factor.
-        corrections: Root rotation, joint rotations (radians, in their joints' axes) and root
-            position (metres, in the camera's axes) of each frame.
+        poses: Present poses of the frames.
     """
 
-    def __init__(self, motion: Motion, space: ProportionSpace, frames: Sequence[ClipFrame]) -> None:
-        """Starts with the poses, the proportions and the focal length as they are."""
-        self._motion = motion
+    def __init__(
+        self,
+        motion: Motion,
+        space: ProportionSpace,
+        frames: Sequence[ClipFrame],
+        *,
+        prior: ClipPrior | None = None,
+        keypoints: ClipKeypoints | None = None,
+        sigma_log_focal: float = SIGMA_LOG_FOCAL,
+    ) -> None:
+        """Starts with the poses, the proportions and the focal length as they are.
+
+        Args:
+            motion: The poses to start from.
+            space: Proportions around the present person.
+            frames: The frames to fit, in time order.
+            prior: What is known of the poses; if None, that they are near the motion's.
+            keypoints: Key points of these frames, as further evidence.
+            sigma_log_focal: How uncertain the focal length is.
+        """
         self.frames = tuple(frames)
         self.model = OutlineModel(space)
+        self._keypoint_model = KeypointModel(space)
+        self._keypoints = keypoints
         self.coefficients = np.zeros(space.count)
-        self.log_focal = 0.0
-        self.corrections = np.zeros((len(self.frames), 75))
-        gaps = np.maximum(np.diff([frame.number for frame in self.frames]), 1.0)
-        links = 1.0 / (CHANGE_PER_FRAME**2 * gaps)
-        self._links = np.repeat(links[:, None], 75, axis=1)
+        self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
+        self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
+        self.poses = self._given
+        self._turns = np.stack([each.camera.camera_from_world[:3, :3] for each in self.frames])
+        numbers = np.array([frame.number for frame in self.frames])
+        self._prior = prior or GivenPosePrior(self._given, self._turns, numbers)
+
+    @property
+    def corrections(self) -> Float[np.ndarray, "frames 75"]:
+        """Correction of each frame: root and joint rotations (radians, in their joints' axes) and
+        root position (metres, in the camera's axes).
+        """
+        return self.poses.steps_from(self._given, self._turns)
 
     def camera(self, index: int) -> Camera:
         """Camera of a frame, with the present focal length."""
-        camera, factor = self.frames[index].mask.camera, float(np.exp(self.log_focal))
+        camera, factor = self.frames[index].camera, float(np.exp(self.log_focal))
         return replace(camera, focal_px=(camera.focal_px[0] * factor, camera.focal_px[1] * factor))
 
     def pose(self, index: int) -> BodyPose:
         """Present pose of a frame."""
-        frame = self.frames[index]
-        return correct_pose(
-            self._motion[frame.row], self.corrections[index], frame.mask.camera.camera_from_world
-        )
+        return self.poses[index]
 
     def iterate(self, fitted: FitParameters = ALL_PARAMETERS) -> float:
         """Makes one Gauss-Newton step.
@@ -138,26 +140,38 @@ class ClipFitter:
         Returns:
             Root mean square distance of the outlines before the step, px; robustly weighted.
         """
-        equations, error = self._linearise()
+        equations, error = self._linearise(fitted.outlines)
         self._add_priors(equations, fitted)
         moved, step = equations.solve()
-        self.corrections += np.clip(moved * POSE_SIGMA, -MAX_POSE_STEP, MAX_POSE_STEP)
+        zoom = float(step[-1] * self._sigma_log_focal)
+        zoomed = float(np.clip(zoom, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
+        moved *= POSE_SIGMA
+        moved[:, 74] -= (zoom - zoomed) * self._depths_m()  # distances go with the focal length
+        moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
+        moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
+        self.poses = self.poses.moved(moved, self._turns)
         self.coefficients += np.clip(step[:-1], -1.0, 1.0)
-        self.log_focal += float(
-            np.clip(step[-1] * SIGMA_LOG_FOCAL, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
-        )
+        self.log_focal += zoomed
         self.model.set_proportions(self.coefficients)
         return error
+
+    def _depths_m(self) -> Float[np.ndarray, "frames"]:
+        """Distance of each frame's root along the view."""
+        views = np.stack([frame.camera.camera_from_world[2] for frame in self.frames])
+        places = self.model.joints[0] + self.poses.translations
+        return (views[:, :3] * places).sum(axis=1) + views[:, 3]
 
     def error_px(self) -> float:
         """Root mean square distance of the outlines, px of the reduced masks."""
         return self._linearise()[1]
 
-    def _linearise(self) -> tuple[ChainEquations, float]:
-        """The outlines' equations in prior standard deviations, and their present error, px."""
+    def _linearise(self, outlines: bool = True) -> tuple[ChainEquations, float]:
+        """The evidence's equations in prior standard deviations; the outlines' error, px."""
         equations = ChainEquations.empty(len(self.frames), 75, len(self.coefficients) + 1)
         squares = total = 0.0
         for index, frame in enumerate(self.frames):
+            if frame.mask is None or not outlines:
+                continue
             mask = replace(frame.mask, camera=self.camera(index))
             seen = self.model.compare(self.pose(index), mask)
             if seen is None:
@@ -165,16 +179,35 @@ class ClipFitter:
             weight = seen.weights * (INDEPENDENT_ROWS / SIGMA_OUTLINE_PX**2 / len(seen.weights))
             squares += float(weight @ seen.residuals**2)
             total += float(weight.sum())
-            shared = np.column_stack([seen.shape_jacobian, SIGMA_LOG_FOCAL * seen.focal_jacobian])
+            shared = np.column_stack(
+                [seen.shape_jacobian, self._sigma_log_focal * seen.focal_jacobian]
+            )
             equations.add(index, seen.pose_jacobian * POSE_SIGMA, shared, seen.residuals, weight)
+        self._add_keypoints(equations)
         return equations, float(np.sqrt(squares / max(total, 1e-9)))
+
+    def _add_keypoints(self, equations: ChainEquations) -> None:
+        """Adds the key points of all frames."""
+        if self._keypoints is None:
+            return
+        cameras = [self.camera(index) for index in range(len(self.frames))]
+        seen = self._keypoint_model.compare(
+            self.poses, self.model.joints, ClipCameras.of(cameras), self._keypoints
+        )
+        focal = self._sigma_log_focal * seen.focal_jacobian[..., None]
+        equations.add_all(
+            seen.pose_jacobian * POSE_SIGMA,
+            np.concatenate([seen.shape_jacobian, focal], axis=-1),
+            seen.residuals,
+            seen.weights,
+        )
 
     def _add_priors(self, equations: ChainEquations, fitted: FitParameters) -> None:
         """Adds the priors of all parameters, and holds those that are not fitted."""
-        equations.add_chain(self.corrections / POSE_SIGMA, self._links)
+        self._prior.add_to(equations, self.poses)
         precision = np.full(len(self.coefficients) + 1, 1.0)
         precision *= max(1.0, len(self.frames) / FRAMES_PER_PRIOR)
-        state = np.concatenate([self.coefficients, [self.log_focal / SIGMA_LOG_FOCAL]])
+        state = np.concatenate([self.coefficients, [self.log_focal / self._sigma_log_focal]])
         equations.add_shared(precision, state)
         held = np.zeros(len(state))
         held[:-1] = 0.0 if fitted.proportions else HELD_PRECISION

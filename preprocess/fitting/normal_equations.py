@@ -59,6 +59,22 @@ class ChainEquations:
         self.right[frame] -= heavy.T @ residuals
         self.right_shared[:] -= heavy_shared.T @ residuals
 
+    def add_all(
+        self,
+        own: Float[np.ndarray, "frames rows n"],
+        shared: Float[np.ndarray, "frames rows m"],
+        residuals: Float[np.ndarray, "frames rows"],
+        weights: Float[np.ndarray, "frames rows"],
+    ) -> None:
+        """Adds weighted residuals of all frames, with their Jacobians."""
+        heavy, heavy_shared = weights[..., None] * own, weights[..., None] * shared
+        own_by = own.swapaxes(1, 2)
+        self.blocks[:] += own_by @ heavy
+        self.borders[:] += own_by @ heavy_shared
+        self.shared[:] += np.tensordot(shared, heavy_shared, axes=((0, 1), (0, 1)))
+        self.right[:] -= (residuals[:, None] @ heavy)[:, 0]
+        self.right_shared[:] -= np.tensordot(residuals, heavy_shared, axes=((0, 1), (0, 1)))
+
     def add_chain(
         self, state: Float[np.ndarray, "frames n"], links: Float[np.ndarray, "gaps n"]
     ) -> None:
@@ -69,14 +85,20 @@ class ChainEquations:
             links: Precision of the difference between neighbors.
         """
         each = np.arange(state.shape[1])
-        self.links[:] += links
         self.blocks[:, each, each] += 1.0
+        self.right[:] -= state
+        self.add_links(np.diff(state, axis=0), links)
+
+    def add_links(
+        self, apart: Float[np.ndarray, "gaps n"], links: Float[np.ndarray, "gaps n"]
+    ) -> None:
+        """Adds priors of equality between neighbors, `apart` from each other at present."""
+        each = np.arange(links.shape[1])
+        self.links[:] += links
         self.blocks[:-1, each, each] += links
         self.blocks[1:, each, each] += links
-        apart = np.diff(state, axis=0) * links
-        self.right[:] -= state
-        self.right[:-1] += apart
-        self.right[1:] -= apart
+        self.right[:-1] += apart * links
+        self.right[1:] -= apart * links
 
     def add_shared(self, precision: Float[np.ndarray, "m"], state: Float[np.ndarray, "m"]) -> None:
         """Adds priors around 0 of the shared parameters, whose present values are `state`."""

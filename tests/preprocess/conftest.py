@@ -9,10 +9,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from capture.camera import Camera
+from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import ProportionSpace
+from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
+from preprocess.tracking.keypoint_track import KeypointTrack
 
 
 @pytest.fixture
@@ -51,8 +57,6 @@ def truth(rng) -> Motion:
     phase = np.linspace(0.0, 2.0 * np.pi, count)
     yaw = phase[:, None] * np.array([0.0, 1.0, 0.0])
     upright = np.array([np.pi, 0.0, 0.0])
-    from scipy.spatial.transform import Rotation
-
     roots = (Rotation.from_rotvec(upright) * Rotation.from_rotvec(yaw)).as_rotvec()
     waves = 0.4 * np.sin(phase[:, None, None] + rng.uniform(0.0, 6.0, (1, 23, 3)))
     waves[:, 21:] = 0.0  # SMPL's hands: no tracker knows more of them
@@ -124,3 +128,72 @@ def joblib_bytes(monkeypatch) -> Callable[..., bytes]:
         return zlib.compress(stream.getvalue(), 3) if compressed else stream.getvalue()
 
     return dump
+
+
+@pytest.fixture
+def mean_body() -> ShapedBody:
+    """The embedded body's mean shape."""
+    return load_body_model().with_shape()
+
+
+@pytest.fixture
+def keypoint_camera() -> Camera:
+    """A phone's camera at the origin."""
+    return Camera(
+        focal_px=(204.0, 204.0),
+        center_px=(67.5, 120.0),
+        size_px=(135, 240),
+        camera_from_world=np.eye(4),
+    )
+
+
+@pytest.fixture
+def turning_person() -> Callable[[int], Motion]:
+    """Makes a person who turns round before the camera, with bent arms and knees; 10° a frame."""
+
+    def turning_person(count: int) -> Motion:
+        yaw = np.deg2rad(10.0) * np.arange(count)[:, None] * np.array([0.0, 1.0, 0.0])
+        roots = Rotation.from_rotvec([np.pi, 0.0, 0.0]) * Rotation.from_rotvec(yaw)
+        joints = np.zeros((count, 23, 3))
+        joints[:, [0, 1], 0], joints[:, [3, 4], 0] = -0.3, 0.5  # hips and knees
+        joints[:, 15], joints[:, 16] = (0.0, 0.0, -0.9), (0.0, 0.0, 0.9)  # shoulders
+        joints[:, 17, 1], joints[:, 18, 1] = -0.8, 0.8  # elbows
+        return Motion(
+            root_rotations=roots.as_rotvec(),
+            root_translations=np.tile([0.0, 0.2, 3.0], (count, 1)),
+            joint_rotations=joints,
+            valid=np.ones(count, dtype=bool),
+            betas=np.zeros(10),
+            body_model="body24",
+            frames=np.arange(count),
+        )
+
+    return turning_person
+
+
+@pytest.fixture
+def track_motion(mean_body, keypoint_camera) -> Callable[[Motion], KeypointTrack]:
+    """Makes the key points that a perfect tracker would find of a motion."""
+
+    def track_motion(motion: Motion) -> KeypointTrack:
+        points = []
+        for row in range(len(motion)):
+            carried = mean_body.with_pose(motion[row]).world_from_rest()[KEYPOINT_JOINTS]
+            rest = (
+                mean_body.joints[KEYPOINT_JOINTS]
+                + KeypointModel(ProportionSpace.around(mean_body)).offsets_m
+            )
+            points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
+        world = np.stack(points)
+        pixels = keypoint_camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)
+        return KeypointTrack(
+            frames=np.arange(len(motion)),
+            image_px=pixels,
+            world_m=world - world[:, [23, 24]].mean(axis=1, keepdims=True),
+            visibility=np.ones((len(motion), 33)),
+            presence=np.ones(len(motion)),
+            size_px=keypoint_camera.size_px,
+            times_s=np.arange(len(motion)) / 30.0,
+        )
+
+    return track_motion

@@ -57,7 +57,7 @@ def outlines(space: ProportionSpace, coefficients, motion: Motion) -> list[ClipF
     model.set_proportions(coefficients)
     masks = [model.silhouette(pose, CAMERA).astype(np.float32) for pose in motion_poses(motion)]
     return [
-        ClipFrame(row=row, number=float(row), mask=OutlineDistances.of(mask, CAMERA))
+        ClipFrame(row=row, number=float(row), camera=CAMERA, mask=OutlineDistances.of(mask, CAMERA))
         for row, mask in enumerate(masks)
     ]
 

@@ -1,0 +1,179 @@
+"""What is known of a clip's poses before any picture: near those given, or merely human."""
+
+from typing import Protocol, final, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from preprocess.fitting.clip_poses import ClipPoses, rotation_vectors
+from preprocess.fitting.normal_equations import ChainEquations
+
+SIGMA_ROOT_RAD = 0.12
+"""Prior standard deviation of the root's rotation, radians."""
+SIGMA_SIDE_M = 0.05
+"""Prior standard deviation of the root's position across the view, metres."""
+SIGMA_DEPTH_M = 0.25
+"""Prior standard deviation of the root's distance, metres."""
+JOINT_SIGMAS_RAD = (
+    (0.10, (1, 2)), (0.10, (4, 5)), (0.08, (7, 8)), (0.01, (10, 11)), (0.04, (3, 6, 9)),
+    (0.07, (12, 15)), (0.05, (13, 14)), (0.12, (16, 17)), (0.12, (18, 19)), (0.08, (20, 21)),
+    (0.01, (22, 23)),
+)  # fmt: skip
+"""Prior standard deviation of joints' rotations, radians: of hips, knees, ankles, toes, spine, neck
+and head, collars, shoulders, elbows, wrists and hands."""
+CHANGE_PER_FRAME = 0.15
+"""Standard deviation of a correction's change from a frame to the next, in prior standard
+deviations; over n frames it grows with the root of n."""
+
+
+def _pose_sigma() -> Float[np.ndarray, "75"]:
+    sigma = np.zeros((25, 3))
+    sigma[0] = SIGMA_ROOT_RAD
+    for value, joints in JOINT_SIGMAS_RAD:
+        sigma[list(joints)] = value
+    sigma[24] = SIGMA_SIDE_M, SIGMA_SIDE_M, SIGMA_DEPTH_M
+    return sigma.ravel()
+
+
+POSE_SIGMA = _pose_sigma()
+"""Prior standard deviation of a frame's correction: root and joint rotations, root position. These
+are the units of a frame's parameters in the equations."""
+
+MIRRORED_AXES = (1.0, -1.0, -1.0)
+"""An axis-angle of a left joint times this is that of the right one."""
+LEFT_PRIORS = {
+    1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
+    7: ((0.0, 0.0, 0.0), (0.30, 0.20, 0.15)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
+    13: ((0.0, 0.0, 0.0), (0.05, 0.12, 0.12)), 16: ((0.0, -0.2, -0.9), (0.50, 0.60, 0.70)),
+    18: ((0.0, -0.35, 0.0), (0.40, 0.70, 0.08)), 20: ((0.0, 0.0, 0.0), (0.25, 0.20, 0.25)),
+    22: ((0.0, 0.0, 0.0), (0.02, 0.02, 0.02)),
+}  # fmt: skip
+"""Mean and standard deviation of the left joints' axis-angles, radians: hip, knee, ankle, toes,
+collar, shoulder, elbow, wrist, hand."""
+MIDDLE_PRIORS = {3: 0.12, 6: 0.10, 9: 0.10, 12: 0.20, 15: 0.20}
+"""Standard deviation of the axis-angles of spine, neck and head, radians."""
+HINGES = ((4, 0, 1.0), (5, 0, 1.0), (18, 1, -1.0), (19, 1, 1.0))
+"""Knees and elbows, the axis that they bend about, and to which side."""
+SIGMA_HINGE_RAD = 0.03
+"""Standard deviation of how far a hinge bends to the wrong side, radians."""
+SIGMA_FREE = 30.0
+"""Standard deviation of what is not known at all, radians or metres."""
+STEADY_FRAMES = 5.0
+"""Standard deviation of the frames over which a motion is nearly steady."""
+CHANGES_PER_SECOND = (
+    (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.055, (1, 2, 4, 5)),
+    (0.045, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.09, (16, 17, 18, 19)),
+)  # fmt: skip
+"""Standard deviation of how far a joint strays from a steady motion in a second, radians."""
+CHANGE_M = (0.013, 0.013, 0.013)
+"""Standard deviation of how far the root strays from a steady motion in a second, metres."""
+FAST_CHANGE = 3.0
+"""Standard deviations of a change between frames at which it counts half (Cauchy): people move
+fast at times."""
+
+
+@runtime_checkable
+class ClipPrior(Protocol):
+    """What is known of the poses of a clip."""
+
+    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
+        ...
+
+
+@final
+class GivenPosePrior:
+    """The poses are near given ones, and the corrections of neighboring frames are alike."""
+
+    def __init__(
+        self,
+        given: ClipPoses,
+        camera_rotations: Float[np.ndarray, "frames 3 3"],
+        frame_numbers: Float[np.ndarray, "frames"],
+    ) -> None:
+        """Takes the given poses of the frames, and the frames' numbers."""
+        self._given, self._cameras = given, camera_rotations
+        links = 1.0 / (CHANGE_PER_FRAME**2 * np.maximum(np.diff(frame_numbers), 1.0))
+        self._links = np.repeat(links[:, None], 75, axis=1)
+
+    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        """See `ClipPrior`."""
+        equations.add_chain(poses.steps_from(self._given, self._cameras) / POSE_SIGMA, self._links)
+
+
+@final
+class HumanPosePrior:
+    """Joints turn as people's do: knees and elbows one way, and slowly most of the time."""
+
+    def __init__(
+        self,
+        camera_rotations: Float[np.ndarray, "frames 3 3"],
+        times_s: Float[np.ndarray, "frames"],
+    ) -> None:
+        """Takes the times of the frames."""
+        self._cameras = camera_rotations
+        change = np.zeros((25, 3))
+        for value, joints in CHANGES_PER_SECOND:
+            change[list(joints)] = value
+        change[24] = CHANGE_M
+        gaps = np.maximum(np.diff(times_s), 1e-3)
+        self._change = change.ravel() * np.sqrt(gaps)[:, None]
+
+    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        """See `ClipPrior`."""
+        vectors = rotation_vectors(poses.rotations)
+        by_step = _inverse_right_jacobian(vectors)
+        weights, residuals = np.broadcast_to(1.0 / _SIGMA**2, vectors.shape).copy(), vectors - _MEAN
+        for joint, axis, side in HINGES:
+            wrong = side * vectors[:, joint, axis] < 0.0
+            weights[wrong, joint, axis] = SIGMA_HINGE_RAD**-2
+            residuals[wrong, joint, axis] = vectors[wrong, joint, axis]
+        heavy = weights[..., None] * by_step
+        blocks = by_step.swapaxes(-1, -2) @ heavy
+        right = -(heavy.swapaxes(-1, -2) @ residuals[..., None])[..., 0]
+        units = POSE_SIGMA[:72].reshape(24, 3)
+        blocks *= units[:, :, None] * units[:, None]
+        for joint in range(24):
+            part = slice(3 * joint, 3 * joint + 3)
+            equations.blocks[:, part, part] += blocks[:, joint]
+        equations.right[:, :72] += (right * units).reshape(-1, 72)
+        each = np.arange(72, 75)
+        equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
+        self._add_links(equations, poses)
+
+    def _add_links(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
+        after = ClipPoses(rotations=poses.rotations[1:], translations=poses.translations[1:])
+        apart = after.steps_from(before, self._cameras[:-1])
+        apart -= gaussian_filter1d(apart, STEADY_FRAMES, axis=0, mode="nearest")
+        size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
+        usual = np.repeat(1.0 / (1.0 + size / FAST_CHANGE**2), 3, axis=1)
+        equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
+
+
+def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
+    mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
+    for left, (middle, spread) in LEFT_PRIORS.items():
+        mean[left], mean[left + 1] = middle, np.array(middle) * MIRRORED_AXES
+        sigma[left] = sigma[left + 1] = spread
+    for joint, spread in MIDDLE_PRIORS.items():
+        sigma[joint] = spread
+    return mean, sigma
+
+
+_MEAN, _SIGMA = _human_priors()
+
+
+def _inverse_right_jacobian(
+    vectors: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Derivative of the axis-angle of R(v) R(step) by the step, at 0."""
+    angle = np.linalg.norm(vectors, axis=-1)
+    safe = np.clip(angle, 1e-3, 3.0)
+    factor = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    cross = cross.reshape(*vectors.shape[:-1], 3, 3)
+    return np.eye(3) + 0.5 * cross + factor[..., None, None] * (cross @ cross)

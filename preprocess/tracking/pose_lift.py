@@ -1,0 +1,145 @@
+"""First guess of poses from key points, frame by frame and without a search.
+
+The root follows from the trunk's four key points, limbs from the directions between theirs. How far
+an upper arm or a thigh twists about itself follows from where the elbow or the knee bends to. The
+distance is the one at which the body covers its key points in the picture.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.poses.gap_filling import fill_gaps
+from preprocess.poses.root_placement import place_by_pixels
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.swap_repair import repair_swaps
+
+MIN_PRESENCE = 0.5
+"""Probability of a person below which a frame's key points are not used."""
+TRUNK_POINTS = (11, 12, 23, 24)
+"""Shoulders and hips."""
+TRUNK_JOINTS = (16, 17, 1, 2)
+"""The joints next to them."""
+LIMBS = (
+    (16, 18, 20, 11, 13, 15, (0.0, -1.0, 0.0)), (17, 19, 21, 12, 14, 16, (0.0, 1.0, 0.0)),
+    (1, 4, 7, 23, 25, 27, (1.0, 0.0, 0.0)), (2, 5, 8, 24, 26, 28, (1.0, 0.0, 0.0)),
+)  # fmt: skip
+"""Of arms and legs: three joints, the three key points next to them, and the axis that the middle
+joint bends about at rest."""
+STRAIGHT = 0.35
+"""Sine of a limb's bend at which its key points and its rest pose tell its twist alike."""
+PLACED_JOINTS = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
+"""Joints that are placed at their key points in the picture."""
+PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
+"""Their key points."""
+
+
+def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> Motion:
+    """Poses of the body's mean shape, a first guess; short gaps are bridged.
+
+    Args:
+        track: Key points of one person.
+        shaped: The body, of its model's mean shape.
+        camera: The camera of all frames, of the frames' size, at the world's origin.
+
+    Returns:
+        One row for each frame with a person, and for the frames of short gaps between them; with
+        the key points, and the camera's K.
+    """
+    track, _ = repair_swaps(track)
+    poses = [
+        _lift(track.image_px[row], track.world_m[row], shaped, camera) for row in range(len(track))
+    ]
+    motion = Motion(
+        root_rotations=np.array([pose.root_rotation for pose in poses]).reshape(-1, 3),
+        root_translations=np.array([pose.root_translation for pose in poses]).reshape(-1, 3),
+        joint_rotations=np.array([pose.joint_rotations for pose in poses]).reshape(-1, 23, 3),
+        valid=track.presence >= MIN_PRESENCE,
+        betas=np.zeros(shaped.body.shape_directions.shape[-1]),
+        body_model=shaped.body.family,
+        frames=track.frames,
+        times_s=track.times_s,
+        intrinsic=camera.intrinsic,
+        keypoints=track,
+    )
+    return fill_gaps(motion)
+
+
+def _lift(
+    image_px: Float[np.ndarray, "33 2"],
+    world_m: Float[np.ndarray, "33 3"],
+    shaped: ShapedBody,
+    camera: Camera,
+) -> BodyPose:
+    """The pose of one frame."""
+    rest, local = shaped.joints, np.tile(np.eye(3), (24, 1, 1))
+    local[0] = _trunk_turn(rest[list(TRUNK_JOINTS)], world_m[list(TRUNK_POINTS)])
+    for upper, middle, lower, *points, hinge in LIMBS:
+        first, second = np.diff(world_m[points], axis=0)
+        turned = _limb_turn(rest[middle] - rest[upper], np.array(hinge), local[0], first, second)
+        # the trunk's other joints and the collars rest: a limb's parent turns as the root does
+        local[upper] = local[0].T @ turned
+        bent = turned.T @ second
+        local[middle] = _swing(rest[lower] - rest[middle], bent)
+    vectors = axis_angles_from_matrices(local)
+    pose = BodyPose(
+        root_rotation=vectors[0], root_translation=np.zeros(3), joint_rotations=vectors[1:]
+    )
+    joints = shaped.with_pose(pose).joints()[list(PLACED_JOINTS)]
+    place = place_by_pixels(joints, image_px[list(PLACED_POINTS)], camera)
+    return replace(pose, root_translation=place)
+
+
+def _trunk_turn(
+    rest: Float[np.ndarray, "4 3"], found: Float[np.ndarray, "4 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation that takes one trunk nearest to another (Kabsch 1976)."""
+    a, b = rest - rest.mean(axis=0), found - found.mean(axis=0)
+    u, _, v = np.linalg.svd(b.T @ a)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+
+
+def _limb_turn(
+    rest: Float[np.ndarray, "3"],
+    hinge: Float[np.ndarray, "3"],
+    parent: Float[np.ndarray, "3 3"],
+    first: Float[np.ndarray, "3"],
+    second: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3 3"]:
+    """World rotation of a limb's first bone, so that its hinge bends it where it is bent to.
+
+    Args:
+        rest: First bone at rest.
+        hinge: Axis of the hinge at its end, at rest.
+        parent: World rotation of what it hangs on.
+        first, second: The limb's bones as they were found.
+    """
+    along, further = _unit(first), _unit(second)
+    unbent = parent @ _swing(rest, parent.T @ first)
+    axis = np.cross(along, further) + STRAIGHT * (unbent @ hinge)
+    axis = _unit(axis - (axis @ along) * along)
+    start, side = _unit(rest), _unit(hinge - (hinge @ _unit(rest)) * _unit(rest))
+    there = np.column_stack([along, axis, np.cross(along, axis)])
+    here = np.column_stack([start, side, np.cross(start, side)])
+    return there @ here.T
+
+
+def _swing(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes direction a to direction b."""
+    a, b = _unit(a), _unit(b)
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-8:
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        return rotation_matrices(_unit(axis) * (0.0 if a @ b > 0.0 else np.pi))
+    return rotation_matrices(axis / sine * np.arctan2(sine, a @ b))
+
+
+def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -1,0 +1,52 @@
+"""What is known of poses before any picture."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.fitting.normal_equations import ChainEquations
+from preprocess.fitting.pose_priors import POSE_SIGMA, HumanPosePrior
+
+
+def settle(poses: ClipPoses, iterations: int = 8) -> ClipPoses:
+    """The poses that the prior alone leads to, held near where they are."""
+    count = len(poses.translations)
+    cameras = np.tile(np.eye(3), (count, 1, 1))
+    prior = HumanPosePrior(cameras, np.arange(count) / 30.0)
+    start = poses
+    for _ in range(iterations):
+        equations = ChainEquations.empty(count, 75, 1)
+        prior.add_to(equations, poses)
+        back = 0.05 * poses.steps_from(start, cameras) / POSE_SIGMA
+        each = np.arange(75)
+        equations.blocks[:, each, each] += 0.05
+        equations.right[:] -= back
+        equations.add_shared(np.ones(1), np.zeros(1))
+        poses = poses.moved(equations.solve()[0] * POSE_SIGMA, cameras)
+    return poses
+
+
+def test_knees_and_elbows_bend_one_way(turning_person):
+    motion = turning_person(5)
+    wrong = motion.joint_rotations.copy()
+    wrong[:, [3, 4], 0], wrong[:, 17, 1], wrong[:, 18, 1] = -0.5, 0.5, -0.5
+    poses = settle(ClipPoses.of(replace(motion, joint_rotations=wrong), range(5)))
+    bends = np.stack([poses[row].joint_rotations for row in range(5)])
+    assert bends[:, [3, 4], 0].min() > -0.05
+    assert bends[:, 17, 1].max() < 0.05
+    assert bends[:, 18, 1].min() > -0.05
+
+
+def test_a_steady_turn_stays_and_jitter_goes(turning_person):
+    motion, generator = turning_person(30), np.random.default_rng(0)
+    steady = ClipPoses.of(motion, range(30))
+    shaken = replace(
+        motion, root_rotations=motion.root_rotations + 0.02 * generator.normal(size=(30, 3))
+    )
+    cameras = np.tile(np.eye(3), (30, 1, 1))
+    kept = settle(steady).steps_from(steady, cameras)[5:-5, :3]
+    calmed = settle(ClipPoses.of(shaken, range(30))).steps_from(steady, cameras)[5:-5, :3]
+    before = ClipPoses.of(shaken, range(30)).steps_from(steady, cameras)[5:-5, :3]
+    assert np.abs(kept).max() < 0.01
+    assert np.diff(calmed, axis=0).std() < 0.35 * np.diff(before, axis=0).std()

@@ -1,0 +1,129 @@
+"""Poses lifted from key points, fitted to key points and masks, written and read again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import Motion, RelativeFocalLength
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion
+from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
+from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.pose_lift import lift_keypoints
+from studio.shoot import ShootConfig, film_capture
+
+
+def track_points(capture: Capture) -> KeypointTrack:
+    """The capture's own key points, as a tracker finds them: depth is noisy."""
+    generator, camera, points = np.random.default_rng(0), capture.cameras[0], []
+    for row in range(len(capture.motion)):
+        carried = capture.shaped.with_pose(capture.motion[row]).world_from_rest()[KEYPOINT_JOINTS]
+        rest = capture.shaped.joints[KEYPOINT_JOINTS] + KEYPOINT_OFFSETS_M
+        points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
+    world = np.stack(points)
+    count, view = len(world), camera.camera_from_world
+    pixels = camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)
+    seen = world @ view[:3, :3].T + view[:3, 3]
+    seen -= seen[:, [23, 24]].mean(axis=1, keepdims=True)
+    seen[..., 2] += 0.03 * generator.normal(size=seen.shape[:2])
+    return KeypointTrack(
+        frames=np.arange(count), image_px=pixels, world_m=0.9 * seen,
+        visibility=np.ones((count, 33)), presence=np.ones(count), size_px=camera.size_px,
+        times_s=np.arange(count) / 30.0,
+    )  # fmt: skip
+
+
+def joints_in_camera(capture: Capture) -> np.ndarray:
+    view = capture.cameras[0].camera_from_world[:3, :3]
+    joints = np.stack([capture.shaped.with_pose(capture.motion[row]).joints() for row in range(16)])
+    return (joints - joints[:, :1]) @ view.T
+
+
+def error_mm(capture: Capture, truth: Capture) -> float:
+    """Mean distance of joints, relative to the pelvis and free of scale."""
+    ours, theirs = joints_in_camera(capture), joints_in_camera(truth)
+    scale = (ours * theirs).sum() / (ours * ours).sum()
+    return 1000.0 * float(np.linalg.norm(scale * ours - theirs, axis=2).mean())
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory) -> Capture:
+    folder = tmp_path_factory.mktemp("tracked") / "capture"
+    film_capture(folder, ShootConfig(frames=16, size=96, turns=0.4))
+    return open_capture(CaptureInputs(video=folder))
+
+
+@pytest.fixture(scope="module")
+def lifted(truth, tmp_path_factory) -> Capture:
+    """The film with lifted poses and an assumed camera; frame 7 was lost."""
+    body: ShapedBody = load_body_model().with_shape()
+    size = truth.source.size_px
+    camera = replace(
+        truth.cameras[0], camera_from_world=np.eye(4),
+        focal_px=(RelativeFocalLength(ratio=0.85).intrinsic_matrix(size)[0, 0],) * 2,
+    )  # fmt: skip
+    poses = tmp_path_factory.mktemp("lifted") / "poses.npz"
+    track = track_points(truth)
+    track.presence[7] = 0.0
+    write_motion(poses, lift_keypoints(track, body, camera))
+    return open_capture(
+        CaptureInputs(
+            video=truth.paths.video, poses=poses, masks=truth.paths.masks, cameras="static"
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def fit(lifted):
+    return fit_capture(lifted)
+
+
+def test_the_fit_brings_lifted_poses_near_the_truth(lifted, truth, fit):
+    fitted = apply_fit(lifted, fit)
+    assert fit.taken
+    assert fit.error_after_cm < 0.6 * fit.error_before_cm
+    assert error_mm(fitted, truth) < 0.85 * error_mm(lifted, truth)
+    assert error_mm(fitted, truth) < 40.0
+
+
+def test_fitted_poses_are_read_as_they_were_written(lifted, fit, tmp_path):
+    motion: Motion = fitted_motion(lifted, fit)
+    write_motion(tmp_path / "poses.npz", motion)
+    inputs = CaptureInputs(
+        video=lifted.paths.video, poses=tmp_path / "poses.npz", masks=lifted.paths.masks,
+        cameras="static",
+    )  # fmt: skip
+    again, fitted = open_capture(inputs), apply_fit(lifted, fit)
+    np.testing.assert_allclose(again.shaped.joints, fit.shape(lifted.shaped).joints)
+    ours, theirs = joints_in_camera(again), joints_in_camera(fitted)
+    scale = (ours * theirs).sum() / (ours * ours).sum()
+    np.testing.assert_allclose(scale * ours, theirs, atol=1e-6)
+    assert again.cameras[0].focal_px == pytest.approx(fitted.cameras[0].focal_px)
+    assert read_motion(tmp_path / "poses.npz").keypoints is not None
+    assert fit_capture(again) is None  # its proportions say that it was fitted
+
+
+def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
+    alone = fit_capture(replace(lifted, masks=None))
+    assert alone.taken
+    assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
+
+
+def test_key_points_help_given_poses(truth):
+    """Arms that point at the camera look alike in a mask whatever their bend."""
+    generator = np.random.default_rng(1)
+    off = truth.motion.joint_rotations.copy()
+    off[:, [15, 16, 17, 18]] += 0.15 * generator.normal(size=(4, 3))
+    wrong = replace(truth, motion=replace(truth.motion, joint_rotations=off))
+    without, helped = (
+        fit_capture(wrong, keypoints=points) for points in (None, track_points(truth))
+    )
+    errors = [
+        error_mm(apply_fit(wrong, replace(found, taken=True)), truth) for found in (without, helped)
+    ]
+    assert errors[1] < 0.8 * errors[0]

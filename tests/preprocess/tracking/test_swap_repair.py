@@ -1,0 +1,73 @@
+"""Stretches with left and right exchanged: those that are repaired, and those that are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.swap_repair import LEFT_POINTS, RIGHT_POINTS, repair_swaps
+
+LEFT, RIGHT = list(LEFT_POINTS), list(RIGHT_POINTS)
+
+
+def turning_track(count: int, degrees_per_frame: float, frame_step: int = 1) -> KeypointTrack:
+    """Points of a person who turns about the y axis."""
+    generator = np.random.default_rng(0)
+    rest = generator.normal(size=(33, 3))
+    rest[LEFT, 0], rest[RIGHT, 0] = 0.2, -0.2
+    rest[LEFT, 1:] = rest[RIGHT, 1:]
+    angle = np.deg2rad(degrees_per_frame) * np.arange(count)
+    turn = np.zeros((count, 3, 3))
+    turn[:, 1, 1] = 1.0
+    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(angle)
+    turn[:, 0, 2], turn[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    world = rest @ turn.swapaxes(1, 2)
+    return KeypointTrack(
+        frames=frame_step * np.arange(count), image_px=200.0 + 100.0 * world[..., :2],
+        world_m=world, visibility=np.ones((count, 33)), presence=np.ones(count),
+        size_px=(400, 400),
+    )  # fmt: skip
+
+
+def swap(track: KeypointTrack, rows: slice) -> KeypointTrack:
+    image, world = track.image_px.copy(), track.world_m.copy()
+    for array in (image, world):
+        array[rows] = array[rows][:, _mirrored()]
+    return replace(track, image_px=image, world_m=world)
+
+
+def _mirrored() -> np.ndarray:
+    order = np.arange(33)
+    order[LEFT], order[RIGHT] = RIGHT, LEFT
+    return order
+
+
+@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 30), slice(52, 56)])
+def test_a_short_stretch_is_exchanged_back(stretch):
+    whole = turning_track(80, 4.0)
+    repaired, rows = repair_swaps(swap(whole, stretch))
+    assert np.flatnonzero(rows).tolist() == list(range(stretch.start, stretch.stop))
+    np.testing.assert_allclose(repaired.image_px, whole.image_px)
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+def test_two_stretches_are_exchanged_back():
+    whole = turning_track(80, 4.0)
+    repaired, _ = repair_swaps(swap(swap(whole, slice(10, 12)), slice(40, 49)))
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+@pytest.mark.parametrize(
+    "track",
+    [
+        turning_track(30, 20.0),  # fast, but right
+        turning_track(8, 45.0),  # photographs
+        swap(turning_track(12, 10.0, 10), slice(5, 6)),  # too far apart in time to tell
+        swap(turning_track(60, 4.0), slice(30, 60)),  # which half is wrong?
+    ],
+)
+def test_nothing_else_is_touched(track):
+    repaired, rows = repair_swaps(track)
+    assert not rows.any()
+    np.testing.assert_array_equal(repaired.world_m, track.world_m)
