@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of this project's own networks."""
@@ -49,8 +49,6 @@ class OnnxNetwork:
         }
 
 
-def sigmoid(
-    values: Float32[np.ndarray, "*shape"],
-) -> Float32[np.ndarray, "*shape"]:
+def sigmoid(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """The logistic function."""
     return 1 / (1 + np.exp(-np.clip(values, -50, 50)))
