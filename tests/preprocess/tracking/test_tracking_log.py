@@ -70,7 +70,7 @@ def test_a_person_found_far_from_the_last_place_may_be_another():
     assert runs(log_of(None, person(150.0))) == [(TrackingProblem.ABSENT, 10, 10)]
 
 
-def test_events_are_told_in_seconds():
+def test_events_are_described_in_seconds():
     log = log_of(*[None] * 9, person(crowded=True))
     absent, crowded = log.events()
     assert absent.describe(10.0) == (
