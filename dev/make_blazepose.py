@@ -136,7 +136,7 @@ def worst_errors(
     return worst
 
 
-def test_pictures(
+def check_pictures(
     network: Network, size: int, picture: Path | None
 ) -> list[Float32[np.ndarray, "1 rows columns 3"]]:
     """Three pictures of noise, smooth and rough; instead of them the one that is given."""
@@ -176,7 +176,7 @@ def main() -> None:
         path.write_bytes(verified(written, network.sha256, path.name))
         print(f"{path}: {len(written):,} bytes")  # noqa: T201
         if arguments.check:
-            pictures = test_pictures(network, model.shapes[model.inputs[0]][1], arguments.picture)
+            pictures = check_pictures(network, model.shapes[model.inputs[0]][1], arguments.picture)
             for output, (error, size) in worst_errors(source, written, pictures).items():
                 print(f"  {output}: off by {error:.2g} at most, values up to {size:.3g}")  # noqa: T201
 
