@@ -38,7 +38,7 @@ KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = (3, 5)
 """Fewest and most iterations with outlines after that."""
-SIGMA_LOG_ASSUMED_FOCAL = 0.2
+SIGMA_LOG_ASSUMED_FOCAL = 0.3
 """Prior standard deviation of the logarithm of a focal length that is merely assumed."""
 USUAL_FPS = 30.0
 """Frames per second of a film that does not say."""

@@ -40,12 +40,12 @@ PIXEL_WEIGHTS = np.array([0.4] + [0.15] * 6 + [0.4] * 2 + [0.15] * 2 + [1.0] * 6
 """What each key point counts in the picture; those of the face and of a hand err alike."""
 SIGMA_KEYPOINT_PX = 1.0
 """Standard deviation of a key point in the picture, px of the reduced masks (1.4 cm)."""
-ROBUST_KEYPOINT_PX = 5.0
+ROBUST_KEYPOINT_PX = 6.0
 """Distance at which a key point counts a quarter (Geman-McClure), px of the reduced masks."""
 DEPTH_PAIRS = (
-    (11, 12, 0.04), (23, 24, 0.03), (11, 23, 0.05), (12, 24, 0.05), (11, 13, 0.05), (12, 14, 0.05),
-    (13, 15, 0.12), (14, 16, 0.12), (23, 25, 0.05), (24, 26, 0.05), (25, 27, 0.05), (26, 28, 0.05),
-    (29, 31, 0.05), (30, 32, 0.05), (7, 8, 0.04), (7, 0, 0.04), (8, 0, 0.04),
+    (11, 12, 0.12), (23, 24, 0.12), (11, 23, 0.15), (12, 24, 0.15), (11, 13, 0.15), (12, 14, 0.15),
+    (13, 15, 0.36), (14, 16, 0.36), (23, 25, 0.15), (24, 26, 0.15), (25, 27, 0.15), (26, 28, 0.15),
+    (29, 31, 0.15), (30, 32, 0.15), (7, 8, 0.04), (7, 0, 0.04), (8, 0, 0.04),
 )  # fmt: skip
 """Key points whose difference in depth is compared, and its standard deviation, metres."""
 ROBUST_DEPTH = 3.0
@@ -143,7 +143,7 @@ class ClipKeypoints:
         return cls(
             pixels=pixels,
             depths_m=depths / _world_scale(track, rest_joints),
-            confidence=np.where(known[:, None], track.visibility[rows] ** 2, 0.0),
+            confidence=np.where(known[:, None], track.visibility[rows], 0.0),
         )
 
 

@@ -24,6 +24,8 @@ OUTLINE_PERSON_PX = 128
 """Height of a person in the reduced masks, px: a pixel is about 1.4 cm."""
 OUTLINE_SKIN_POINTS = 7000
 """Points on the skin: about one per pixel of a person `OUTLINE_PERSON_PX` high."""
+SPLAT_GROWTH_PX = 0.5
+"""How far a splatted silhouette reaches beyond the outline: it has every pixel that is touched."""
 MASK_BORDER_POINTS = 160
 """Points of a mask's border that are compared."""
 SKIN_BORDER_POINTS = 160
@@ -164,6 +166,7 @@ class OutlineModel:
         depth_px, _ = _sample(signed_distance_px(splat_silhouette(points, camera)), pixels)
         outer = np.abs(depth_px) < MAX_RIM_DEPTH_PX
         chosen, pixels = near[outer], pixels[outer]
+        within = depth_px[outer] + SPLAT_GROWTH_PX  # rim points lie a little inside the outline
         if len(chosen) < 16:
             return chosen, _Matches.none()
         some = np.linspace(0, len(chosen), min(SKIN_BORDER_POINTS, len(chosen)), endpoint=False)
@@ -172,8 +175,9 @@ class OutlineModel:
         height, width = mask.distance.shape
         inside = (np.minimum(pixels[some], (width, height) - pixels[some]) > IMAGE_BORDER_PX).all(1)
         some, value, slope = some[inside], value[inside], slope[inside]
+        value = value - within[some]
         _, nearest = KDTree(pixels).query(mask.border)
-        back = ((pixels[nearest] - mask.border) * mask.normals).sum(axis=1)
+        back = ((pixels[nearest] - mask.border) * mask.normals).sum(axis=1) - within[nearest]
         return chosen, _Matches(
             index=np.concatenate([some, nearest]),
             residuals=np.concatenate([value, back]),

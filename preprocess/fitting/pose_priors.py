@@ -44,14 +44,14 @@ MIRRORED_AXES = (1.0, -1.0, -1.0)
 """An axis-angle of a left joint times this is that of the right one."""
 LEFT_PRIORS = {
     1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
-    7: ((0.0, 0.0, 0.0), (0.30, 0.20, 0.15)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
-    13: ((0.0, 0.0, 0.0), (0.05, 0.12, 0.12)), 16: ((0.0, -0.2, -0.9), (0.50, 0.60, 0.70)),
+    7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
+    13: ((0.0, 0.0, 0.0), (0.05, 0.12, 0.12)), 16: ((0.0, -0.2, -0.8), (0.50, 0.60, 0.70)),
     18: ((0.0, -0.35, 0.0), (0.40, 0.70, 0.08)), 20: ((0.0, 0.0, 0.0), (0.25, 0.20, 0.25)),
     22: ((0.0, 0.0, 0.0), (0.02, 0.02, 0.02)),
 }  # fmt: skip
 """Mean and standard deviation of the left joints' axis-angles, radians: hip, knee, ankle, toes,
 collar, shoulder, elbow, wrist, hand."""
-MIDDLE_PRIORS = {3: 0.12, 6: 0.10, 9: 0.10, 12: 0.20, 15: 0.20}
+MIDDLE_PRIORS = {3: 0.08, 6: 0.07, 9: 0.07, 12: 0.20, 15: 0.20}
 """Standard deviation of the axis-angles of spine, neck and head, radians."""
 HINGES = ((4, 0, 1.0), (5, 0, 1.0), (18, 1, -1.0), (19, 1, 1.0))
 """Knees and elbows, the axis that they bend about, and to which side."""
@@ -68,9 +68,12 @@ CHANGES_PER_SECOND = (
 """Standard deviation of how far a joint strays from a steady motion in a second, radians."""
 CHANGE_M = (0.013, 0.013, 0.013)
 """Standard deviation of how far the root strays from a steady motion in a second, metres."""
-FAST_CHANGE = 3.0
-"""Standard deviations of a change between frames at which it counts half (Cauchy): people move
-fast at times."""
+CUT_TURN_RAD = 0.25
+"""Rotation of the root from frame to frame that photographs show, but no film; at it neighbors
+tell a quarter about each other."""
+FAST_CHANGE = 6.0
+"""Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
+people move fast at times."""
 
 
 @runtime_checkable
@@ -146,9 +149,11 @@ class HumanPosePrior:
         before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
         after = ClipPoses(rotations=poses.rotations[1:], translations=poses.translations[1:])
         apart = after.steps_from(before, self._cameras[:-1])
+        turned = np.linalg.norm(apart[:, :3], axis=1)
         apart -= gaussian_filter1d(apart, STEADY_FRAMES, axis=0, mode="nearest")
         size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
-        usual = np.repeat(1.0 / (1.0 + size / FAST_CHANGE**2), 3, axis=1)
+        usual = np.repeat(1.0 / (1.0 + size / FAST_CHANGE**2) ** 2, 3, axis=1)
+        usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2
         equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
 
 
