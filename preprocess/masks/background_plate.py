@@ -1,0 +1,122 @@
+"""What a static camera sees behind the person: a running mean and variance of every pixel's color.
+
+A phone's exposure and white balance drift, so each frame is compared after one gain per channel.
+If too much of the background differs nevertheless, the camera has moved, and the plate starts anew.
+"""
+
+from typing import NamedTuple, final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+MEMORY_FRAMES = 30.0
+"""Length of the running mean, frames."""
+MIN_SEEN_FRAMES = 2.0
+"""Frames in which a pixel must have been background before its color is known."""
+MIN_SPREAD = 6.0
+"""Least standard deviation of a background pixel's color, in levels."""
+CHANGED_DIFFERENCE = 12.0
+"""Difference from the plate, in levels, of a background pixel that has changed."""
+MAX_CHANGED_FRACTION = 0.3
+"""Fraction of changed background pixels from which the camera has moved."""
+STRIDE = 5
+"""Gains are estimated from every n-th row and column."""
+MIN_SAMPLES = 50
+"""Fewest known background pixels from which gains are estimated."""
+
+
+class PlateColors(NamedTuple):
+    """The background at some pixels of a frame.
+
+    Attributes:
+        known: Which of the pixels are known; the others have no row below.
+        mean: Their colors at the frame's exposure, in levels.
+        variance: Variance of a channel.
+    """
+
+    known: Bool[np.ndarray, "pixels"]
+    mean: Float32[np.ndarray, "3 known"]
+    variance: Float32[np.ndarray, "known"]
+
+
+@final
+class BackgroundPlate:
+    """Mean and variance of the background's colors, per pixel of a frame."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._mean = np.zeros((3, 0, 0), np.float32)
+        self._variance = self._frames = np.zeros((0, 0), np.float32)
+        self._gain = np.ones(3, np.float32)
+
+    def align(
+        self,
+        image: Float32[np.ndarray, "3 height width"],
+        background: Bool[np.ndarray, "height width"],
+    ) -> None:
+        """Estimate the frame's gains; forget everything if the camera has moved.
+
+        Args:
+            image: The frame's channels, in levels; another size than before rescales the plate.
+            background: Pixels that are surely background.
+        """
+        self._gain = np.ones(3, np.float32)
+        self._rescale(background.shape)
+        some = np.s_[::STRIDE, ::STRIDE]
+        known = background[some] & (self._frames[some] >= MIN_SEEN_FRAMES)
+        if known.sum() < MIN_SAMPLES:
+            return
+        seen, before = (each[:, ::STRIDE, ::STRIDE][:, known] for each in (image, self._mean))
+        alike = np.ones(seen.shape[1], dtype=bool)
+        for _ in range(2):  # again without what does not fit
+            total = np.maximum((before[:, alike] ** 2).sum(axis=1), np.float32(1.0))
+            self._gain = (seen[:, alike] * before[:, alike]).sum(axis=1) / total
+            alike = np.abs(seen - self._gain[:, None] * before).max(axis=0) < CHANGED_DIFFERENCE
+            if alike.mean() < 1.0 - MAX_CHANGED_FRACTION:
+                self._frames[:] = 0.0
+                self._gain = np.ones(3, np.float32)
+                return
+
+    def at(
+        self, rows: Int[np.ndarray, "pixels"], columns: Int[np.ndarray, "pixels"]
+    ) -> PlateColors:
+        """The background at some pixels of the aligned frame."""
+        index = rows * self._frames.shape[1] + columns
+        frames = self._frames.ravel()[index]
+        known = frames >= MIN_SEEN_FRAMES
+        index, frames = index[known], frames[known]
+        # The mean of a few frames is uncertain itself.
+        variance = np.maximum(self._variance.ravel()[index], np.float32(MIN_SPREAD**2))
+        variance *= np.float32(1.0) + np.float32(2.0) / frames
+        mean = np.stack([plane.ravel()[index] for plane in self._mean])
+        return PlateColors(known, mean * self._gain[:, None], variance)
+
+    def update(
+        self,
+        image: Float32[np.ndarray, "3 height width"],
+        background: Bool[np.ndarray, "height width"],
+    ) -> None:
+        """Average the sure background of the aligned frame into the plate."""
+        self._frames += background
+        share = background / np.clip(self._frames, np.float32(1.0), np.float32(MEMORY_FRAMES))
+        squared = np.zeros_like(self._variance)
+        for seen, mean, gain in zip(image, self._mean, self._gain, strict=True):
+            off = seen / gain - mean
+            mean += off * share
+            squared += off * off
+        # Welford 1962: the variance takes the squared deviation across the old and the new mean.
+        squared *= (np.float32(1.0) - share) / np.float32(3.0)
+        self._variance += share * (squared - self._variance)
+
+    def _rescale(self, shape: tuple[int, int]) -> None:
+        """Change the plate's resolution; an empty one is made."""
+        if self._frames.shape == shape:
+            return
+        if not self._frames.size:
+            self._mean = np.zeros((3, *shape), np.float32)
+            self._variance, self._frames = np.zeros((2, *shape), np.float32)
+            return
+        planes = (*self._mean, self._variance, self._frames)
+        scaled = [np.asarray(cv2.resize(each, shape[::-1]), np.float32) for each in planes]
+        self._mean, self._variance, self._frames = np.stack(scaled[:3]), scaled[3], scaled[4]

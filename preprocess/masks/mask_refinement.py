@@ -1,0 +1,319 @@
+"""Sharp masks from a tracker's soft ones: what the network saw, joined with the frame's colors.
+
+The network's mask is coarse: a pixel of its square is several of the frame, fingers and the gap
+between arm and trunk are lost. It is right at large, though, so only a band around its border is
+decided anew, by Bayes' rule: the network's probability is the prior; the likelihoods are those of
+a pixel's color under the colors of person and background nearby, under the histograms of both, and,
+where a static camera has seen it, under the background itself (`BackgroundPlate`). A guided filter
+makes neighbors of like color agree and carries the result to full size.
+"""
+
+from typing import NamedTuple, final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+from preprocess.masks.background_plate import BackgroundPlate, PlateColors
+from preprocess.masks.guided_filter import apply_coefficients, guided_coefficients
+from preprocess.tracking.keypoints import CroppedMask
+
+WORKING_SCALE = 2.0
+"""Pixels of the working image for each pixel of the network's square, about; the working image is
+the frame, or smaller by a whole number."""
+RESCALE_MARGIN = 0.4
+"""How far that number must be from the best before it changes."""
+
+OUTER_BAND, INNER_BAND = 7.0, 6.0
+"""Reach of the band outside and inside the mask's border, in the network's pixels."""
+MARGIN = 4.0
+"""Width of the background beyond the band that is looked at, in the network's pixels."""
+SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
+"""Probability, and distance from the border, of pixels that teach the person's colors."""
+SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
+"""The same of pixels that teach the background's colors."""
+
+LOCAL_SIGMA = 3.0
+"""Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
+LOCAL_SPREAD = 14.0
+"""Standard deviation of a color that the neighborhood's mean misses, in levels."""
+UNSEEN = 0.005
+"""Density of a color that no neighbor has, relative to `REFERENCE_SPREAD`."""
+REFERENCE_SPREAD = 16.0
+"""Standard deviation, in levels, at whose peak a density is 1."""
+UNSEEN_BACKGROUND = 0.00025
+"""The same where the background is known."""
+SHADOW_GAIN = 0.6, 1.05
+"""Range of the factors by which the person's shadow and reflected light change the background."""
+SHADOW_PROBABILITY = 0.1
+"""Probability that a background pixel is shaded or lit by the person."""
+
+LOCAL_WEIGHT, PLATE_WEIGHT, HISTOGRAM_WEIGHT = 0.5, 2.0, 0.75
+"""Weights of the three log likelihood ratios."""
+MAX_LOG_RATIO = 8.0
+"""Bound of their sum."""
+HISTOGRAM_MEMORY = 0.9
+"""Share of earlier frames in the histograms."""
+
+FILTER_RADIUS_PX = 3
+"""Radius of the guided filter's windows in the working image, px."""
+FILTER_TOLERANCE = 5.0
+"""Standard deviation of colors, in levels, that the guided filter does not follow."""
+CONTRAST = 3.0
+"""Steepening of the filtered mask around 1/2."""
+PERSON_FREE_ALPHA = 0.05
+"""Alpha below which a pixel enters the background plate."""
+
+Plane = Float32[np.ndarray, "height width"]
+Channels = Float32[np.ndarray, "3 height width"]
+PixelMask = Bool[np.ndarray, "height width"]
+Pixels = Float32[np.ndarray, "pixels"]
+
+
+class _Band(NamedTuple):
+    """The part of a working image around the person, and what the network says of it.
+
+    Attributes:
+        image: The three channels, in levels.
+        corner: Row and column of its first pixel in the working image.
+        prior: The network's probability of person.
+        inside: Pixels that are more likely person.
+        person, background: Pixels that are surely so, for learning colors.
+        rows, columns: The pixels of the band.
+        colors: Their colors, in levels.
+    """
+
+    image: Channels
+    corner: tuple[int, int]
+    prior: Plane
+    inside: PixelMask
+    person: PixelMask
+    background: PixelMask
+    rows: Int[np.ndarray, "pixels"]
+    columns: Int[np.ndarray, "pixels"]
+    colors: Float32[np.ndarray, "3 pixels"]
+
+
+@final
+class MaskRefiner:
+    """Refines the masks of one person in the frames of one camera, in their order."""
+
+    def __init__(self, frame_px: tuple[int, int]) -> None:
+        """Start without knowledge of background and person.
+
+        Args:
+            frame_px: Width and height of the frames.
+        """
+        self._frame_px = frame_px
+        self._plate = BackgroundPlate()
+        self._reduction = 0
+        self._histograms = np.zeros((2, 16**3), np.float32)
+
+    def __call__(
+        self,
+        rgb: UInt8[np.ndarray, "rows columns 3"],
+        mask: CroppedMask,
+        size_px: tuple[int, int] | None = None,
+    ) -> Plane:
+        """Refine the mask of the next frame.
+
+        Args:
+            rgb: The frame.
+            mask: The tracker's mask.
+            size_px: Width and height of the result; None for the frame's.
+
+        Returns:
+            How far each pixel is person, in [0, 1].
+        """
+        alpha = self._refine(rgb, mask)
+        if size_px is None or size_px == self._frame_px:
+            return alpha
+        way = cv2.INTER_AREA if size_px[0] < self._frame_px[0] else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(alpha, size_px, interpolation=way), np.float32)
+
+    def _refine(self, rgb: UInt8[np.ndarray, "rows columns 3"], mask: CroppedMask) -> Plane:
+        square_px = float(np.hypot(*mask.image_from_crop[:, 0]))
+        best = square_px / WORKING_SCALE
+        if abs(self._reduction - best) > 0.5 + RESCALE_MARGIN or not self._reduction:
+            self._reduction = max(1, round(best))
+        times = self._reduction
+        working_px = self._frame_px[0] // times, self._frame_px[1] // times
+        whole_px = working_px[0] * times, working_px[1] * times  # a frame's last pixels may be cut
+        small = rgb[: whole_px[1], : whole_px[0]]
+        if times > 1:
+            small = cv2.resize(small, working_px, interpolation=cv2.INTER_AREA)
+        image = np.stack(cv2.split(small)).astype(np.float32)
+        band, far = _find_band(image, mask.resample(whole_px, working_px), square_px / times)
+        self._plate.align(image, far)
+        found = np.zeros(self._frame_px[::-1], np.float32)
+        if band is not None:
+            alpha = self._decide(band, square_px / times)
+            fitted = guided_coefficients(band.image, alpha, FILTER_RADIUS_PX, FILTER_TOLERANCE)
+            (top, left), (height, width) = band.corner, alpha.shape
+            filtered = apply_coefficients(band.image, fitted)
+            person = filtered > PERSON_FREE_ALPHA
+            kernel = np.ones((5, 5), np.uint8)
+            far[top : top + height, left : left + width] = (
+                cv2.dilate(person.astype(np.uint8), kernel) == 0
+            )
+            there = np.s_[
+                top * times : (top + height) * times, left * times : (left + width) * times
+            ]
+            found[there] = _enlarge(rgb[there], fitted, times)
+        self._plate.update(image, far)
+        return found
+
+    def _decide(self, band: _Band, unit_px: float) -> Plane:
+        """Probability of person in the band, and 0 or 1 beyond it."""
+        front, back = _local_densities(band, LOCAL_SIGMA * unit_px)
+        ratio = np.float32(LOCAL_WEIGHT) * np.log(front / back)
+        plate = self._plate.at(band.rows + band.corner[0], band.columns + band.corner[1])
+        behind = _plate_density(band.colors[:, plate.known], plate)
+        ratio[plate.known] = np.float32(PLATE_WEIGHT) * np.log(front[plate.known] / behind)
+        ratio += np.float32(HISTOGRAM_WEIGHT) * self._histogram_ratio(band)
+        at = band.rows, band.columns
+        prior = np.clip(band.prior[at], np.float32(0.01), np.float32(0.99))
+        odds = prior / (np.float32(1.0) - prior)
+        odds *= np.exp(np.clip(ratio, np.float32(-MAX_LOG_RATIO), np.float32(MAX_LOG_RATIO)))
+        alpha = band.inside.astype(np.float32)
+        alpha[at] = odds / (np.float32(1.0) + odds)
+        return alpha
+
+    def _histogram_ratio(self, band: _Band) -> Pixels:
+        """Log ratio of the colors' frequencies on the person and around them."""
+        some = np.s_[::2, ::2]
+        bins = _color_bins(band.image[:, ::2, ::2])
+        now = np.stack(
+            [
+                np.bincount(bins[each[some]], minlength=16**3)
+                for each in (band.person, band.background)
+            ]
+        ).astype(np.float32)
+        kept = np.float32(HISTOGRAM_MEMORY) if self._histograms.any() else np.float32(0.0)
+        self._histograms = kept * self._histograms + (np.float32(1.0) - kept) * now
+        total = np.maximum(self._histograms.sum(axis=1, keepdims=True), np.float32(1e-3))
+        front, back = self._histograms / total + np.float32(1e-4)
+        return np.log(front / back)[_color_bins(band.colors)]
+
+
+def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | None, PixelMask]:
+    """The band around a soft mask's border, and the pixels beyond it.
+
+    Args:
+        image: The working image's channels.
+        soft: The network's mask of it.
+        unit_px: Edge of the network's pixel in it, px.
+    """
+    far = np.ones(soft.shape, dtype=bool)
+    left, top, width, height = cv2.boundingRect((soft > 0.5).astype(np.uint8))
+    if not width:
+        return None, far
+    margin = int((OUTER_BAND + MARGIN) * unit_px) + 1
+    top, bottom = max(top - margin, 0), min(top + height + margin, soft.shape[0])
+    left, right = max(left - margin, 0), min(left + width + margin, soft.shape[1])
+    around = np.s_[top:bottom, left:right]
+    prior = np.ascontiguousarray(soft[around])
+    inside = prior > 0.5
+    hard = inside.astype(np.uint8)
+    out = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 3)
+    depth = cv2.distanceTransform(hard, cv2.DIST_L2, 3)
+    far[around] = beyond = out > OUTER_BAND * unit_px
+    deep = depth > INNER_BAND * unit_px
+    rows, columns = np.nonzero(~(beyond | deep))
+    part = np.ascontiguousarray(image[:, top:bottom, left:right])
+    index = rows * part.shape[2] + columns
+    return _Band(
+        image=part,
+        corner=(top, left),
+        prior=prior,
+        inside=inside,
+        person=deep | ((prior > SURE_PERSON) & (depth > SURE_PERSON_DEPTH * unit_px)),
+        background=beyond
+        | ((prior < SURE_BACKGROUND) & (out > SURE_BACKGROUND_DISTANCE * unit_px)),
+        rows=rows,
+        columns=columns,
+        colors=np.stack([plane.ravel()[index] for plane in part]),
+    ), far
+
+
+def _density(squared: Pixels, variance: Pixels) -> Pixels:
+    """Density of a color at a squared distance from its mean, relative to the reference peak."""
+    ratio = np.float32(REFERENCE_SPREAD**2) / variance
+    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
+
+
+def _local_densities(band: _Band, sigma_px: float) -> tuple[Pixels, Pixels]:
+    """Density of the band's colors among the sure colors of person and of background near each.
+
+    Means and variances are those of the image of half the size.
+    """
+    height, width = band.inside.shape
+    half_px = max(width // 2, 1), max(height // 2, 1)
+    planes = [cv2.resize(each, half_px, interpolation=cv2.INTER_AREA) for each in band.image]
+    planes.append(planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2)
+    rows = np.minimum(band.rows // 2, half_px[1] - 1)
+    index = rows * half_px[0] + np.minimum(band.columns // 2, half_px[0] - 1)
+
+    def density(chosen: PixelMask) -> Pixels:
+        share = cv2.resize(chosen.astype(np.float32), half_px, interpolation=cv2.INTER_AREA)
+        share = (share > 0.99).astype(np.float32)
+        weight, *moments = (
+            cv2.GaussianBlur(each * share, (0, 0), sigma_px / 2.0).ravel()[index]
+            for each in (np.ones_like(share), *planes)
+        )
+        inverse = np.float32(1.0) / np.maximum(weight, np.float32(1e-6))
+        variance, squared = moments[3] * inverse, np.zeros_like(weight)
+        for color, moment in zip(band.colors, moments, strict=False):
+            mean = moment * inverse
+            variance -= mean * mean
+            squared += (color - mean) ** 2
+        variance = np.maximum(variance, np.float32(0.0)) / np.float32(3.0)
+        near = _density(squared, variance + np.float32(LOCAL_SPREAD**2))
+        near[weight < 1e-3] = 0.0
+        return near + np.float32(UNSEEN)
+
+    return density(band.person), density(band.background)
+
+
+def _plate_density(colors: Float32[np.ndarray, "3 pixels"], plate: PlateColors) -> Pixels:
+    """Density of colors where the background is known, as it is or in the person's shadow.
+
+    A shadow has the background's color, only darker (Horprasert et al. 1999, a statistical approach
+    for background subtraction and shadow detection).
+    """
+    mean = plate.mean
+    dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
+    length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
+    gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
+    plain, shaded = np.zeros((2, len(dot)), np.float32)
+    for color, expected in zip(colors, mean, strict=True):
+        plain += (color - expected) ** 2
+        shaded += (color - gain * expected) ** 2
+    return (
+        np.float32(1.0 - SHADOW_PROBABILITY) * _density(plain, plate.variance)
+        + np.float32(SHADOW_PROBABILITY) * _density(shaded, plate.variance)
+        + np.float32(UNSEEN_BACKGROUND)
+    )
+
+
+def _color_bins(colors: Float32[np.ndarray, "3 *pixels"]) -> Int[np.ndarray, "*pixels"]:
+    """Number of each color's bin of 16 x 16 x 16."""
+    red, green, blue = colors.astype(np.int32) >> 4
+    return (red << 8) | (green << 4) | blue
+
+
+def _enlarge(
+    rgb: UInt8[np.ndarray, "rows columns 3"],
+    coefficients: Float32[np.ndarray, "4 height width"],
+    times: int,
+) -> Float32[np.ndarray, "rows columns"]:
+    """The mask at full size: the filter's enlarged coefficients, applied to the frame."""
+    size_px = rgb.shape[1], rgb.shape[0]
+
+    def full(plane: Plane) -> Float32[np.ndarray, "rows columns"]:
+        return plane if times == 1 else cv2.resize(plane, size_px)
+
+    alpha = np.float32(CONTRAST) * full(coefficients[3]) + np.float32(0.5 - 0.5 * CONTRAST)
+    for channel, slope in zip(cv2.split(np.ascontiguousarray(rgb)), coefficients, strict=False):
+        alpha += cv2.multiply(channel, full(slope), scale=CONTRAST, dtype=cv2.CV_32F)
+    return np.clip(alpha, np.float32(0.0), np.float32(1.0))

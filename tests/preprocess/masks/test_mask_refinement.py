@@ -1,0 +1,123 @@
+"""Refined masks: finer than the network's, better still before a static background."""
+
+import cv2
+import numpy as np
+import pytest
+
+from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.tracking.keypoints import CroppedMask
+
+SIZE_PX = 160, 240
+SQUARE_PX = 3.75
+"""Frame pixels for each of 64 pixels of the network's square."""
+COLOR = np.array([150.0, 60.0, 50.0])
+"""The person's."""
+
+
+def _background(seed: int) -> np.ndarray:
+    """A wall of coarse and fine texture; a third of it has nearly the person's color."""
+    generator = np.random.default_rng(seed)
+    coarse = generator.uniform(70.0, 190.0, (12, 8, 3)).astype(np.float32)
+    alike = generator.random((12, 8)) < 0.33
+    coarse[alike] = COLOR + generator.normal(0.0, 25.0, (int(alike.sum()), 3))
+    fine = generator.normal(0.0, 6.0, (SIZE_PX[1], SIZE_PX[0], 3)).astype(np.float32)
+    return cv2.resize(coarse, SIZE_PX, interpolation=cv2.INTER_CUBIC) + fine
+
+
+def _person(shift_px: int) -> np.ndarray:
+    """A trunk with a head, two legs and a thin arm held out."""
+    shape = np.zeros(SIZE_PX[::-1], np.uint8)
+    middle = 80 + shift_px
+    cv2.ellipse(shape, (middle, 110), (22, 45), 0, 0, 360, 255, -1)
+    cv2.circle(shape, (middle, 50), 16, 255, -1)
+    for side in (-1, 1):
+        cv2.line(shape, (middle + side * 11, 140), (middle + side * 16, 215), 255, 13)
+    cv2.line(shape, (middle + 14, 80), (middle + 50, 125), 255, 5)
+    return cv2.GaussianBlur(shape.astype(np.float32) / 255.0, (0, 0), 0.7)
+
+
+def _frame(shift_px: int, background: np.ndarray) -> tuple[np.ndarray, CroppedMask, np.ndarray]:
+    """A frame, what a coarse network says of it, and the exact mask."""
+    truth = _person(shift_px)
+    rows = np.arange(SIZE_PX[1])[:, None, None]
+    color = COLOR + 25.0 * np.sin(rows / 4.0)
+    rgb = truth[..., None] * color + (1.0 - truth[..., None]) * background
+    rgb = rgb + np.random.default_rng(shift_px + 100).normal(0.0, 3.0, rgb.shape)
+    square = np.zeros((240, 240), np.float32)
+    square[:, 40:200] = cv2.GaussianBlur(truth, (0, 0), 4.0)
+    values = cv2.resize(square, (64, 64), interpolation=cv2.INTER_AREA)
+    mask = CroppedMask(
+        values=np.round(255.0 * values).astype(np.uint8),
+        image_from_crop=np.array([[SQUARE_PX, 0.0, -40.0], [0.0, SQUARE_PX, 0.0]]),
+    )
+    return np.clip(rgb, 0.0, 255.0).astype(np.uint8), mask, truth
+
+
+def _iou(alpha: np.ndarray, truth: np.ndarray) -> float:
+    found, true = alpha > 0.5, truth > 0.5
+    return float((found & true).sum() / (found | true).sum())
+
+
+def _refine_clip(backgrounds: list[np.ndarray]) -> tuple[float, float]:
+    """IoU of the network's masks and of the refined ones over the later half of a clip."""
+    refiner, soft, refined = MaskRefiner(SIZE_PX), [], []
+    for number, background in enumerate(backgrounds):
+        rgb, mask, truth = _frame((number % 8 - 4) * 5, background)
+        soft.append(_iou(mask.resample(SIZE_PX, SIZE_PX), truth))
+        refined.append(_iou(refiner(rgb, mask), truth))
+    half = len(soft) // 2
+    return float(np.mean(soft[half:])), float(np.mean(refined[half:]))
+
+
+def test_single_frame_gains_from_the_colors_nearby() -> None:
+    """One frame is enough to be finer than the network."""
+    rgb, mask, truth = _frame(0, _background(1))
+    alpha = MaskRefiner(SIZE_PX)(rgb, mask)
+    assert alpha.dtype == np.float32
+    assert alpha.min() >= 0.0
+    assert alpha.max() <= 1.0
+    assert _iou(alpha, truth) > _iou(mask.resample(SIZE_PX, SIZE_PX), truth) + 0.01
+
+
+def test_static_background_gains_more_than_a_changing_one() -> None:
+    """What a static camera has seen decides; another background in each frame does no harm."""
+    soft, static = _refine_clip([_background(1)] * 16)
+    _, moving = _refine_clip([_background(seed) for seed in range(16)])
+    assert static > moving + 0.005
+    assert moving > soft + 0.005
+
+
+def test_exposure_that_drifts_leaves_the_background_known() -> None:
+    """A phone's exposure changes by the frame, by channels of their own."""
+    gains = 1.0 + 0.12 * np.sin(np.arange(16)[:, None] * np.array([0.7, 0.9, 1.1]))
+    _, steady = _refine_clip([_background(1)] * 16)
+    _, drifting = _refine_clip([_background(1) * gain for gain in gains])
+    assert drifting > steady - 0.01
+
+
+@pytest.mark.parametrize("size_px", [(80, 120), (160, 240), (240, 360)])
+def test_any_size(size_px: tuple[int, int]) -> None:
+    """The mask comes in the size that is wanted, and covers the same part of the picture."""
+    rgb, mask, truth = _frame(0, _background(1))
+    alpha = MaskRefiner(SIZE_PX)(rgb, mask, size_px)
+    assert alpha.shape == size_px[::-1]
+    assert alpha.mean() == pytest.approx(truth.mean(), rel=0.03)
+
+
+def test_large_frames_are_decided_at_a_smaller_size() -> None:
+    """A frame of odd size is reduced by a whole number; the mask stays where the person is."""
+    rgb, mask, truth = _frame(0, _background(1))
+    size_px = SIZE_PX[0] * 3 + 1, SIZE_PX[1] * 3 + 1
+    scale = np.array(size_px) / np.array(SIZE_PX)
+    rgb = cv2.resize(rgb, size_px, interpolation=cv2.INTER_LINEAR)
+    large = CroppedMask(values=mask.values, image_from_crop=mask.image_from_crop * scale[:, None])
+    refined = MaskRefiner(size_px)(rgb, large)
+    truth = cv2.resize(truth, size_px)
+    assert _iou(refined, truth) > _iou(large.resample(size_px, size_px), truth) + 0.01
+
+
+def test_frame_without_a_person_gives_an_empty_mask() -> None:
+    """Where the network sees nobody there is no mask, and the background is learnt."""
+    rgb, mask, _ = _frame(0, _background(1))
+    empty = CroppedMask(values=np.zeros_like(mask.values), image_from_crop=mask.image_from_crop)
+    assert not MaskRefiner(SIZE_PX)(rgb, empty).any()
