@@ -25,7 +25,8 @@ class CaptureFit:
         coefficients: Proportions, in prior standard deviations.
         focal_factor: Factor of the focal lengths.
         corrections: Correction of each row of the motion: root and joint rotations, root position.
-        error_before_cm: Root mean square distance between outlines of body and masks, cm.
+        error_before_cm: Root mean square distance between outlines of body and masks, cm; of poses
+            that were made of key points: after a fit to these alone.
         error_after_cm: The same with the changes.
         taken: Whether the changes are made; poses that are exact are left alone.
         fits_body: Whether proportions could change; not those of a finished avatar's person.

@@ -32,11 +32,11 @@ MIN_ITERATIONS = 6
 """Fewest Gauss-Newton iterations; the first ones may overshoot."""
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
-TRACKED_KEY_FRAMES = 80
+TRACKED_KEY_FRAMES = 60
 """The same for poses that were made of key points, which tell the poses between them."""
 KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
-TRACKED_ITERATIONS = (3, 5)
+TRACKED_ITERATIONS = (4, 5)
 """Fewest and most iterations with outlines after that."""
 SIGMA_LOG_ASSUMED_FOCAL = 0.3
 """Prior standard deviation of the logarithm of a focal length that is merely assumed."""
@@ -109,20 +109,18 @@ def fit_capture(
     fitter = make_fitter(capture, keypoints)
     if fitter is None:
         return None
-    before = fitter.error_px()
-    focal = not capture.cameras.is_moving
-    everything = FitParameters(proportions=fit_body, focal=focal)
+    everything = FitParameters(proportions=fit_body, focal=not capture.cameras.is_moving)
+    errors: list[float] = []
     if tracked:
-        explained = np.inf
         for _ in range(KEYPOINT_ITERATIONS):
             fitter.iterate(everything._replace(outlines=False))
-        _iterate_until_settled(fitter, everything, TRACKED_ITERATIONS)
     else:
-        for _ in range(PROPORTION_ITERATIONS):
-            fitter.iterate(everything._replace(poses=False))
-        explained = fitter.error_px()
-        _iterate_until_settled(fitter, everything, (MIN_ITERATIONS, MAX_ITERATIONS))
-    after = fitter.error_px()
+        alone = everything._replace(poses=False)
+        errors = [fitter.iterate(alone) for _ in range(PROPORTION_ITERATIONS)]
+    settling = _iterate_until_settled(
+        fitter, everything, TRACKED_ITERATIONS if tracked else (MIN_ITERATIONS, MAX_ITERATIONS)
+    )
+    before, explained, after = (errors or settling)[0], settling[0], settling[-1]
     corrections = fitter.corrections
     turned = np.degrees(np.linalg.norm(corrections[:, :3], axis=1).mean())
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
@@ -139,14 +137,19 @@ def fit_capture(
 
 def _iterate_until_settled(
     fitter: ClipFitter, fitted: FitParameters, bounds: tuple[int, int]
-) -> None:
-    """Iterates until the error hardly decreases, between a fewest and a most times."""
+) -> list[float]:
+    """Iterates until the error hardly decreases, between a fewest and a most times.
+
+    Returns:
+        The error before each iteration.
+    """
     errors: list[float] = []
     while len(errors) < bounds[1]:
         errors.append(fitter.iterate(fitted))
         settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
         if len(errors) >= bounds[0] and settled:
             break
+    return errors
 
 
 def make_fitter(capture: Capture, keypoints: KeypointTrack | None = None) -> ClipFitter | None:

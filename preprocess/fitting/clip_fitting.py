@@ -169,11 +169,13 @@ class ClipFitter:
         """The evidence's equations in prior standard deviations; the outlines' error, px."""
         equations = ChainEquations.empty(len(self.frames), 75, len(self.coefficients) + 1)
         squares = total = 0.0
+        rest, parents = self.model.joints, self.model.space.shaped.body.parents
+        carried = self.poses.joints(rest, parents).world_from_rest(rest)
         for index, frame in enumerate(self.frames):
             if frame.mask is None or not outlines:
                 continue
             mask = replace(frame.mask, camera=self.camera(index))
-            seen = self.model.compare(self.pose(index), mask)
+            seen = self.model.compare(carried[index], mask)
             if seen is None:
                 continue
             weight = seen.weights * (INDEPENDENT_ROWS / SIGMA_OUTLINE_PX**2 / len(seen.weights))

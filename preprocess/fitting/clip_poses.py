@@ -24,6 +24,15 @@ class PosedJoints(NamedTuple):
     turns: Float[np.ndarray, "frames 24 3 3"]
     places: Float[np.ndarray, "frames 24 3"]
 
+    def world_from_rest(
+        self, rest_joints: Float[np.ndarray, "24 3"]
+    ) -> Float[np.ndarray, "frames 24 4 4"]:
+        """Transforms that carry points of the rest pose with their joints."""
+        found = np.zeros((*self.places.shape[:2], 4, 4))
+        found[..., :3, :3], found[..., 3, 3] = self.turns, 1.0
+        found[..., :3, 3] = self.places - (self.turns @ rest_joints[..., None])[..., 0]
+        return found
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClipPoses:

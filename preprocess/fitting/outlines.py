@@ -115,9 +115,15 @@ class OutlineModel:
         normals = self._skin.interpolate(vertex_normals(shaped.vertices, shaped.body.faces))
         self._normals = normals.astype(np.float32)
 
-    def compare(self, pose: BodyPose, mask: OutlineDistances) -> OutlineRows | None:
-        """Residuals of a pose before a mask; None where the silhouette cannot be compared."""
-        transforms = self._world_from_rest(pose)
+    def compare(
+        self, transforms: Float[np.ndarray, "24 4 4"], mask: OutlineDistances
+    ) -> OutlineRows | None:
+        """Residuals of a pose before a mask; None where the silhouette cannot be compared.
+
+        Args:
+            transforms: The pose, as `world_from_rest` gives it.
+            mask: Outline of the mask.
+        """
         points, normals = self._posed(transforms)
         chosen, matched = self._match(points, normals, mask)
         if not len(matched.normals):
@@ -127,7 +133,7 @@ class OutlineModel:
 
     def silhouette(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
         """The pixels that the person covers."""
-        return splat_silhouette(self._posed(self._world_from_rest(pose))[0], camera)
+        return splat_silhouette(self._posed(self.world_from_rest(pose))[0], camera)
 
     def _posed(
         self, transforms: Float[np.ndarray, "24 4 4"]
@@ -141,7 +147,8 @@ class OutlineModel:
             normals += blended[:, :, axis] * self._normals[:, axis, None]
         return points, normals
 
-    def _world_from_rest(self, pose: BodyPose) -> Float[np.ndarray, "24 4 4"]:
+    def world_from_rest(self, pose: BodyPose) -> Float[np.ndarray, "24 4 4"]:
+        """Joint transforms of a pose, for the present proportions."""
         turns = np.concatenate([pose.root_rotation[None], pose.joint_rotations])
         found = joint_transforms(
             self.joints, self.space.shaped.body.parents, rotation_matrices(turns)

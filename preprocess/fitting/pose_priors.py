@@ -62,8 +62,8 @@ SIGMA_FREE = 30.0
 STEADY_FRAMES = 5.0
 """Standard deviation of the frames over which a motion is nearly steady."""
 CHANGES_PER_SECOND = (
-    (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.055, (1, 2, 4, 5)),
-    (0.045, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.09, (16, 17, 18, 19)),
+    (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.07, (1, 2, 4, 5)),
+    (0.05, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.11, (16, 17, 18, 19)),
 )  # fmt: skip
 """Standard deviation of how far a joint strays from a steady motion in a second, radians."""
 CHANGE_M = (0.013, 0.013, 0.013)

@@ -52,7 +52,7 @@ def project_rows(model, rows, weights, rest, pose, camera) -> np.ndarray:
 
 
 def test_a_body_fits_its_own_outline_within_a_pixel(model):
-    seen = model.compare(a_pose(), mask_of(model, a_pose()))
+    seen = model.compare(model.world_from_rest(a_pose()), mask_of(model, a_pose()))
     assert np.abs(np.median(seen.residuals)) < 0.5
     assert np.percentile(np.abs(seen.residuals), 90) < 1.5
 
@@ -62,7 +62,7 @@ def test_a_shift_across_the_view_shows_in_the_residuals(model):
     moved = replace(
         a_pose(), root_translation=a_pose().root_translation + np.array([shift_m, 0.0, 0.0])
     )
-    seen = model.compare(moved, mask)
+    seen = model.compare(model.world_from_rest(moved), mask)
     found = np.linalg.lstsq(
         seen.pose_jacobian[:, 72:73] * seen.weights[:, None],
         seen.residuals * seen.weights,
@@ -94,7 +94,7 @@ def test_the_jacobian_of_a_pose_is_that_of_projected_skin(model, parameter):
 def linearise_at(model, pose, chosen, normals):
     from preprocess.fitting.outlines import _Matches
 
-    transforms = model._world_from_rest(pose)
+    transforms = model.world_from_rest(pose)
     blended = np.einsum("rj,jab->rab", model._weights[chosen], transforms[:, :3])
     points = np.einsum("rab,rb->ra", blended[:, :, :3], model._rest[chosen]) + blended[:, :, 3]
     matches = _Matches(np.arange(len(chosen)), np.zeros(len(chosen)), normals)
