@@ -212,7 +212,8 @@ def _in_turn(training: Sequence[PosedView], tiers: int, num_views: int) -> list[
     """Deal pictures out to tiers, so that each gets some of every view, from which they follow."""
     parts: list[list[PosedView]] = [[] for _ in range(tiers)]
     for turn, view in enumerate(training):
-        parts[(turn + turn // num_views) % tiers].append(view)
+        rounds = 0 if num_views % tiers else turn // num_views
+        parts[(turn + rounds) % tiers].append(view)
     return parts
 
 

@@ -4,6 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from capture.camera import Camera
+from export.bake import fine_tuning
 from export.bake.bake_tables import (
     BRICK_BYTES,
     THICK_FAINT_FRACTION,
@@ -18,6 +20,7 @@ from export.package.package_file import read_package
 from export.package.render_settings import QUALITY_TIERS, THICK_FIELD_TIERS
 from export.reference.compositor import VoxelCodes, back_project, composite_segments
 from export.reference.reference_player import PlayerInputs, draw_reference, trace_picture
+from preprocess.body.body_pose import BodyPose
 
 SETTINGS = QUALITY_TIERS["hq"]
 
@@ -266,3 +269,16 @@ def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
     assert {tier: each.settings for tier, each in thick.manifest.tiers.items()} == (
         {tier: THICK_FIELD_TIERS[tier] for tier in thick.manifest.tiers}
     )
+
+
+@pytest.mark.parametrize("num_views", [1, 2, 3, 4])
+def test_each_tier_gets_pictures_of_every_view(num_views):
+    cameras = [
+        Camera.from_intrinsic(np.diag([100.0 + number, 100.0, 1.0]), (64, 64))
+        for number in range(num_views)
+    ]
+    training = [(BodyPose.rest(), cameras[number % num_views]) for number in range(12)]
+    parts = fine_tuning._in_turn(training, 2, num_views)
+    for part in parts:
+        assert {camera.focal_px[0] for _, camera in part} == {c.focal_px[0] for c in cameras}
+    assert abs(len(parts[0]) - len(parts[1])) <= 1
