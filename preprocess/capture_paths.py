@@ -81,25 +81,49 @@ def find_capture_paths(
         if not path.exists():
             raise InputError(f"{path} does not exist; check the path.")
     if poses is None:
-        poses = _first_existing([video], POSE_FILE_NAMES)
+        poses = find_own_poses(video)
     if poses is None:
         beside = _first_existing([video.parent], POSE_FILE_NAMES)
         there = "" if beside is None else f" {beside} lies beside it: is it meant?"
         raise InputError(
             f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
-            f"tracker wrote: docs/formats.md).{there} Finding poses in the video is a tracker's "
-            "work."
+            f"tracker wrote: docs/formats.md).{there} ia-track finds poses in a video."
         )
-    inside = video.is_dir() and video.name != "images"
-    places = [video if inside else video.parent, poses.parent]
     if cameras is None:
-        cameras = _first_existing(places, CAMERA_NAMES)
+        cameras = find_own_cameras(video, poses)
     return CapturePaths(
         video=video,
         poses=poses,
-        masks=masks or _first_existing(places, MASK_NAMES),
+        masks=masks or find_own_masks(video, poses),
         cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
     )
+
+
+def find_own_poses(video: Path) -> Path | None:
+    """The poses in a capture folder; None if there are none, or `video` is no folder."""
+    return _first_existing([video], POSE_FILE_NAMES)
+
+
+def find_own_masks(video: Path, poses: Path | None = None) -> Path | None:
+    """The masks in a capture folder, beside a video, or beside its poses; None without any."""
+    return _first_existing(_places_of_parts(video, poses), MASK_NAMES)
+
+
+def find_own_cameras(video: Path, poses: Path | None = None) -> Path | None:
+    """The cameras in a capture folder, beside a video, or beside its poses; None without any."""
+    return _first_existing(_places_of_parts(video, poses), CAMERA_NAMES)
+
+
+def find_live_poses(folder: Path) -> Path | None:
+    """The poses in a folder to which a live source is written; None if there are none yet."""
+    inside = folder.parent if folder.name == "images" else folder
+    return _first_existing([inside], ["poses.npz", "poses.jsonl"])
+
+
+def _places_of_parts(video: Path, poses: Path | None) -> list[Path]:
+    inside = video.is_dir() and video.name != "images"
+    place = video if inside else video.parent
+    return [place] if poses is None else [place, poses.parent]
 
 
 def find_live_capture_paths(
@@ -122,7 +146,7 @@ def find_live_capture_paths(
     inside = video.parent if video.name == "images" else video
     is_folder = video.is_dir()
     if poses is None and is_folder:
-        poses = _first_existing([inside], ["poses.npz", "poses.jsonl"]) or inside / "poses.npz"
+        poses = find_live_poses(video) or inside / "poses.npz"
     if poses is None:
         raise InputError(
             f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "

@@ -24,6 +24,7 @@ from preprocess.capture_paths import CapturePaths, find_parts
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.live.live_inputs import LiveInputs
+from preprocess.live.tracked_stream import LiveTracking
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_origin import Segmenter, segmenter_name
 from preprocess.observation import Observation
@@ -46,6 +47,8 @@ class CaptureInputs:
         person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Of a live source: how long nothing new may come.
         height_m: How tall the person is; None if only the poses tell.
+        tracker: Name of the tracker that finds poses where none are given; None for the built-in
+            one.
         transposed: Whether the film's width and height are exchanged before masks and cameras are
             compared with it; only to find out whether it was rotated.
     """
@@ -61,6 +64,7 @@ class CaptureInputs:
     person: str | None = None
     idle_s: float = IDLE_TIMEOUT_S
     height_m: float | None = None
+    tracker: str | None = None
     transposed: bool = False
 
     def input_paths(self) -> list[Path]:
@@ -91,10 +95,11 @@ class Capture:
         shaped: The person's body.
         size_px: Longer side that training sees; None for the frames' own.
         notes: What a user should know about how the parts were read.
-        live: Poses and masks of a live source, which come while it runs; `motion` is what had come
-            when it was opened.
+        live: Poses and masks of a live source, which come while it runs, or what tracks them;
+            `motion` is what had come when it was opened.
         segment: What estimates the masks, if nothing holds them.
         camera_report: Entry of the report about solved cameras.
+        tracking_report: Entry of the report about poses that were tracked in the video.
         refit: How the poses were fitted to the masks, if they were made for another body.
         live_fit: Fit of a live source's poses to the masks, repeated while frames arrive.
         fit: What was fitted to the masks before training (`preprocess.fitting`).
@@ -108,9 +113,10 @@ class Capture:
     shaped: ShapedBody
     size_px: int | None
     notes: tuple[str, ...]
-    live: LiveInputs | None = None
+    live: LiveInputs | LiveTracking | None = None
     segment: Segmenter | None = None
     camera_report: dict[str, Any] | None = None
+    tracking_report: dict[str, Any] | None = None
     refit: BodyPlacement | None = None
     live_fit: LiveAlignment | None = None
     fit: CaptureFit | None = None
@@ -153,11 +159,15 @@ class Capture:
             agreement = getattr(self.segment, "agreement", None)
             name = getattr(self.segment, "name", type(self.segment).__name__)
             return {"masks": f"estimated by {name}", "mask_agreement": agreement}
+        if isinstance(self.live, LiveTracking):
+            return {"masks": "tracked", "mask_agreement": None}
         source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
         return {"masks": source, "mask_agreement": None}
 
     def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""
+        if isinstance(self.live, LiveTracking):
+            yield from self.live.final_notes()
         growing = self.live_fit
         if growing is not None and growing.placement is not None:
             yield f"{growing.placement.describe()} (By the first {growing.frame_count} frames.)"

@@ -92,6 +92,7 @@ class ClipFitter:
         prior: ClipPrior | None = None,
         keypoints: ClipKeypoints | None = None,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
+        model: OutlineModel | None = None,
     ) -> None:
         """Starts with the poses, the proportions and the focal length as they are.
 
@@ -102,9 +103,10 @@ class ClipFitter:
             prior: What is known of the poses; if None, that they are near the motion's.
             keypoints: Key points of these frames, as further evidence.
             sigma_log_focal: How uncertain the focal length is.
+            model: The person at the space's origin, where several clips share it.
         """
         self.frames = tuple(frames)
-        self.model = OutlineModel(space)
+        self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
         self._keypoints = keypoints
         self.coefficients = np.zeros(space.count)
@@ -150,7 +152,9 @@ class ClipFitter:
         moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
         moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
         self.poses = self.poses.moved(moved, self._turns)
-        self.coefficients += np.clip(step[:-1], -1.0, 1.0)
+        if fitted.proportions:
+            self.coefficients += np.clip(step[:-1], -1.0, 1.0)
+            self.model.set_proportions(self.coefficients)
         self.log_focal += zoomed
         self.model.set_proportions(self.coefficients)
         return error

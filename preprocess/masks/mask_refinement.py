@@ -2,7 +2,7 @@
 
 The network's mask is coarse: a pixel of its square is several of the frame, fingers and the gap
 between arm and trunk are lost. It is right at large, though, so only a band around its border is
-decided anew, by Bayes' rule: the network's probability is the prior; the likelihoods are those of
+decided again, by Bayes' rule: the network's probability is the prior; the likelihoods are those of
 a pixel's color under the colors of person and background nearby, under the histograms of both, and,
 where a static camera has seen it, under the background itself (`BackgroundPlate`). A guided filter
 makes neighbors of like color agree and carries the result to full size.

@@ -13,9 +13,11 @@ from preprocess.tracking.keypoints import PersonKeypoints
 KEYPOINT_SHAPES = {
     "keypoint_frames": (-1,), "keypoints_px": (-1, 33, 2), "keypoints_m": (-1, 33, 3),
     "keypoint_visibility": (-1, 33), "keypoint_presence": (-1,), "keypoint_image_size": (2,),
-    "keypoint_times": (-1,),
+    "keypoint_times": (-1,), "keypoint_problems": (-1,),
 }  # fmt: skip
 """Arrays that hold key points in a file, and their shapes (-1: one row a frame)."""
+OPTIONAL_KEYS = ("keypoint_times", "keypoint_problems")
+"""Arrays that may be missing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -27,6 +29,7 @@ class KeypointTrack:
         image_px, world_m, visibility, presence: As in `PersonKeypoints`.
         size_px: Width and height of the frames.
         times_s: Time of each row's frame, seconds, if known.
+        problems: What makes each row doubtful, as the sum of `PROBLEM_BITS`, if known.
     """
 
     frames: Int[np.ndarray, "rows"]
@@ -36,6 +39,7 @@ class KeypointTrack:
     presence: Float[np.ndarray, "rows"]
     size_px: tuple[int, int]
     times_s: Float[np.ndarray, "rows"] | None = None
+    problems: Int[np.ndarray, "rows"] | None = None
 
     def __len__(self) -> int:
         """Number of frames in which the person was found."""
@@ -70,7 +74,8 @@ class KeypointTrack:
             "keypoint_presence": self.presence.astype(np.float32),
             "keypoint_image_size": np.array(self.size_px),
         }
-        return arrays if self.times_s is None else {**arrays, "keypoint_times": self.times_s}
+        optional = {"keypoint_times": self.times_s, "keypoint_problems": self.problems}
+        return arrays | {key: each for key, each in optional.items() if each is not None}
 
     @classmethod
     def from_arrays(
@@ -86,7 +91,7 @@ class KeypointTrack:
         count = arrays["keypoint_frames"].size
         found: dict[str, Shaped[np.ndarray, ...]] = {}
         for key, shape in KEYPOINT_SHAPES.items():
-            if key == "keypoint_times" and key not in arrays:
+            if key in OPTIONAL_KEYS and key not in arrays:
                 continue
             if key not in arrays or arrays[key].dtype.kind not in "iuf":
                 raise InputError(f"{path} holds key points without numbers in `{key}`.")
@@ -98,6 +103,7 @@ class KeypointTrack:
         if (np.diff(frames) <= 0.0).any():
             raise InputError(f"`keypoint_frames` in {path} do not ascend.")
         width, height = found["keypoint_image_size"]
+        problems = found.get("keypoint_problems")
         return cls(
             frames=frames.astype(np.int64),
             image_px=found["keypoints_px"],
@@ -106,4 +112,5 @@ class KeypointTrack:
             presence=found["keypoint_presence"],
             size_px=(int(width), int(height)),
             times_s=found.get("keypoint_times"),
+            problems=None if problems is None else problems.astype(np.int64),
         )

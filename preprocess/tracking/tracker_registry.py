@@ -22,7 +22,7 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
         InputError: If no package registers that name, or its tracker cannot be loaded.
     """
     if name == DEFAULT_TRACKER:
-        from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+        from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 
         return BlazePoseTracker(person=person)
     return make_plugin("tracker", name, person, own=DEFAULT_TRACKER, option=f"--tracker {name}")

@@ -117,7 +117,7 @@ def test_large_frames_are_decided_at_a_smaller_size() -> None:
 
 
 def test_frame_without_a_person_gives_an_empty_mask() -> None:
-    """Where the network sees nobody there is no mask, and the background is learnt."""
+    """Where the network sees no person there is no mask, and the background is learnt."""
     rgb, mask, _ = _frame(0, _background(1))
     empty = CroppedMask(values=np.zeros_like(mask.values), image_from_crop=mask.image_from_crop)
     assert not MaskRefiner(SIZE_PX)(rgb, empty).any()

@@ -4,7 +4,7 @@ import pytest
 
 from capture.input_error import InputError
 from preprocess import plugins
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.tracker_registry import make_tracker
 

@@ -1,10 +1,10 @@
-"""Tests of `preprocess/tracking/person_square.py` and of masks in such a square."""
+"""Tests of `preprocess/blazepose/person_square.py` and of masks in such a square."""
 
 import numpy as np
 import pytest
 
+from preprocess.blazepose.person_square import PersonSquare
 from preprocess.tracking.keypoints import CroppedMask
-from preprocess.tracking.person_square import PersonSquare
 
 SIZE = 64
 """Width and height of the crops, pixels."""

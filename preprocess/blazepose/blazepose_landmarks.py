@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from preprocess.blazepose.onnx_network import WEIGHTS, OnnxNetwork, sigmoid
+from preprocess.blazepose.person_square import PersonSquare
 from preprocess.tracking.keypoints import KEYPOINT_COUNT, CroppedMask, PersonKeypoints
-from preprocess.tracking.onnx_network import WEIGHTS, OnnxNetwork, sigmoid
-from preprocess.tracking.person_square import PersonSquare
 
 HEATMAP_REACH = 3
 """Cells of a heat map on each side of a key point that make it more exact."""

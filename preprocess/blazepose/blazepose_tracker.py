@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from capture.input_error import InputError
-from preprocess.tracking.blazepose_detector import (
+from preprocess.blazepose.blazepose_detector import (
     SAME_PERSON_DISTANCE,
     BlazePoseDetector,
     PersonDetection,
 )
-from preprocess.tracking.blazepose_landmarks import BlazePoseLandmarks, FoundLandmarks
+from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks, FoundLandmarks
+from preprocess.blazepose.person_looks import PersonLooks, colors_of
+from preprocess.blazepose.person_square import PersonSquare
 from preprocess.tracking.keypoints import PersonKeypoints
-from preprocess.tracking.person_looks import PersonLooks, colors_of
-from preprocess.tracking.person_square import PersonSquare
 
 MIN_PRESENCE = 0.5
 """Least probability of a person in the square; below it the person is lost."""

@@ -1,4 +1,4 @@
-"""Tests of `preprocess/tracking/blazepose_*.py`: the real networks on the studio's actors."""
+"""Tests of `preprocess/blazepose/*.py`: the real networks on the studio's actors."""
 
 from dataclasses import dataclass
 
@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.tracking.blazepose_detector import (
+from preprocess.blazepose.blazepose_detector import (
     BlazePoseDetector,
     PersonDetection,
     anchors,
     is_same_person,
     parts_of_frame,
 )
-from preprocess.tracking.blazepose_landmarks import refine
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker, LastPlace
-from preprocess.tracking.person_square import PersonSquare
-from preprocess.tracking.tracking_log import TrackingLog, TrackingProblem
+from preprocess.blazepose.blazepose_landmarks import refine
+from preprocess.blazepose.blazepose_tracker import BlazePoseTracker, LastPlace
+from preprocess.blazepose.person_square import PersonSquare
+from preprocess.tracking.tracking_problems import ProblemFinder, TrackingProblem
 from studio import actor_motions
 from studio.actor import Actor
 from studio.studio_cameras import portrait_camera
@@ -184,16 +184,16 @@ def test_a_person_who_walks_past_is_not_followed(striped, plain, is_in_front):
 
 
 def test_a_person_who_leaves_and_returns_is_found_again(plain):
-    tracker, log, size_px = BlazePoseTracker(), TrackingLog(), (400, 480)
+    tracker, finder, size_px = BlazePoseTracker(), ProblemFinder(), (400, 480)
     lefts = [65, 120, 180, 230, 270, 320, 400, 400, 320, 270, 230, 180]
-    for frame, left in enumerate(lefts):
-        log.add(frame, tracker(scene((plain, left), width=400)), size_px)
-    absent, *_ = (e for e in log.events() if e.problem is TrackingProblem.ABSENT)
-    assert 4 <= absent.first <= 6
-    assert 7 <= absent.last <= 9
-    assert log.share(TrackingProblem.RIGHT) > 0
-    assert log.share(TrackingProblem.LEFT) == 0
-    assert log.share(TrackingProblem.ELSEWHERE) == 0
+    found = [tracker(scene((plain, left), width=400)) for left in lefts]
+    absent = [row for row, each in enumerate(found) if each is None]
+    assert 4 <= absent[0] <= 6
+    assert 7 <= absent[-1] <= 9
+    problems = set().union(*(finder.problems(each, size_px) for each in found))
+    assert TrackingProblem.RIGHT in problems
+    assert TrackingProblem.LEFT not in problems
+    assert TrackingProblem.ELSEWHERE not in problems
 
 
 # --- parts ------------------------------------------------------------------------------------

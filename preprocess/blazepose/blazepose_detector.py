@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from preprocess.tracking.onnx_network import WEIGHTS, OnnxNetwork, sigmoid
-from preprocess.tracking.person_square import PersonSquare
+from preprocess.blazepose.onnx_network import WEIGHTS, OnnxNetwork, sigmoid
+from preprocess.blazepose.person_square import PersonSquare
 
 ANCHOR_GRIDS = ((8, 2), (16, 2), (32, 6))
 """Distance of the anchors, pixels, and how many there are at each place."""

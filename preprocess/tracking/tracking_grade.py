@@ -1,0 +1,284 @@
+"""Grades tracked poses: do body and mask agree, are the poses smooth, and where are they doubtful?
+
+No grade uses ground truth, so the same grades hold for any video.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from capture.camera import Camera
+from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.tracking_problems import PROBLEM_BITS
+
+MIN_IOU = 0.7
+"""Least mean IoU of body and mask of poses that are good enough for an avatar."""
+DOUBTFUL_IOU = 0.65
+"""IoU below which a frame is doubtful."""
+MIN_FOUND_SHARE = 0.7
+"""Least share of the frames in which the person must be found."""
+MAX_DOUBTFUL_SHARE = 0.5
+"""Largest share of doubtful frames of poses that are good enough for an avatar."""
+MIN_PERSON_PX = 96.0
+"""Least median height of the person in the frames, px."""
+MIN_VISIBILITY = 0.1
+"""Mean visibility of elbow and wrist, or knee and ankle, below which a limb was guessed."""
+FAST_HEIGHTS_PER_S = 4.5
+"""Speed of a wrist or an ankle above which networks are often wrong, body heights per second."""
+MIN_SPEED_FRAMES = 16
+"""Fewest frames of which speeds are judged; a few photographs have no times."""
+BRIDGED_S = 0.35
+"""Gap between two doubtful stretches with the same reason that are joined, seconds."""
+MIN_STRETCH_FRAMES = 3
+"""Fewest frames of a doubtful stretch that is reported."""
+DIRECTIONS = 12
+"""Directions, 30 degrees each, from which the camera may see the person."""
+LIMBS = {
+    "left arm": (13, 15), "right arm": (14, 16), "left leg": (25, 27), "right leg": (26, 28),
+}  # fmt: skip
+"""Key points whose visibility tells whether a limb was seen."""
+ENDS = {"left wrist": 15, "right wrist": 16, "left ankle": 27, "right ankle": 28}
+"""Key points that move fast."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoubtfulStretch:
+    """Frames in a row whose poses are doubtful.
+
+    Attributes:
+        start_s, end_s: From the first frame to the last, seconds.
+        frames: Number of frames.
+        reason: Why, in a few words.
+    """
+
+    start_s: float
+    end_s: float
+    frames: int
+    reason: str
+
+    def describe(self) -> str:
+        """Describe the stretch, for people."""
+        return f"{self.start_s:.1f} to {self.end_s:.1f} s: {self.reason}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingGrade:
+    """Grades of tracked poses.
+
+    Attributes:
+        frames: Number of frames that were looked at.
+        found_share: Share of them in which the person was found.
+        doubtful_share: Share of them that are doubtful for another reason than a limb that is
+            hidden or fast; those without the person included.
+        iou_mean, iou_worst: IoU of posed body and mask; NaN where no mask could be compared.
+        jitter_mm: Median second difference of joints relative to the root, mm per frame squared.
+        person_px: Median height of the person in the frames, px.
+        directions_seen: Share of the horizontal directions from which the person was seen.
+        stretches: Doubtful stretches, in order.
+        doubts: Why frames are doubtful, by their numbers.
+    """
+
+    frames: int
+    found_share: float
+    doubtful_share: float
+    iou_mean: float
+    iou_worst: float
+    jitter_mm: float
+    person_px: float
+    directions_seen: float
+    stretches: tuple[DoubtfulStretch, ...]
+    doubts: Mapping[int, str]
+
+    @property
+    def objections(self) -> tuple[str, ...]:
+        """Why the poses are not good enough for an avatar; empty if they are."""
+        found = []
+        if self.found_share < MIN_FOUND_SHARE:
+            found.append(f"the person was found in only {self.found_share:.0%} of the frames")
+        if self.iou_mean < MIN_IOU:
+            found.append(
+                f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"
+            )
+        if self.doubtful_share > MAX_DOUBTFUL_SHARE:
+            found.append(f"{self.doubtful_share:.0%} of the frames are doubtful")
+        if self.person_px < MIN_PERSON_PX:
+            found.append(
+                f"the person is only {self.person_px:.0f} px tall (expected {MIN_PERSON_PX:.0f})"
+            )
+        return tuple(found)
+
+    @property
+    def is_good_enough(self) -> bool:
+        """Whether the poses are good enough for an avatar."""
+        return not self.objections
+
+    def describe(self) -> str:
+        """The verdict in one sentence."""
+        scores = (
+            f"found in {self.found_share:.0%} of {self.frames} frames; IoU of body and masks "
+            f"{self.iou_mean:.2f} (worst frame {self.iou_worst:.2f}); jitter {self.jitter_mm:.1f} "
+            f"mm per frame squared; seen from {self.directions_seen:.0%} of the directions around"
+        )
+        if self.is_good_enough:
+            return f"Good enough for an avatar: yes, because the person was {scores}."
+        return (
+            f"Good enough for an avatar: no, because {'; and '.join(self.objections)}. The person "
+            f"was {scores}."
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Figures for a report; NaN becomes null."""
+        figures = {
+            name: None if np.isnan(value) else round(float(value), 4)
+            for name, value in vars(self).items()
+            if isinstance(value, float)
+        }
+        return {
+            "summary": self.describe(),
+            "good_enough": self.is_good_enough,
+            "objections": list(self.objections),
+            "frames": self.frames,
+            **figures,
+            "doubtful": [vars(each) for each in self.stretches],
+        }
+
+
+def grade_tracking(
+    motion: Motion,
+    keypoints: KeypointTrack,
+    shaped: ShapedBody,
+    camera: Camera,
+    frame_times_s: Mapping[int, float],
+    iou_of_frame: Mapping[int, float],
+) -> TrackingGrade:
+    """Grade tracked poses.
+
+    Args:
+        motion: Poses, with the numbers of their frames.
+        keypoints: What they were made of.
+        shaped: The person.
+        camera: Camera of the poses.
+        frame_times_s: Time of each frame that was looked at, by its number.
+        iou_of_frame: IoU of posed body and mask of some frames, by their numbers.
+    """
+    numbers = np.array(sorted(frame_times_s))
+    reasons = _reasons_by_frame(keypoints, frame_times_s, iou_of_frame)
+    of_limbs = ("is a guess", "is fast")
+    doubtful = [
+        any(not each.endswith(of_limbs) for each in reasons.get(int(number), ()))
+        for number in numbers
+    ]
+    ious = np.array([value for value in iou_of_frame.values() if np.isfinite(value)])
+    heights = np.ptp(keypoints.image_px[:, :, 1], axis=1)
+    return TrackingGrade(
+        frames=len(numbers),
+        found_share=len(keypoints) / max(1, len(numbers)),
+        doubtful_share=float(np.mean(doubtful)),
+        iou_mean=float(ious.mean()) if len(ious) else float("nan"),
+        iou_worst=float(ious.min()) if len(ious) else float("nan"),
+        jitter_mm=_jitter_mm(motion, shaped),
+        person_px=float(np.median(heights)) if len(heights) else 0.0,
+        directions_seen=_directions_seen(motion, camera),
+        stretches=tuple(_stretches(numbers.tolist(), frame_times_s, reasons)),
+        doubts={number: "; ".join(words) for number, words in reasons.items()},
+    )
+
+
+def _reasons_by_frame(
+    keypoints: KeypointTrack,
+    frame_times_s: Mapping[int, float],
+    iou_of_frame: Mapping[int, float],
+) -> dict[int, list[str]]:
+    """Why frames are doubtful, by their numbers."""
+    reasons: dict[int, list[str]] = {}
+
+    def note(rows: Bool[np.ndarray, "rows"], reason: str) -> None:
+        for number in keypoints.frames[rows].tolist():
+            reasons.setdefault(int(number), []).append(reason)
+
+    found = set(keypoints.frames.tolist())
+    for number in frame_times_s:
+        if number not in found:
+            reasons[number] = ["the person was not found"]
+    for number, iou in iou_of_frame.items():
+        if iou < DOUBTFUL_IOU and number in found:
+            reasons.setdefault(number, []).append("body and mask disagree")
+    for problem, bit in PROBLEM_BITS.items():
+        if keypoints.problems is not None:
+            note((keypoints.problems & bit) > 0, problem.value)
+    for name, points in LIMBS.items():
+        hidden = keypoints.visibility[:, list(points)].mean(axis=1) < MIN_VISIBILITY
+        note(hidden, f"the {name} is hidden, its pose is a guess")
+    for name, point in ENDS.items() if len(keypoints) >= MIN_SPEED_FRAMES else ():
+        note(_speed(keypoints, point, frame_times_s) > FAST_HEIGHTS_PER_S, f"the {name} is fast")
+    return reasons
+
+
+def _speed(
+    keypoints: KeypointTrack, point: int, frame_times_s: Mapping[int, float]
+) -> Float[np.ndarray, "rows"]:
+    """Speed of a key point relative to the hips, median body heights per second."""
+    if len(keypoints) < 2:
+        return np.zeros(len(keypoints))
+    hips = keypoints.image_px[:, [23, 24]].mean(axis=1)
+    place = keypoints.image_px[:, point] - hips
+    times = np.array([frame_times_s[int(number)] for number in keypoints.frames])
+    span = np.maximum(np.diff(times), 1e-3)
+    steps = np.linalg.norm(np.diff(place, axis=0), axis=1) / span
+    tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
+    return np.maximum(np.append(steps, 0.0), np.append(0.0, steps)) / tall
+
+
+def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:
+    """Median second difference of joints relative to the root, of three frames in a row."""
+    joints = np.stack(
+        [shaped.with_pose(motion[row]).joints() for row in range(len(motion))]
+        or [np.zeros((24, 3))]
+    )
+    relative = joints - joints[:, :1]
+    rows = np.arange(len(motion)) if motion.frames is None else motion.frames
+    inner = motion.valid[:-2] & motion.valid[1:-1] & motion.valid[2:]
+    inner &= np.diff(rows)[:-1] == np.diff(rows)[1:]
+    if not inner.any():
+        return float("nan")
+    bend = relative[2:] - 2.0 * relative[1:-1] + relative[:-2]
+    return 1000.0 * float(np.median(np.linalg.norm(bend[inner][:, 1:], axis=2)))
+
+
+def _directions_seen(motion: Motion, camera: Camera) -> float:
+    """Share of the horizontal directions around the person from which the camera saw it."""
+    turned = camera.camera_from_world[:3, :3] @ rotation_matrices(motion.root_rotations)
+    to_camera = -turned[:, 2]  # the view's axis, in the axes of the body
+    angle = np.arctan2(to_camera[:, 0], to_camera[:, 2])[motion.valid]
+    bins = np.floor((angle / (2.0 * np.pi)) % 1.0 * DIRECTIONS).astype(int)
+    return len(np.unique(bins)) / DIRECTIONS
+
+
+def _stretches(
+    numbers: list[int], frame_times_s: Mapping[int, float], reasons: Mapping[int, list[str]]
+) -> Iterator[DoubtfulStretch]:
+    """Doubtful frames joined to stretches with one reason each, by their start."""
+    found: list[DoubtfulStretch] = []
+    for reason in dict.fromkeys(each for number in numbers for each in reasons.get(number, [])):
+        rows = [number for number in numbers if reason in reasons.get(number, [])]
+        groups: list[list[int]] = []
+        for number in rows:
+            near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= BRIDGED_S
+            groups[-1].append(number) if near else groups.append([number])
+        found += [
+            DoubtfulStretch(
+                start_s=round(frame_times_s[group[0]], 2),
+                end_s=round(frame_times_s[group[-1]], 2),
+                frames=len(group),
+                reason=reason,
+            )
+            for group in groups
+            if len(group) >= MIN_STRETCH_FRAMES or len(numbers) < 4 * MIN_STRETCH_FRAMES
+        ]
+    return iter(sorted(found, key=lambda each: (each.start_s, each.reason)))

@@ -1,0 +1,93 @@
+"""What makes a frame's track doubtful: borders of the picture, and other persons."""
+
+from enum import Enum
+from typing import final
+
+import numpy as np
+
+from preprocess.tracking.keypoints import PersonKeypoints
+
+BORDER_SAMPLES = 128
+"""Places along each border of a frame at which the mask is read."""
+MIN_TOUCHING = 2
+"""Places with the person in them that make a touch."""
+ELSEWHERE = 0.6
+"""Distance from the last place, in sides of the square around the person, that is worth a word."""
+
+
+class TrackingProblem(Enum):
+    """Kinds of doubtful frames; the value is what a user reads."""
+
+    CROWDED = "another person is so near that the two may be mixed up"
+    ELSEWHERE = "the person was found again in another place, perhaps it is another person"
+    LEFT = "the person is cut by the picture's left border"
+    RIGHT = "the person is cut by the picture's right border"
+    TOP = "the person is cut by the picture's upper border"
+    BOTTOM = "the person is cut by the picture's lower border"
+
+
+PROBLEM_BITS = {problem: 1 << place for place, problem in enumerate(TrackingProblem)}
+"""The bit of each problem in the numbers that files hold."""
+
+
+@final
+class ProblemFinder:
+    """Finds the problems of a track, frame by frame."""
+
+    def __init__(self) -> None:
+        """Starts without frames."""
+        self._last_found: PersonKeypoints | None = None
+        self._is_absent = False
+
+    def problems(
+        self, found: PersonKeypoints | None, size_px: tuple[int, int]
+    ) -> frozenset[TrackingProblem]:
+        """The problems of the next frame.
+
+        Args:
+            found: The person in it; None if there was none.
+            size_px: Width and height of the frame.
+        """
+        if found is None:
+            self._is_absent = True
+            return frozenset()
+        problems = touched_borders(found, size_px)
+        if found.crowded:
+            problems.add(TrackingProblem.CROWDED)
+        if self._is_absent and self._last_found and has_moved(self._last_found, found):
+            problems.add(TrackingProblem.ELSEWHERE)
+        self._last_found, self._is_absent = found, False
+        return frozenset(problems)
+
+
+def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[TrackingProblem]:
+    """The borders of the frame that a person's mask touches."""
+    width, height = size_px
+    crop_from_image = np.linalg.inv(np.vstack([found.mask.image_from_crop, [0, 0, 1]]))[:2]
+    inset = np.hypot(*found.mask.image_from_crop[:, 0])  # one of the mask's own pixels
+    along = (np.arange(BORDER_SAMPLES) + 0.5) / BORDER_SAMPLES
+    low, high = np.full(BORDER_SAMPLES, inset), np.ones(BORDER_SAMPLES)
+    lines = {
+        TrackingProblem.LEFT: (low, along * height),
+        TrackingProblem.RIGHT: (high * width - inset, along * height),
+        TrackingProblem.TOP: (along * width, low),
+        TrackingProblem.BOTTOM: (along * width, high * height - inset),
+    }
+    rows, columns = found.mask.values.shape
+    touched = set()
+    for problem, (x, y) in lines.items():
+        column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:
+            touched.add(problem)
+    return touched
+
+
+def has_moved(before: PersonKeypoints, after: PersonKeypoints) -> bool:
+    """Whether two squares around a person are far from each other."""
+    middles = []
+    for found in (before, after):
+        rows, columns = found.mask.values.shape
+        middles.append(found.mask.image_from_crop @ [columns / 2, rows / 2, 1])
+    side = before.mask.values.shape[1] * np.hypot(*before.mask.image_from_crop[:, 0])
+    return bool(np.hypot(*(middles[1] - middles[0])) > ELSEWHERE * side)

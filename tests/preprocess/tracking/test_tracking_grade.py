@@ -1,0 +1,134 @@
+"""Grades of tracked poses: doubtful stretches are reported with their times."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.camera import Camera
+from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import Motion
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
+from preprocess.tracking.tracking_problems import PROBLEM_BITS, TrackingProblem
+
+FRAMES = 60
+FPS = 30.0
+TIMES = {number: number / FPS for number in range(FRAMES)}
+
+
+@pytest.fixture(scope="module")
+def shaped():
+    return load_body_model(None).with_shape()
+
+
+def a_motion(turns: float = 1.0, noise_rad: float = 0.0) -> Motion:
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0.0, 2.0 * np.pi * turns, FRAMES)
+    upright = np.array([np.pi, 0.0, 0.0])  # OpenCV's y points down
+    from scipy.spatial.transform import Rotation
+
+    roots = Rotation.from_rotvec(upright) * Rotation.from_rotvec(
+        np.column_stack([np.zeros(FRAMES), angles, np.zeros(FRAMES)])
+    )
+    return Motion(
+        root_rotations=roots.as_rotvec(),
+        root_translations=np.tile([0.0, 0.0, 3.0], (FRAMES, 1)),
+        joint_rotations=noise_rad * rng.normal(size=(FRAMES, 23, 3)),
+        valid=np.ones(FRAMES, dtype=bool),
+        betas=np.zeros(10),
+        body_model="body24",
+        frames=np.arange(FRAMES),
+    )
+
+
+def some_keypoints() -> KeypointTrack:
+    image = np.full((FRAMES, 33, 2), 300.0)
+    image[:, 0, 1], image[:, 27:33, 1] = 100.0, 500.0
+    return KeypointTrack(
+        frames=np.arange(FRAMES),
+        image_px=image,
+        world_m=np.zeros((FRAMES, 33, 3)),
+        visibility=np.ones((FRAMES, 33)),
+        presence=np.ones(FRAMES),
+        size_px=(600, 600),
+    )
+
+
+def grade(shaped, keypoints=None, motion=None, iou=0.85, times=TIMES) -> TrackingGrade:
+    camera = Camera.from_intrinsic(
+        np.array([[600.0, 0, 300], [0, 600.0, 300], [0, 0, 1]]), (600, 600)
+    )
+    return grade_tracking(
+        a_motion() if motion is None else motion,
+        some_keypoints() if keypoints is None else keypoints,
+        shaped,
+        camera,
+        times,
+        dict.fromkeys(range(0, FRAMES, 4), iou),
+    )
+
+
+def test_good_poses_are_good_enough(shaped):
+    found = grade(shaped)
+    assert found.is_good_enough
+    assert found.stretches == ()
+    assert found.directions_seen == 1.0
+    assert found.person_px == pytest.approx(400.0)
+    assert "yes" in found.describe()
+
+
+def test_who_did_not_turn_was_seen_from_few_directions(shaped):
+    assert grade(shaped, motion=a_motion(turns=0.0)).directions_seen == pytest.approx(1 / 12)
+
+
+def test_jitter_grows_with_noise(shaped):
+    calm, noisy = grade(shaped), grade(shaped, motion=a_motion(noise_rad=0.05))
+    assert calm.jitter_mm < 5.0
+    assert noisy.jitter_mm > 4.0 * calm.jitter_mm
+
+
+def test_disagreeing_masks_are_an_objection(shaped):
+    found = grade(shaped, iou=0.4)
+    assert not found.is_good_enough
+    assert "IoU" in found.objections[0]
+    assert found.stretches[0].reason == "body and mask disagree"
+
+
+def test_lost_frames_are_reported_by_their_time(shaped):
+    keep = np.r_[0:20, 35:FRAMES]
+    keypoints = some_keypoints()
+    some = replace(
+        keypoints,
+        **{
+            name: getattr(keypoints, name)[keep]
+            for name in ("frames", "image_px", "world_m", "visibility", "presence")
+        },
+    )
+    found = grade(shaped, keypoints=some)
+    assert found.found_share == pytest.approx(45 / 60)
+    assert found.stretches[0].describe() == "0.7 to 1.1 s: the person was not found"
+
+
+def test_hidden_fast_and_cut_limbs_are_reported(shaped):
+    keypoints = some_keypoints()
+    keypoints.visibility[10:20, [13, 15]] = 0.02
+    problems = np.zeros(FRAMES, dtype=np.int64)
+    problems[30:40] = PROBLEM_BITS[TrackingProblem.BOTTOM]
+    keypoints.image_px[45:50:2, 16, 0] += 150.0
+    reasons = {
+        each.reason
+        for each in grade(shaped, keypoints=replace(keypoints, problems=problems)).stretches
+    }
+    assert reasons == {
+        "the left arm is hidden, its pose is a guess",
+        "the person is cut by the picture's lower border",
+        "the right wrist is fast",
+    }
+
+
+def test_json_holds_no_nan(shaped):
+    found = grade(shaped, motion=replace(a_motion(), frames=np.arange(0, 600, 10)[:FRAMES]))
+    told = replace(found, jitter_mm=float("nan")).as_json()
+    assert told["jitter_mm"] is None
+    assert told["good_enough"] is True

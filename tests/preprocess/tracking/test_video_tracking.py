@@ -1,0 +1,85 @@
+"""Tracking of a recording: every frame gets a mask, and missing frames are reported."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+from preprocess.tracking.video_tracking import track_video
+
+COUNT = 12
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number in range(COUNT):
+        cv2.imwrite(str(folder / f"{number:04d}.png"), np.full((48, 32, 3), 10 * number, np.uint8))
+    return open_source(folder)
+
+
+class FakeTracker:
+    """Finds a person wherever the picture is bright enough."""
+
+    def __init__(self, darkest: int = 0) -> None:
+        self.darkest = darkest
+
+    def __call__(self, rgb):
+        if rgb.mean() < self.darkest:
+            return None
+        return PersonKeypoints(
+            image_px=np.full((33, 2), float(rgb.mean())),
+            world_m=np.zeros((33, 3)),
+            visibility=np.ones(33),
+            presence=1.0,
+            mask=CroppedMask(
+                values=np.full((8, 8), 255, np.uint8),
+                image_from_crop=np.array([[2.0, 0.0, 8.0], [0.0, 2.0, 16.0]]),
+            ),
+        )
+
+
+def plain(rgb, mask, size_px):
+    return mask.resample((rgb.shape[1], rgb.shape[0]), size_px)
+
+
+def test_each_frame_has_a_mask_and_found_ones_have_key_points(pictures, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    found = track_video(pictures, FakeTracker(darkest=25), plain, masks)
+    assert found.keypoints.frames.tolist() == list(range(3, COUNT))
+    assert found.lost_frames == [0, 1, 2]
+    assert found.keypoints.image_px[0, 0, 0] == 30.0
+    files = sorted(masks.iterdir())
+    assert [file.stem for file in files] == [f"{number:06d}" for number in range(COUNT)]
+    assert cv2.imread(str(files[0]), 0).max() == 0
+    drawn = cv2.imread(str(files[5]), 0)
+    assert drawn[17:31, 9:23].min() == 255
+    assert drawn[:14].max() == drawn[:, 26:].max() == 0
+
+
+def test_a_video_without_persons_is_bad_input(pictures):
+    with pytest.raises(InputError, match="none of 12 frames"):
+        track_video(pictures, FakeTracker(darkest=200), plain, None)
+
+
+def test_a_stop_keeps_what_was_found(pictures):
+    stop = threading.Event()
+
+    def advance(done: int) -> None:
+        if done == 5:
+            stop.set()
+
+    found = track_video(pictures, FakeTracker(), plain, None, advance=advance, stop=stop)
+    assert found.interrupted
+    assert len(found.keypoints) == 5
+
+
+def test_a_failing_mask_writer_is_not_swallowed(pictures, tmp_path):
+    with pytest.raises(OSError, match="gone"):
+        track_video(pictures, FakeTracker(), plain, tmp_path / "gone")
