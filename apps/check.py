@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
@@ -24,6 +25,12 @@ from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import BAD_INPUT, DONE, run_command
 from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file
+from apps.tracking.person_tracking import (
+    grade_capture,
+    needs_tracking,
+    print_grade,
+    track_person,
+)
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
@@ -64,7 +71,7 @@ class CheckArguments:
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of images, or capture folder."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """SMPL poses, as ia-ingest takes them."""
+    """SMPL poses, as ia-ingest takes them; without them the person is tracked, as by ia-track."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, as ia-ingest takes them."""
     mask_invert: Flag = False
@@ -149,9 +156,18 @@ def check(arguments: CheckArguments, console: Console) -> int:
     """
     inputs = arguments.capture_inputs()
     arguments.check_outputs()
+    if not needs_tracking(inputs):
+        return _check_inputs(arguments, inputs, console)
+    with TemporaryDirectory() as folder:
+        tracking = track_person(inputs, Path(folder) / "poses.npz", console)
+        return _check_inputs(arguments, tracking.inputs, console)
+
+
+def _check_inputs(arguments: CheckArguments, inputs: CaptureInputs, console: Console) -> int:
     try:
         with console.status("comparing poses, masks and cameras"):
             check_result = check_capture(inputs)
+            grade = grade_capture(check_result.recording)
     except InputError as error:
         if arguments.json is not None:
             write_text_atomically(
@@ -160,9 +176,12 @@ def check(arguments: CheckArguments, console: Console) -> int:
             )  # fmt: skip
         raise
     if arguments.json is not None:
-        text = json.dumps(check_to_json(check_result), indent=1) + "\n"
+        told = check_to_json(check_result) | {"tracking": grade and grade.as_json()}
+        text = json.dumps(told, indent=1) + "\n"
         write_text_atomically(arguments.json, text, replace=arguments.overwrite)
     _print_findings(check_result, console)
+    if grade is not None:
+        print_grade(grade, console)
     path, ours = arguments.sheet_path(), arguments.sheet is None
     if write_contact_sheet(path, check_result, replace=arguments.overwrite, listed=ours):
         console.print_artifact("look at it", path)
@@ -174,7 +193,8 @@ def check(arguments: CheckArguments, console: Console) -> int:
         return DONE if check_result.corrected_iou >= USABLE_IOU else BAD_INPUT
     if check_result.causes and not check_result.is_auto_corrected:
         console.info(f"To correct it:  {check_command(inputs)}")
-    return BAD_INPUT if check_result.verdict == "unusable" else DONE
+    good = grade is None or grade.is_good_enough
+    return DONE if good and check_result.verdict != "unusable" else BAD_INPUT
 
 
 def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
@@ -225,7 +245,7 @@ def unreadable_to_json(reason: str) -> dict[str, Any]:
     return {
         "format": 1, "verdict": "unusable", "cause": None,
         "iou": {"now": None, "after_fix": None}, "tried": [], "corrections": [], "anomalies": [],
-        "refused": reason, "edges": None, "film": None,
+        "refused": reason, "edges": None, "film": None, "tracking": None,
     }  # fmt: skip
 
 

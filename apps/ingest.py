@@ -4,6 +4,8 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
 
 from apps.checks.preflight_check import correction_hint, preflight_check
 from apps.cli.command_line import fill_optional_port, parse_arguments
@@ -13,6 +15,11 @@ from apps.cli.interrupt import exit_on_interrupt, stop_on_interrupt
 from apps.run.camera_solving import CameraSolving, start_camera_solving
 from apps.run.ingest_arguments import VIEW_PORT, IngestArguments
 from apps.run.run_folder import RunFolder
+from apps.tracking.tracked_run import (
+    read_tracking_report,
+    remove_unused_tracking,
+    track_missing_poses,
+)
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from preprocess.capture_session import Capture
@@ -42,9 +49,14 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
     run, inputs = arguments.run_folder(), arguments.capture_inputs().input_paths()
     run.check_usable(inputs, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
+        asked, arguments = arguments, track_missing_poses(arguments, run, console)
+        if arguments.tracks_stream:  # its frames come as soon as it is open
+            _load_trainer_code(arguments, run, console)
         capture = _open_aligned(arguments, run, console)
         with start_camera_solving(arguments.solve_job(capture), capture, run) as solving:
-            return _train_and_report(arguments, capture, run, console, solving, started_at)
+            return _train_and_report(
+                arguments, capture, run, console, solving, started_at, command=asked.as_json()
+            )
 
 
 def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) -> Capture:
@@ -57,6 +69,7 @@ def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) 
         if not hint:
             raise
         raise InputError(f"{error} {hint}") from error
+    capture = replace(capture, tracking_report=read_tracking_report(arguments, run))
     console.info(_describe_capture(capture))
     for note in capture.notes:
         console.warning(note)
@@ -68,8 +81,8 @@ def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) 
 def _fit_to_masks(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> Capture:
-    """Fit body, poses and focal length to the masks, unless the poses are exact."""
-    if not arguments.refine_poses:
+    """Fit body, poses and focal length to the masks, unless they are exact or were fitted."""
+    if not arguments.refine_poses or capture.motion.proportions is not None:
         return capture
     resumes = arguments.resume and run.has_checkpoint()
     fit = load_capture_fit(run.fit_file, capture.identity) if resumes else None
@@ -93,6 +106,17 @@ def _describe_capture(capture: Capture) -> str:
     )
 
 
+def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
+    """Import torch and load the compiled kernels; return the number of threads."""
+    if "torch" not in sys.modules:
+        with exit_on_interrupt(console, PROGRAM, run.release), console.status("loading torch"):
+            from apps.run import report_writer, training_session  # noqa: F401
+    from apps.run.session_start import load_kernels
+
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        return load_kernels(arguments, console)
+
+
 def _train_and_report(
     arguments: IngestArguments,
     capture: Capture,
@@ -100,20 +124,22 @@ def _train_and_report(
     console: Console,
     solving: CameraSolving | None,
     started_at: float,
+    *,
+    command: dict[str, Any],
 ) -> int:
     """Train on an aligned capture, bake its package and write the report."""
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        with console.status("loading torch"):
-            from apps.run.report_writer import print_results, write_report
-            from apps.run.session_start import load_kernels, open_viewer, prepare_trainer
-            from apps.run.training_session import TrainingSession
-        threads = load_kernels(arguments, console)
+    threads = _load_trainer_code(arguments, run, console)
+    from apps.run.report_writer import print_results, write_report
+    from apps.run.session_start import open_viewer, prepare_trainer
+    from apps.run.training_session import TrainingSession
+
     if solving is not None:
         capture = solving.wait_before_training(capture, console)
     with exit_on_interrupt(console, PROGRAM, run.release):
         start = prepare_trainer(arguments, capture, run, console)
         viewer = open_viewer(arguments, capture, run, console)
     run.start_run(resume=arguments.resume)
+    remove_unused_tracking(arguments, run)
     try:
         kept = nullcontext() if solving is None else solving.save_on_exit(capture, run, console)
         with kept, stop_on_interrupt(console) as stop:
@@ -125,7 +151,7 @@ def _train_and_report(
             if solving is not None:
                 capture = solving.wait_after_training(capture, run, console, stop)
             report = write_report(
-                result, capture, run, console, command=arguments.as_json(), threads=threads,
+                result, capture, run, console, command=command, threads=threads,
                 startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
             )  # fmt: skip
             if arguments.json is not None:

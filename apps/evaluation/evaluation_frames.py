@@ -9,6 +9,7 @@ from typing import Any
 
 from apps.run.ingest_arguments import IngestArguments, trainable_longer_side_px
 from apps.run.run_folder import RunFolder
+from apps.tracking.tracked_run import read_tracked_poses
 from capture.input_error import InputError
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fit import load_capture_fit
@@ -84,6 +85,12 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
             f"{run.path} was trained from a live source, which was not recorded. Pass another "
             "capture of the same person with --on."
         )
+    if given.tracks_stream:
+        raise InputError(
+            f"{run.path} was trained while its video was tracked, and those poses cannot be "
+            "repeated. Run ia-track, and pass --on and --poses."
+        )
+    given = read_tracked_poses(given, run)
     inputs = given.capture_inputs()
     if given.cameras == "solve" and run.cameras.is_file():
         inputs = replace(inputs, cameras=str(run.cameras), poses=run.poses)

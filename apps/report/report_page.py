@@ -68,6 +68,7 @@ def report_page(
             _section("Earlier videos", _earlier_videos(report)),
             _section("Body coverage", _coverage(report, body_map)),
             _section("Cameras", _cameras(report, present_files)),
+            _section("Tracking", _tracking(report)),
             _section("Held-out frames", _pairs(pairs)),
             _section("Novel poses", _animation(animation)),
             _section("Warnings", _warnings(report, warnings)),
@@ -202,6 +203,21 @@ def _cameras(report: Report, present: Collection[str]) -> str:
         if {"cameras.npz", "poses.npz"} <= set(present):
             text += " cameras.npz and poses.npz hold the cameras and the poses in their world."
     return f'<p class="legend">{escape(text)}</p>'
+
+
+def _tracking(report: Report) -> str:
+    """Grades of poses that were tracked in the video, and where they are doubtful."""
+    found = report.tracking
+    if found is None:
+        return ""
+    rows = "".join(
+        f"<tr><td>{each['start_s']:.1f} to {each['end_s']:.1f} s</td>"
+        f"<td>{escape(each['reason'])}</td></tr>"
+        for each in found["doubtful"]
+    )
+    return f'<p class="legend">{escape(found["summary"])}</p>' + (
+        f"<table><tr><th>doubtful</th><th>why</th></tr>{rows}</table>" if rows else ""
+    )
 
 
 def _coverage(report: Report, body_map: str) -> str:

@@ -279,7 +279,11 @@ class ForgettingStats:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A whole report. `package` is None if none was written, `cameras` if none were solved."""
+    """A whole report.
+
+    `package` is None if none was written, `cameras` if none were solved, `tracking` if poses were
+    given.
+    """
 
     command: dict[str, Any]
     recipe: dict[str, Any]
@@ -294,6 +298,7 @@ class Report:
     coverage: CoverageStats | None = None
     earlier_videos: ForgettingStats | None = None
     cameras: dict[str, Any] | None = None
+    tracking: dict[str, Any] | None = None
     format: int = REPORT_FORMAT
 
     @property
@@ -307,7 +312,7 @@ class Report:
         content = to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
         order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
         order += ("held_out", "held_out_refined", "curve", "stream", "package", "coverage")
-        order += ("earlier_videos", "cameras")
+        order += ("earlier_videos", "cameras", "tracking")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 

@@ -13,6 +13,7 @@ from apps.cli.capture_options import mask_inversion, parse_frame_range
 from apps.cli.output_paths import check_output_file
 from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
+from apps.tracking.person_tracking import needs_stream_tracking, open_stream
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
@@ -44,11 +45,16 @@ class IngestArguments:
 
     Try it:
 
-        ia-ingest video.mp4 --poses poses.npz --out run
+        ia-ingest video.mp4 --out run
 
     `run` then holds avatar.iavatar (play it: ia-play), report.json, report.html (look at it) and
-    checkpoint/. Masks and cameras are searched for next to the video, then next to the poses, as
-    masks/ and cameras.npz; a capture folder contains everything.
+    checkpoint/. Poses and masks are found in the video by the built-in tracker (ia-track) and are
+    kept in tracking/; those of another tracker are used if they are given:
+
+        ia-ingest video.mp4 --poses poses.npz --masks masks --out run
+
+    Masks and cameras are searched for next to the video, then next to the poses, as masks/ and
+    cameras.npz; a capture folder contains everything.
 
     Exit codes: 0 done; 1 trained, but the avatar is not usable (verdict "failed" in the report; the
     package is written if there is anything to draw); 2 bad input; 3 disk full, device or run folder
@@ -61,13 +67,18 @@ class IngestArguments:
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """SMPL poses: an .npz with global_orient, body_pose, transl (or poses, trans), or the output of
     4D-Humans, WHAM, VIBE, GVHMR, TRAM, PromptHMR, ROMP, BEV or EasyMocap (a file, or a folder of
-    files); see docs/formats.md. Pickles are read without executing them."""
+    files); see docs/formats.md. Pickles are read without executing them. Default: tracked in the
+    video."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
-    """Person ID in the pose file (default: the longest track)."""
+    """Person ID in the pose file (default: the longest track); without poses, which person to
+    track: 1 is the leftmost (default: the one in front)."""
+    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Another installed tracker to use where no --poses are given (default: blazepose, the built-in
+    one; docs/formats.md)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, one per frame, 255 where the person is: a folder of images, a video, an .npz, or COCO
-    run-length codes. Default: estimated from images and poses (segmenter:grabcut);
-    segmenter:NAME selects another installed segmenter."""
+    run-length codes. Default: tracked with the poses, or estimated from images and given poses
+    (segmenter:grabcut); segmenter:NAME selects another installed segmenter."""
     mask_invert: Flag = False
     """Masks are dark where the person is (default: detected automatically)."""
     no_mask_invert: Flag = False
@@ -100,10 +111,11 @@ class IngestArguments:
     """Simulate a live camera: deliver frames at their timestamps. The avatar is ready when the
     video ends; extra --seconds continue training after the last frame."""
     live: Flag = False
-    """VIDEO is a folder to which another program is still writing images, while a tracker writes
-    the poses (the .npz repeatedly, or a .jsonl, one line per frame) and masks named like the images
-    appear in --masks. The run ends with a file named DONE in the folder, after --idle-seconds
-    without new data, after --seconds, or by Ctrl-C. A camera is live without this flag."""
+    """VIDEO is a folder to which another program is still writing images. A tracker may write the
+    poses meanwhile to --poses (the .npz repeatedly, or a .jsonl, one line per frame), and masks
+    named like the images to --masks; without --poses the person is tracked here. The run ends
+    with a file named DONE in the folder, after --idle-seconds without new data, after --seconds,
+    or by Ctrl-C. A camera is live without this flag."""
     idle_seconds: float = IDLE_TIMEOUT_S
     """Stop a live source after this many seconds without new data; also the limit for the first
     frame and pose."""
@@ -211,6 +223,7 @@ class IngestArguments:
             ),
             live=self.live,
             person=self.person,
+            tracker=self.tracker,
             idle_s=self.idle_seconds,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
@@ -230,6 +243,11 @@ class IngestArguments:
         """Open the capture that the arguments name."""
         run = self.run_folder()
         resumes = self.resume and run.has_checkpoint() and run.body_file.is_file()
+        if self.tracks_stream:
+            person = run.body_file if resumes else None
+            recording = open_stream(self.capture_inputs(), run.tracked_poses, person)
+            size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
+            return replace(recording, size_px=size_px)
         recording = open_capture(self.capture_inputs())
         if resumes:
             fit = load_capture_fit(run.fit_file, recording.identity)
@@ -238,6 +256,11 @@ class IngestArguments:
         size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
         recording = replace(recording, size_px=size_px)
         return recording.in_real_time() if self.realtime else recording
+
+    @property
+    def tracks_stream(self) -> bool:
+        """Whether poses are missing and must be tracked while frames come."""
+        return needs_stream_tracking(self.capture_inputs(), realtime=self.realtime)
 
     def training_seconds(self, recording: Capture) -> float:
         """Return the training time: as given, else the clip's duration, else a minute.

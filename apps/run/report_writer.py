@@ -298,6 +298,7 @@ def _build_report(
         coverage=CoverageStats.of(result.coverage),
         earlier_videos=result.earlier_videos,
         cameras=capture.camera_report,
+        tracking=capture.tracking_report,
     )
 
 

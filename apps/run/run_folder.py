@@ -75,6 +75,21 @@ class RunFolder:
         return self.path / "poses.npz"
 
     @property
+    def tracking(self) -> Path:
+        """Folder of the poses and masks that were tracked in the video, if none were given."""
+        return self.path / "tracking"
+
+    @property
+    def tracked_poses(self) -> Path:
+        """The poses that were tracked in the video."""
+        return self.tracking / "poses.npz"
+
+    @property
+    def tracking_grade(self) -> Path:
+        """Grades of the tracked poses, and what they were tracked for."""
+        return self.tracking / "grade.json"
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """All files that a run may write, except for the stages of camera solving."""
         top = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
@@ -207,7 +222,7 @@ class RunFolder:
         for path in self.files:
             if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
-        for folder in (self.checkpoint, self.path / "cameras"):
+        for folder in (self.checkpoint, self.path / "cameras", self.tracking):
             if os.path.lexists(folder) and not folder.is_dir():
                 return folder
         lists = (OutputFileList(self.path), OutputFileList(self.checkpoint))

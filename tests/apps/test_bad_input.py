@@ -45,8 +45,9 @@ def test_a_video_that_is_not_there(refused, tmp_path):
     refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4", "exist"])
 
 
-def test_poses_that_were_not_named(refused, capture):
-    refused(capture / "video.mp4", words=["--poses"])
+def test_a_video_that_cannot_be_tracked(refused, capture):
+    (capture / "masks").rename(capture / "elsewhere")
+    refused(capture / "video.mp4", words=["person", "--poses"])
 
 
 @pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:grabcut"]])

@@ -1,0 +1,171 @@
+"""ia-track: find poses, masks and camera of the person in a video."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from apps.cli.capture_options import mask_inversion, parse_frame_range
+from apps.cli.command_line import parse_arguments
+from apps.cli.console import Console
+from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
+from apps.cli.interrupt import stop_on_interrupt
+from apps.cli.output_paths import check_output_file, check_output_folder
+from apps.tracking.person_tracking import print_grade, track_person
+from apps.tracking.skeleton_film import write_skeleton_film
+from capture.atomic_files import write_text_atomically
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from preprocess.capture_session import CaptureInputs
+
+PROGRAM = "ia-track"
+NOT_GOOD_ENOUGH = 1
+"""Exit code of poses that were written, but are not good enough for an avatar."""
+Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackArguments:
+    """Find poses, masks and camera of the person in a video, and grade them.
+
+    Neural networks (BlazePose) find key points and a mask in each frame; then one body, its poses
+    and the focal length are fitted to all of them. It needs about 60 ms per frame on one core and
+    no graphics card. ia-ingest does the same by itself where no --poses are given; run ia-track to
+    look at the poses first, or to use them elsewhere. Try it:
+
+        ia-track video.mp4 --out tracked/poses.npz
+
+        ia-ingest video.mp4 --poses tracked/poses.npz
+
+    `tracked` then holds poses.npz (SMPL's keys: global_orient, body_pose, transl; and K, the key
+    points, and the body's proportions. The angles belong to the embedded body, model "body24", not
+    to SMPL's shape), masks/, skeleton.webm (look at it) and grade.json.
+
+    It works best on one person, from head to feet in the picture, in a video of a camera that
+    stands still. Hidden limbs are guessed, and fast ones are often wrong.
+
+    Exit codes: 0 the poses are good enough for an avatar; 1 they are not, but were written; 2 bad
+    input, or no person was found; 3 disk full; 130 Ctrl-C, after what was found so far was written.
+    """
+
+    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
+    """Video file, folder of images, or capture folder."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Poses to write, .npz; the rest is written beside it (default: runs/NAME-tracked/poses.npz,
+    named after the video)."""
+    person: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Which person: 1 is the leftmost in the first frame that shows a person (default: the one in
+    front)."""
+    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Another installed tracker to use (default: blazepose, the built-in one; docs/formats.md)."""
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Masks to use instead of tracked ones, as ia-ingest takes them."""
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Cameras, as ia-ingest takes them (default: a camera that stands still; its focal length is
+    fitted)."""
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Your own SMPL body; the poses are then SMPL's (default: the embedded body)."""
+    frames: str = "::"
+    """Frames to use: START:STOP:STEP, counted from 0 (default: all; of a long video every nth, 600
+    at most)."""
+    film: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Draw skeleton.webm."""
+    overwrite: Flag = False
+    """Replace files that exist."""
+
+    def poses_path(self) -> Path:
+        """Return the path of the poses."""
+        name = self.video.resolve()
+        own = name.name if name.is_dir() else name.stem
+        return self.out or Path("runs") / f"{own}-tracked" / "poses.npz"
+
+    def capture_inputs(self) -> CaptureInputs:
+        """Return the inputs to open.
+
+        Raises:
+            InputError: If they cannot be tracked.
+        """
+        if camera_address(self.video) is not None:
+            raise InputError(f"{self.video} is a camera, but ia-track needs a recording.")
+        if self.person is not None and self.person < 1:
+            raise InputError(f"--person is {self.person}, but must be at least 1 (the leftmost).")
+        if self.cameras == "solve":
+            raise InputError(
+                "--cameras solve needs poses first. Track with --cameras static, then run "
+                "ia-ingest with --poses and --cameras solve."
+            )
+        return CaptureInputs(
+            video=self.video,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parse_frame_range(self.frames),
+            invert_masks=mask_inversion(person_dark=False, person_bright=False),
+            person=None if self.person is None else str(self.person),
+            tracker=self.tracker,
+        )
+
+    def check_outputs(self) -> None:
+        """Check that the outputs can be written.
+
+        Raises:
+            InputError: If one cannot.
+        """
+        poses, inputs = self.poses_path(), self.capture_inputs().input_paths()
+        if poses.suffix.lower() != ".npz":
+            raise InputError(f"--out is {poses}, but must end in .npz.")
+        for path in (poses, self.grade_path(), self.film_path()):
+            check_output_file(path, "--out", inputs, overwrite=self.overwrite)
+        if self.masks is None:
+            check_output_folder(poses.parent / "masks", "--out")
+
+    def grade_path(self) -> Path:
+        """Return the path of the grades."""
+        return self.poses_path().with_name("grade.json")
+
+    def film_path(self) -> Path:
+        """Return the path of the film."""
+        return self.poses_path().with_name("skeleton.webm")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    given = parse_arguments(TrackArguments, PROGRAM, argv)
+    return run_command(PROGRAM, lambda: track(given, Console()))
+
+
+def track(arguments: TrackArguments, console: Console) -> int:
+    """Track the person, and write poses, masks, film and grades.
+
+    Raises:
+        InputError: If the video cannot be read, or no person is found in it.
+        OSError: If the disk is full.
+    """
+    inputs, poses = arguments.capture_inputs(), arguments.poses_path()
+    arguments.check_outputs()
+    with stop_on_interrupt(console, "writing what was found so far") as stop:
+        tracking = track_person(inputs, poses, console, stop=stop, may_replace=arguments.overwrite)
+        text = json.dumps(tracking.grade.as_json(), indent=1) + "\n"
+        write_text_atomically(arguments.grade_path(), text, replace=arguments.overwrite)
+        console.print_artifact("poses", poses)
+        if arguments.film and not stop.is_set():
+            with console.status("drawing the film"):
+                write_skeleton_film(
+                    arguments.film_path(),
+                    tracking.capture,
+                    tracking.grade.doubts,
+                    replace=arguments.overwrite,
+                )
+            console.print_artifact("look at it", arguments.film_path())
+    print_grade(tracking.grade, console)
+    if tracking.interrupted:
+        return INTERRUPTED
+    return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,269 @@
+"""Tracks the person of a recording, fits poses, body and camera, and writes them as files."""
+
+import threading
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from apps.cli.console import Console
+from capture.atomic_files import atomic_file, atomic_folder
+from capture.input_error import InputError
+from capture.live.camera_device import camera_address
+from capture.source import FrameSource
+from capture.source_opening import open_source
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.body.body_file import load_body_model
+from preprocess.body.silhouette import SkinPoints
+from preprocess.cameras.assumed_camera import assume_camera
+from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fitting import fit_capture
+from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_origin import segmenter_name
+from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.observe import associate_cameras, associate_masks
+from preprocess.open_capture import open_capture
+from preprocess.open_stream import open_tracked_stream
+from preprocess.poses.pose_file import write_motion
+from preprocess.tracking.pose_lift import lift_keypoints
+from preprocess.tracking.tracker_registry import DEFAULT_TRACKER, make_tracker
+from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
+from preprocess.tracking.video_tracking import TrackedVideo, track_video
+
+GRADED_FRAMES = 60
+"""Frames, evenly spread, whose masks are compared with the body."""
+MAX_PRINTED_STRETCHES = 8
+"""Doubtful stretches that are printed; reports hold all of them."""
+MAX_FRAMES = 600
+"""Most frames that are tracked unless --frames says which; of longer videos every nth."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonTracking:
+    """The tracked person of a recording.
+
+    Attributes:
+        capture: The recording with poses, masks, camera and body, fitted to each other.
+        inputs: What opens the same from the files that were written.
+        grade: How good the poses are.
+        interrupted: Whether tracking was stopped before the last frame.
+    """
+
+    capture: Capture
+    inputs: CaptureInputs
+    grade: TrackingGrade
+    interrupted: bool
+
+
+def needs_tracking(inputs: CaptureInputs) -> bool:
+    """Whether a recording comes without poses, so that its person must be tracked."""
+    if inputs.live or camera_address(inputs.video) is not None or inputs.poses is not None:
+        return False
+    return inputs.video.exists() and find_own_poses(inputs.video) is None
+
+
+def needs_stream_tracking(inputs: CaptureInputs, *, realtime: bool) -> bool:
+    """Whether the person must be tracked while frames come.
+
+    Args:
+        inputs: What the user named.
+        realtime: Whether a recording is played at its own speed.
+    """
+    if camera_address(inputs.video) is not None:
+        return inputs.poses is None
+    if inputs.live:
+        return inputs.poses is None and not find_live_poses(inputs.video)
+    return realtime and needs_tracking(inputs)
+
+
+def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = None) -> Capture:
+    """Open a stream without poses with this project's tracker; see `open_tracked_stream`.
+
+    Raises:
+        InputError: If it cannot be read, no person is found in it, or masks were named.
+    """
+    if inputs.masks is not None:
+        raise InputError(
+            "--masks cannot be joined with poses that are tracked while frames come. Leave it out, "
+            "or give --poses too (ia-track writes them)."
+        )
+    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
+    return open_tracked_stream(inputs, tracker, MaskRefiner, poses, avatar_body=avatar_body)
+
+
+def limit_frames(inputs: CaptureInputs, source: FrameSource) -> CaptureInputs:
+    """Choose every nth frame of a long recording, unless the user chose some."""
+    count = source.frame_count or 0
+    if inputs.frames is not None or count <= MAX_FRAMES:
+        return inputs
+    return replace(inputs, frames=slice(None, None, -(-count // MAX_FRAMES)))
+
+
+def track_person(
+    inputs: CaptureInputs,
+    poses: Path,
+    console: Console,
+    *,
+    stop: threading.Event | None = None,
+    may_replace: bool | None = None,
+) -> PersonTracking:
+    """Track the person, and write poses and masks.
+
+    Masks that were given, or lie beside the video, are used instead of tracked ones; so are
+    cameras.
+
+    Args:
+        inputs: A recording without poses.
+        poses: File to write; masks are written to the folder masks/ beside it.
+        console: Shows progress.
+        stop: Ends tracking early once it is set; what was found until then is written.
+        may_replace: Whether an existing file of poses may be replaced, as in `atomic_file`.
+
+    Raises:
+        InputError: If the recording cannot be read, or no person is found in it.
+        OSError: If the files cannot be written.
+    """
+    inputs = limit_frames(inputs, open_source(inputs.video, frames=inputs.frames))
+    source = open_source(inputs.video, frames=inputs.frames)
+    folder = poses.parent / "masks"
+    own_masks = not source.has_alpha and _given_masks(inputs) is None
+    with atomic_folder(folder) if own_masks else nullcontext() as part:
+        tracked = _run_networks(source, inputs, part, console, stop)
+        with console.status("fitting body and poses to key points and masks"):
+            capture = _fit_capture(source, tracked, inputs, part)
+            grade = _grade(capture, tracked.frame_times_s)
+        with atomic_file(poses, replace=may_replace) as unfinished:
+            write_motion(unfinished, capture.motion)
+    inputs = replace(inputs, poses=poses, person=None)
+    if own_masks:
+        inputs = replace(inputs, masks=folder, invert_masks=False)
+        capture = replace(capture, masks=open_masks(folder, invert=False))
+    return PersonTracking(
+        capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
+    )
+
+
+def _given_masks(inputs: CaptureInputs) -> Path | None:
+    """Masks that the user named, or that lie beside the video."""
+    if segmenter_name(inputs.masks) is not None:
+        return None
+    return inputs.masks or find_own_masks(inputs.video)
+
+
+def _run_networks(
+    source: FrameSource,
+    inputs: CaptureInputs,
+    mask_folder: Path | None,
+    console: Console,
+    stop: threading.Event | None,
+) -> TrackedVideo:
+    """Find key points and masks in each frame."""
+    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
+    with console.progress("tracking the person", float(source.frame_count or 1)) as bar:
+        return track_video(
+            source,
+            tracker,
+            MaskRefiner(source.size_px),
+            mask_folder,
+            advance=bar.set_count,
+            stop=stop,
+        )
+
+
+def _fit_capture(
+    source: FrameSource, tracked: TrackedVideo, inputs: CaptureInputs, masks: Path | None
+) -> Capture:
+    """The recording with poses lifted from the key points and fitted to them and to the masks."""
+    shaped = load_body_model(inputs.body).with_shape()
+    lifted = lift_keypoints(
+        tracked.keypoints, shaped, assume_camera(inputs.video, inputs.cameras, source)
+    )
+    lifted = replace(lifted, space="camera")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.npz"
+        write_motion(path, lifted)
+        there = replace(inputs, poses=path, person=None, height_m=None)
+        if masks is not None:
+            there = replace(there, masks=masks, invert_masks=False)
+        capture = open_capture(there, skip_checks=True)
+        fit = fit_capture(capture)
+    if fit is None:
+        return capture
+    geometry = CaptureGeometry.of(capture.motion, capture.cameras, source)
+    cameras = fit.scale_focal_lengths(capture.cameras)
+    motion = replace(
+        fit.correct_motion(geometry),
+        proportions=fit.coefficients,
+        intrinsic=None if cameras.is_moving else cameras[0].intrinsic,
+    )
+    return replace(capture, motion=motion, cameras=cameras, shaped=fit.shape(capture.shaped))
+
+
+def person_number(person: str | None) -> int | None:
+    """The number in --person, by which persons of a video without poses are named.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if person is not None and not person.isdecimal():
+        raise InputError(
+            f"--person is {person!r}, but the video comes without poses: expected a number counted "
+            "from left to right, from 1."
+        )
+    return None if person is None else int(person)
+
+
+def grade_capture(capture: Capture) -> TrackingGrade | None:
+    """Grade poses that hold the key points that they were made of; None if they do not."""
+    if capture.motion.keypoints is None:
+        return None
+    return _grade(capture, _even_frame_times(capture.source))
+
+
+def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrade:
+    """Grade tracked poses.
+
+    Args:
+        capture: The recording, with masks and tracked poses.
+        frame_times_s: Time of each frame that was looked at, by its number.
+    """
+    source, keypoints = capture.source, capture.motion.keypoints
+    assert keypoints is not None
+    sampled = sample_masks(
+        source,
+        capture.masks,
+        associate_masks(capture.masks, source),
+        associate_cameras(capture.cameras, source),
+        SkinPoints.of(capture.shaped),
+        count=GRADED_FRAMES,
+        excluded_frames=capture.cameras.frames_without_camera,
+    )
+    scores = sampled.frame_scores(CaptureGeometry.of(capture.motion, capture.cameras, source))
+    return grade_tracking(
+        capture.motion,
+        keypoints,
+        capture.shaped,
+        capture.cameras[0],
+        frame_times_s,
+        {each.index: float(score) for each, score in zip(sampled.samples, scores, strict=True)},
+    )
+
+
+def _even_frame_times(source: FrameSource) -> dict[int, float]:
+    """Times of the wanted frames of a recording with an even rate, by their numbers."""
+    count, chosen = source.frame_count or 0, source.selection
+    step_s = (source.duration_s or 0.0) / max(1, chosen.span(source.frames_in_file))
+    numbers = [chosen.start + chosen.step * place for place in range(count)]
+    return {number: number * step_s for number in numbers}
+
+
+def print_grade(grade: TrackingGrade, console: Console) -> None:
+    """Print the doubtful stretches and the verdict."""
+    for each in grade.stretches[:MAX_PRINTED_STRETCHES]:
+        console.info(f"  doubtful: {each.describe()}")
+    if len(grade.stretches) > MAX_PRINTED_STRETCHES:
+        console.info(f"  … and {len(grade.stretches) - MAX_PRINTED_STRETCHES} more")
+    console.info(grade.describe())

@@ -1,0 +1,102 @@
+"""A film of the tracked person for checking: the body's skeleton and outline over the frames."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.atomic_files import atomic_file
+from capture.video_encoder import video_encoder
+from preprocess.body.silhouette import SkinPoints, splat_silhouette
+from preprocess.capture_session import Capture
+from preprocess.observation import Observation
+from preprocess.observe import shrink_to_longer_side
+
+LONGER_SIDE_PX = 720
+"""Longer side of the film, px."""
+SILHOUETTE_PX = 256
+"""Longer side of the images in which the body's outline is found, px."""
+LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
+"""RGB colors of the person's left and right limbs, and of trunk and head."""
+MASK_COLOR, BODY_COLOR, DOUBT_COLOR = (255, 255, 255), (255, 120, 0), (255, 60, 60)
+"""RGB colors of the mask's outline, the body's outline, and of doubts."""
+LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
+"""Joints of SMPL's tree on the person's left."""
+RIGHT_JOINTS = frozenset({2, 5, 8, 11, 14, 17, 19, 21, 23})
+"""Joints of SMPL's tree on the person's right."""
+
+Rgb = UInt8[np.ndarray, "height width 3"]
+
+
+def write_skeleton_film(
+    path: Path, capture: Capture, doubts: Mapping[int, str], *, replace: bool | None = None
+) -> int:
+    """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
+
+    Args:
+        path: Video to write, .webm or .mp4.
+        capture: The video with its tracked poses and masks.
+        doubts: Why frames are doubtful, by their numbers.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
+
+    Returns:
+        Number of frames drawn.
+
+    Raises:
+        InputError: If this OpenCV cannot write such a video.
+        OSError: If it cannot be written.
+    """
+    source = capture.source
+    count, duration = source.frame_count or 1, source.duration_s
+    fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
+    with atomic_file(path, replace=replace) as part:
+        encoder = video_encoder(path.suffix, transparent=False)
+        return encoder.write(part, _draw_frames(capture, doubts), fps)
+
+
+def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
+    skin = SkinPoints.of(capture.shaped)
+    for item in capture.observations():
+        if not isinstance(item, Observation):
+            continue
+        picture = item.frame.rgb.copy()
+        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
+        drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
+        _draw_outline(picture, item.alpha > 0.5, MASK_COLOR)
+        _draw_outline(picture, cv2.resize(drawn, item.frame.size_px) > 0.5, BODY_COLOR)
+        joints = capture.shaped.with_pose(item.pose).joints()
+        pixels = item.camera.project(joints)
+        for joint, parent in enumerate(capture.shaped.body.parents):
+            if parent >= 0:
+                _draw_bone(picture, pixels[parent], pixels[joint], _joint_color(joint))
+        doubt = doubts.get(item.frame.index, "")
+        _draw_text(picture, f"{item.frame.time_s:5.1f} s  {doubt}".rstrip(), bool(doubt))
+        yield picture
+
+
+def _joint_color(joint: int) -> tuple[int, int, int]:
+    if joint in LEFT_JOINTS:
+        return LEFT_COLOR
+    return RIGHT_COLOR if joint in RIGHT_JOINTS else MIDDLE_COLOR
+
+
+def _draw_bone(
+    picture: Rgb, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]
+) -> None:
+    ends = [tuple(int(v) for v in np.clip(16.0 * end, -1e6, 1e6)) for end in (one, other)]
+    cv2.line(picture, ends[0], ends[1], (20, 20, 20), 5, cv2.LINE_AA, shift=4)
+    cv2.line(picture, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
+
+
+def _draw_outline(picture: Rgb, inside: np.ndarray, color: tuple[int, int, int]) -> None:
+    found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, found, -1, color, 1, cv2.LINE_AA)
+
+
+def _draw_text(picture: Rgb, text: str, doubtful: bool) -> None:
+    for color, thick in (((20, 20, 20), 3), (DOUBT_COLOR if doubtful else MASK_COLOR, 1)):
+        cv2.putText(
+            picture, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, thick, cv2.LINE_AA
+        )

@@ -1,0 +1,129 @@
+"""Tracks the person of a run whose video comes without poses; a resumed run reads its own."""
+
+import json
+import shlex
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+from apps.cli.console import Console
+from apps.run.ingest_arguments import IngestArguments
+from apps.run.run_folder import RunFolder
+from apps.tracking.person_tracking import PersonTracking, needs_tracking, print_grade, track_person
+from capture.atomic_files import write_text_atomically
+from capture.input_error import InputError
+from capture.output_file_list import OutputFileList
+from preprocess.capture_paths import find_own_poses
+from preprocess.capture_session import CaptureInputs
+
+
+def track_missing_poses(
+    arguments: IngestArguments, run: RunFolder, console: Console
+) -> IngestArguments:
+    """Return the arguments with poses and masks that were tracked in the video.
+
+    Unchanged if poses were given, or the source is live. Poses are written to the run's folder
+    tracking/, as ia-track writes them.
+
+    Raises:
+        InputError: If the video cannot be read, or no person is found in it.
+        OSError: If the disk is full.
+    """
+    inputs = arguments.capture_inputs()
+    if arguments.tracks_stream or not needs_tracking(inputs):
+        return arguments
+    stored = _read_stored(run) if arguments.resume else None
+    asked = _describe_request(arguments)
+    if stored is None or stored["request"] != asked:
+        beside = find_own_poses(arguments.video.parent)
+        if beside is not None:
+            console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
+        tracking = _track(inputs, run, console)
+        chosen = tracking.inputs.frames
+        stored = {
+            "request": asked,
+            "frames": None if chosen is None else [chosen.start, chosen.stop, chosen.step],
+            "masks": tracking.inputs.masks == run.tracking / "masks",
+            "grade": tracking.grade.as_json(),
+        }
+        write_text_atomically(run.tracking_grade, json.dumps(stored, indent=1) + "\n")
+        if tracking.grade.is_good_enough or arguments.force:
+            print_grade(tracking.grade, console)
+        else:
+            _remove_tracking(run)
+            look = shlex.join(["ia-track", str(arguments.video)])
+            raise InputError(
+                f"{tracking.grade.describe()} Look at the poses ({look}), film the person again, "
+                "or give --poses of another tracker. To train anyway, pass --force."
+            )
+    return _with_stored(arguments, run, stored)
+
+
+def read_tracked_poses(arguments: IngestArguments, run: RunFolder) -> IngestArguments:
+    """Return a finished run's arguments with the poses and masks that were tracked for it."""
+    stored = _read_stored(run)
+    is_own = stored is not None and stored["request"] == _describe_request(arguments)
+    return _with_stored(arguments, run, stored) if stored is not None and is_own else arguments
+
+
+def _with_stored(
+    arguments: IngestArguments, run: RunFolder, stored: dict[str, Any]
+) -> IngestArguments:
+    frames, text = stored["frames"], arguments.frames
+    if frames is not None:
+        text = ":".join("" if each is None else str(each) for each in frames)
+    masks = run.tracking / "masks" if stored["masks"] else arguments.masks
+    return replace(arguments, poses=run.tracked_poses, masks=masks, frames=text, person=None)
+
+
+def remove_unused_tracking(arguments: IngestArguments, run: RunFolder) -> None:
+    """Remove what was tracked for an older run in the same folder, unless this run uses it."""
+    if arguments.poses != run.tracked_poses and not arguments.resume:
+        _remove_tracking(run)
+
+
+def read_tracking_report(arguments: IngestArguments, run: RunFolder) -> dict[str, Any] | None:
+    """Return the grades of the poses that were tracked for a run; None if they were given."""
+    stored = _read_stored(run) if arguments.poses == run.tracked_poses else None
+    return None if stored is None else stored["grade"]
+
+
+def _track(inputs: CaptureInputs, run: RunFolder, console: Console) -> PersonTracking:
+    """Track the person into the run's folder; leave no empty folder if that fails."""
+    run.tracking.mkdir(parents=True, exist_ok=True)
+    OutputFileList(run.tracking).create()
+    try:
+        return track_person(inputs, run.tracked_poses, console)
+    finally:
+        OutputFileList(run.tracking).remove_if_empty()
+        with suppress(OSError):  # not empty
+            run.tracking.rmdir()
+
+
+def _remove_tracking(run: RunFolder) -> None:
+    """Remove tracked poses and masks."""
+    for folder in (run.tracking / "masks", run.tracking):
+        OutputFileList(folder).remove_all()
+        with suppress(OSError):  # not empty, or missing
+            folder.rmdir()
+
+
+def _describe_request(arguments: IngestArguments) -> dict[str, Any]:
+    """What decides the tracked poses; poses of another request are tracked again."""
+    named = {
+        name: None if value is None else str(value)
+        for name, value in vars(arguments).items()
+        if name in ("masks", "cameras", "body", "frames", "person", "tracker")
+    }
+    return {"video": str(arguments.video.resolve()), **named}
+
+
+def _read_stored(run: RunFolder) -> dict[str, Any] | None:
+    """Return what was tracked for the run before; None if that cannot be used."""
+    try:
+        stored = json.loads(run.tracking_grade.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    expected = {"request", "frames", "masks", "grade"}
+    usable = isinstance(stored, dict) and stored.keys() == expected
+    return stored if usable and run.tracked_poses.is_file() else None

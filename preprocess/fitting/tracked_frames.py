@@ -1,0 +1,197 @@
+"""Fits the poses of a stream's frames one by one, to the key points and the mask of each.
+
+The first frames settle proportions and focal length, which stay; each later pose is fitted together
+with those of the last few frames, so that it moves as people do.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Float32
+
+from capture.camera import Camera
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import ProportionSpace
+from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.keypoint_rows import ClipKeypoints
+from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
+from preprocess.fitting.pose_priors import HumanPosePrior
+from preprocess.observe import shrink_to_longer_side
+from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import PersonKeypoints
+from preprocess.tracking.pose_lift import lift_keypoints
+
+WINDOW_FRAMES = 8
+"""Frames whose poses are fitted together while a stream runs."""
+SIGMA_LOG_ASSUMED_FOCAL = 0.2
+"""Prior standard deviation of the logarithm of an assumed focal length."""
+FIRST_ITERATIONS = (5, 5)
+"""Iterations over the first frames, with key points alone and then with outlines."""
+FRAME_ITERATIONS = (1, 1)
+"""The same for each later frame."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeenPerson:
+    """What was found of the person in one frame of a stream.
+
+    Attributes:
+        number: The frame's.
+        time_s: When it was filmed, seconds.
+        keypoints: Key points, in pixels of the frame.
+        mask: How far each pixel of the reduced frame is person, in [0, 1].
+    """
+
+    number: int
+    time_s: float
+    keypoints: PersonKeypoints
+    mask: Float32[np.ndarray, "rows columns"]
+
+
+def reduced_size_px(person: PersonKeypoints, frame_px: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of the frame at which a person is as tall as outlines need it to be."""
+    tall = max(1.0, float(np.ptp(person.image_px[:, 1])))
+    return shrink_to_longer_side(frame_px, max(32, round(max(frame_px) * OUTLINE_PERSON_PX / tall)))
+
+
+def fit_first_frames(
+    seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera, *, fixed: bool = False
+) -> tuple[Motion, ShapedBody, Camera]:
+    """Fit proportions, focal length and poses to the first frames of a stream.
+
+    Args:
+        seen: The frames.
+        shaped: The body's mean shape, or the person.
+        camera: Camera of the frames, whose focal length is a guess.
+        fixed: Whether the body is the person's, and its proportions stay.
+
+    Returns:
+        Poses of the frames, the person, and the camera.
+    """
+    space = ProportionSpace.around(shaped)
+    fitter = _fitter(seen, None, OutlineModel(space), camera, outlined=len(seen))
+    everything = FitParameters(proportions=not fixed)
+    for _ in range(FIRST_ITERATIONS[0]):
+        fitter.iterate(everything._replace(outlines=False))
+    for _ in range(FIRST_ITERATIONS[1]):
+        fitter.iterate(everything)
+    factor = float(np.exp(fitter.log_focal))
+    focal_px = (camera.focal_px[0] * factor, camera.focal_px[1] * factor)
+    poses = [fitter.pose(index) for index in range(len(seen))]
+    motion = _as_motion(seen, poses, space.shaped, camera)
+    return motion, space.shape(fitter.coefficients), replace(camera, focal_px=focal_px)
+
+
+@final
+class FramePoseFitter:
+    """Fits the pose of each new frame of a stream, for a known person and camera.
+
+    Attributes:
+        mask_px: Width and height of the reduced masks.
+    """
+
+    def __init__(self, shaped: ShapedBody, camera: Camera, mask_px: tuple[int, int]) -> None:
+        """Start without frames.
+
+        Args:
+            shaped: The person.
+            camera: Camera of the frames.
+            mask_px: Width and height of the reduced masks.
+        """
+        self.mask_px = mask_px
+        self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
+        self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
+        self._poses: deque[BodyPose] = deque(maxlen=WINDOW_FRAMES)
+
+    def fit(self, seen: SeenPerson, start: BodyPose | None = None) -> BodyPose:
+        """Fit the pose of the next frame.
+
+        Args:
+            seen: What was found in it.
+            start: Its pose, if it is known nearly; None lifts it from the key points.
+        """
+        self._seen.append(seen)
+        shaped = self._model.space.shaped
+        if start is None:
+            start = _lift([seen], shaped, self._camera)[0]
+        self._poses.append(start)
+        fitter = _fitter(self._seen, self._poses, self._model, self._camera, outlined=1)
+        poses_only = FitParameters(proportions=False, focal=False)
+        for _ in range(FRAME_ITERATIONS[0]):
+            fitter.iterate(poses_only._replace(outlines=False))
+        for _ in range(FRAME_ITERATIONS[1]):
+            fitter.iterate(poses_only)
+        self._poses = deque(
+            (fitter.pose(index) for index in range(len(self._seen))), maxlen=WINDOW_FRAMES
+        )
+        return self._poses[-1]
+
+
+def _lift(seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera) -> Motion:
+    """First guess of the frames' poses."""
+    return lift_keypoints(_track(seen, camera), shaped, camera)
+
+
+def _track(seen: Sequence[SeenPerson], camera: Camera) -> KeypointTrack:
+    return KeypointTrack.of(
+        [each.number for each in seen],
+        [each.keypoints for each in seen],
+        camera.size_px,
+        [each.time_s for each in seen],
+    )
+
+
+def _fitter(
+    seen: Sequence[SeenPerson],
+    poses: Sequence[BodyPose] | None,
+    model: OutlineModel,
+    camera: Camera,
+    *,
+    outlined: int,
+) -> ClipFitter:
+    """The fit of some frames, of which the last ones are compared with their masks."""
+    shaped = model.space.shaped
+    motion = (
+        _lift(seen, shaped, camera) if poses is None else _as_motion(seen, poses, shaped, camera)
+    )
+    height, width = seen[0].mask.shape
+    small = camera.resize((width, height))
+    frames = [
+        ClipFrame(
+            row=row,
+            number=float(each.number),
+            camera=small,
+            mask=OutlineDistances.of(each.mask, small) if row >= len(seen) - outlined else None,
+        )
+        for row, each in enumerate(seen)
+    ]
+    cameras = [small] * len(frames)
+    keypoints = ClipKeypoints.of(
+        _track(seen, camera), [each.number for each in seen], cameras, shaped.joints
+    )
+    rotations = np.stack([each.camera_from_world[:3, :3] for each in cameras])
+    times = np.array([each.time_s for each in seen])
+    return ClipFitter(
+        motion, model.space, frames, model=model, keypoints=keypoints,
+        prior=HumanPosePrior(rotations, times), sigma_log_focal=SIGMA_LOG_ASSUMED_FOCAL,
+    )  # fmt: skip
+
+
+def _as_motion(
+    seen: Sequence[SeenPerson], poses: Sequence[BodyPose], shaped: ShapedBody, camera: Camera
+) -> Motion:
+    return Motion(
+        root_rotations=np.stack([pose.root_rotation for pose in poses]),
+        root_translations=np.stack([pose.root_translation for pose in poses]),
+        joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
+        valid=np.ones(len(poses), dtype=bool),
+        betas=np.zeros(shaped.body.shape_directions.shape[-1]),
+        body_model=shaped.body.family,
+        frames=np.array([each.number for each in seen]),
+        times_s=np.array([each.time_s for each in seen]),
+        intrinsic=camera.intrinsic,
+    )

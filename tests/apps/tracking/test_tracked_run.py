@@ -1,0 +1,78 @@
+"""ia-ingest of a video alone: the person is tracked first, or while the frames come."""
+
+import json
+
+import pytest
+
+from apps import ingest
+from apps.evaluation.evaluation_frames import held_out_frames
+from apps.run.run_folder import RunFolder
+from apps.tracking import tracked_run
+from avatar.training import warmup
+from preprocess.poses.pose_file import read_motion
+from tests.apps.conftest import Outcome
+
+
+@pytest.fixture
+def ingest_video(video, tmp_path, capsys, monkeypatch):
+    """Runs ia-ingest on the video; returns how it ended and the run's folder."""
+    monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
+
+    def call(*words, steps=10):
+        out = tmp_path / "run"
+        named = ["--out", out, "--steps", steps, *words]
+        code = ingest.main([str(word) for word in (video, *named)])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err), out
+
+    return call
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
+    done, out = ingest_video()
+    assert done.code == 0, done.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["tracking"]["good_enough"]
+    assert report["command"]["poses"] is None
+    assert report["frames"]["dropped"] == []
+    assert read_motion(out / "tracking" / "poses.npz").proportions is not None
+    assert "Good enough for an avatar" in (out / "report.html").read_text()
+    # a resumed run reads the poses that it has
+    monkeypatch.setattr(tracked_run, "track_person", None)
+    again, _ = ingest_video("--resume", steps=12)
+    assert again.code == 0, again.err
+    frames = held_out_frames(RunFolder(path=out), None)
+    assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_given_poses_replace_tracked_ones(ingest_video, filmed):
+    done, out = ingest_video("--frames", ":10")
+    assert done.code == 0, done.err
+    done, out = ingest_video("--poses", filmed / "poses.npz", "--overwrite")
+    assert done.code == 0, done.err
+    assert json.loads((out / "report.json").read_text())["tracking"] is None
+    assert not (out / "tracking").exists()
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video):
+    done, out = ingest_video("--realtime")
+    assert done.code == 0, done.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["stream"]["realtime"]
+    assert report["recipe"]["masks"] == "tracked"
+    assert report["frames"]["used"] >= 8
+
+
+def test_masks_cannot_be_joined_with_streamed_tracking(ingest_video, filmed):
+    done, _ = ingest_video("--realtime", "--masks", filmed / "masks")
+    assert done.code == 2
+    assert "--masks cannot be joined" in done.complaint()
+
+
+def test_person_must_be_a_number(ingest_video):
+    done, _ = ingest_video("--person", "anna")
+    assert done.code == 2
+    assert "counted from left to right" in done.complaint()
