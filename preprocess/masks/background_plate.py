@@ -20,7 +20,7 @@ CHANGED_DIFFERENCE = 12.0
 """Difference from the plate, in levels, of a background pixel that has changed."""
 MAX_CHANGED_FRACTION = 0.3
 """Fraction of changed background pixels from which the camera has moved."""
-STRIDE = 5
+STRIDE = 7
 """Gains are estimated from every n-th row and column."""
 MIN_SAMPLES = 50
 """Fewest known background pixels from which gains are estimated."""
@@ -67,7 +67,9 @@ class BackgroundPlate:
         known = background[some] & (self._frames[some] >= MIN_SEEN_FRAMES)
         if known.sum() < MIN_SAMPLES:
             return
-        seen, before = (each[:, ::STRIDE, ::STRIDE][:, known] for each in (image, self._mean))
+        seen, before = (
+            np.stack([plane[some][known] for plane in planes]) for planes in (image, self._mean)
+        )
         alike = np.ones(seen.shape[1], dtype=bool)
         for _ in range(2):  # again without what does not fit
             total = np.maximum((before[:, alike] ** 2).sum(axis=1), np.float32(1.0))

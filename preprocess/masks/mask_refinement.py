@@ -24,7 +24,7 @@ the frame, or smaller by a whole number."""
 RESCALE_MARGIN = 0.4
 """How far that number must be from the best before it changes."""
 
-OUTER_BAND, INNER_BAND = 7.0, 6.0
+OUTER_BAND, INNER_BAND = 6.0, 6.0
 """Reach of the band outside and inside the mask's border, in the network's pixels."""
 MARGIN = 4.0
 """Width of the background beyond the band that is looked at, in the network's pixels."""
@@ -35,9 +35,11 @@ SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
 
 LOCAL_SIGMA = 3.0
 """Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
+NEIGHBORS_PX = 3
+"""Reduction of the image from which they are learnt."""
 LOCAL_SPREAD = 14.0
 """Standard deviation of a color that the neighborhood's mean misses, in levels."""
-UNSEEN = 0.005
+UNSEEN = 0.02
 """Density of a color that no neighbor has, relative to `REFERENCE_SPREAD`."""
 REFERENCE_SPREAD = 16.0
 """Standard deviation, in levels, at whose peak a density is 1."""
@@ -59,7 +61,7 @@ FILTER_RADIUS_PX = 3
 """Radius of the guided filter's windows in the working image, px."""
 FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
-CONTRAST = 3.0
+CONTRAST = 2.0
 """Steepening of the filtered mask around 1/2."""
 PERSON_FREE_ALPHA = 0.05
 """Alpha below which a pixel enters the background plate."""
@@ -177,7 +179,7 @@ class MaskRefiner:
         odds *= np.exp(np.clip(ratio, np.float32(-MAX_LOG_RATIO), np.float32(MAX_LOG_RATIO)))
         alpha = band.inside.astype(np.float32)
         alpha[at] = odds / (np.float32(1.0) + odds)
-        return alpha
+        return _without_islands(alpha, band.inside)
 
     def _histogram_ratio(self, band: _Band) -> Pixels:
         """Log ratio of the colors' frequencies on the person and around them."""
@@ -236,6 +238,16 @@ def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | No
     ), far
 
 
+def _without_islands(alpha: Plane, inside: PixelMask) -> Plane:
+    """Clear parts that are cut off from the person, unless the network saw person there."""
+    _, found = cv2.connectedComponents((alpha > 0.5).astype(np.uint8), ltype=cv2.CV_16U)
+    labels = np.asarray(found, dtype=np.uint16)
+    kept = np.zeros(2**16, np.float32)
+    kept[0] = 1.0  # what is less likely person
+    kept[labels[inside]] = 1.0
+    return alpha * kept[labels]
+
+
 def _density(squared: Pixels, variance: Pixels) -> Pixels:
     """Density of a color at a squared distance from its mean, relative to the reference peak."""
     ratio = np.float32(REFERENCE_SPREAD**2) / variance
@@ -245,20 +257,19 @@ def _density(squared: Pixels, variance: Pixels) -> Pixels:
 def _local_densities(band: _Band, sigma_px: float) -> tuple[Pixels, Pixels]:
     """Density of the band's colors among the sure colors of person and of background near each.
 
-    Means and variances are those of the image of half the size.
+    Means and variances are those of a smaller image.
     """
     height, width = band.inside.shape
-    half_px = max(width // 2, 1), max(height // 2, 1)
-    planes = [cv2.resize(each, half_px, interpolation=cv2.INTER_AREA) for each in band.image]
+    small_px = -(-width // NEIGHBORS_PX), -(-height // NEIGHBORS_PX)
+    planes = [cv2.resize(each, small_px, interpolation=cv2.INTER_AREA) for each in band.image]
     planes.append(planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2)
-    rows = np.minimum(band.rows // 2, half_px[1] - 1)
-    index = rows * half_px[0] + np.minimum(band.columns // 2, half_px[0] - 1)
+    index = band.rows // NEIGHBORS_PX * small_px[0] + band.columns // NEIGHBORS_PX
 
     def density(chosen: PixelMask) -> Pixels:
-        share = cv2.resize(chosen.astype(np.float32), half_px, interpolation=cv2.INTER_AREA)
+        share = cv2.resize(chosen.astype(np.float32), small_px, interpolation=cv2.INTER_AREA)
         share = (share > 0.99).astype(np.float32)
         weight, *moments = (
-            cv2.GaussianBlur(each * share, (0, 0), sigma_px / 2.0).ravel()[index]
+            cv2.GaussianBlur(each * share, (0, 0), sigma_px / NEIGHBORS_PX).ravel()[index]
             for each in (np.ones_like(share), *planes)
         )
         inverse = np.float32(1.0) / np.maximum(weight, np.float32(1e-6))

@@ -121,3 +121,14 @@ def test_frame_without_a_person_gives_an_empty_mask() -> None:
     rgb, mask, _ = _frame(0, _background(1))
     empty = CroppedMask(values=np.zeros_like(mask.values), image_from_crop=mask.image_from_crop)
     assert not MaskRefiner(SIZE_PX)(rgb, empty).any()
+
+
+def test_things_of_the_persons_color_that_are_apart_stay_background() -> None:
+    """A spot of the person's color near the trunk, where the network saw nobody, is no person."""
+    rgb, mask, truth = _frame(0, np.full((SIZE_PX[1], SIZE_PX[0], 3), 120.0))
+    spot = np.s_[118:128, 45:51]
+    rgb[spot] = rgb[105:115, 77:83]
+    alpha = MaskRefiner(SIZE_PX)(rgb, mask)
+    assert truth[spot].max() < 0.01
+    assert alpha[spot].max() < 0.5
+    assert _iou(alpha, truth) > 0.96
