@@ -124,7 +124,7 @@ def test_frame_without_a_person_gives_an_empty_mask() -> None:
 
 
 def test_things_of_the_persons_color_that_are_apart_stay_background() -> None:
-    """A spot of the person's color near the trunk, where the network saw nobody, is no person."""
+    """A spot of the color of the trunk beside it, where the network saw no person, is cleared."""
     rgb, mask, truth = _frame(0, np.full((SIZE_PX[1], SIZE_PX[0], 3), 120.0))
     spot = np.s_[118:128, 45:51]
     rgb[spot] = rgb[105:115, 77:83]
