@@ -74,6 +74,9 @@ tell a quarter about each other."""
 FAST_CHANGE = 6.0
 """Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
 people move fast at times."""
+FIRST_FAST_CHANGE = 100.0
+"""The same in the first iteration, halved from one to the next: a frame that a tracker got wrong is
+drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
 
 
 @runtime_checkable
@@ -122,6 +125,7 @@ class HumanPosePrior:
         change[24] = CHANGE_M
         gaps = np.maximum(np.diff(times_s), 1e-3)
         self._change = change.ravel() * np.sqrt(gaps)[:, None]
+        self._fast_change = FIRST_FAST_CHANGE
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
         """See `ClipPrior`."""
@@ -144,6 +148,7 @@ class HumanPosePrior:
         each = np.arange(72, 75)
         equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
         self._add_links(equations, poses)
+        self._fast_change = max(FAST_CHANGE, 0.5 * self._fast_change)
 
     def _add_links(self, equations: ChainEquations, poses: ClipPoses) -> None:
         before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
@@ -152,7 +157,7 @@ class HumanPosePrior:
         turned = np.linalg.norm(apart[:, :3], axis=1)
         apart -= gaussian_filter1d(apart, STEADY_FRAMES, axis=0, mode="nearest")
         size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
-        usual = np.repeat(1.0 / (1.0 + size / FAST_CHANGE**2) ** 2, 3, axis=1)
+        usual = np.repeat(1.0 / (1.0 + size / self._fast_change**2) ** 2, 3, axis=1)
         usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2
         equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
 
