@@ -88,16 +88,13 @@ def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
     return float((a * b).sum() / (b * b).sum())
 
 
-def fit_capture(
-    capture: Capture, *, fit_body: bool = True, keypoints: KeypointTrack | None = None
-) -> CaptureFit | None:
-    """Fit a capture to the masks of a few frames, and to key points where there are any.
+def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:
+    """Fit a capture to the masks of a few frames, and to its key points if its poses have some.
 
     Args:
         capture: A recording with masks. If its motion holds key points, its poses are a first
             guess made of these alone, and always give way.
         fit_body: Whether proportions may change; not where an avatar's person is given.
-        keypoints: Key points as further evidence for given poses.
 
     Returns:
         The changes; None if there are no masks that could be fitted, or if the poses' file holds
@@ -106,7 +103,7 @@ def fit_capture(
     tracked = capture.motion.keypoints is not None
     if fit_body and capture.motion.proportions is not None:
         return None
-    fitter = make_fitter(capture, keypoints)
+    fitter = make_fitter(capture)
     if fitter is None:
         return None
     everything = FitParameters(proportions=fit_body, focal=not capture.cameras.is_moving)
@@ -152,29 +149,22 @@ def _iterate_until_settled(
     return errors
 
 
-def make_fitter(capture: Capture, keypoints: KeypointTrack | None = None) -> ClipFitter | None:
-    """The problem of a capture's evenly spread masks and its key points.
-
-    Args:
-        capture: A recording with masks.
-        keypoints: Key points; None for those that its poses were made of, if any.
+def make_fitter(capture: Capture) -> ClipFitter | None:
+    """The problem of a capture's evenly spread masks, and of its key points.
 
     Returns:
-        The problem, at its start; None without enough masks.
+        The problem, at its start; None without enough masks or key points.
     """
-    has_masks = capture.masks is not None or capture.source.has_alpha
-    if capture.live is not None or not (has_masks or capture.motion.keypoints):
+    track, has_masks = capture.motion.keypoints, capture.masks is not None
+    has_masks |= capture.source.has_alpha
+    if capture.live is not None or not (has_masks or track):
         return None
-    tracked, geometry = capture.motion.keypoints, _geometry(capture)
-    keypoints = keypoints or tracked
-    count = TRACKED_KEY_FRAMES if tracked else KEY_FRAMES
+    geometry, space = _geometry(capture), ProportionSpace.around(capture.shaped)
+    count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
     outlines = _read_outlines(capture, geometry, count) if has_masks else {}
-    if len(outlines) < MIN_FRAMES and (keypoints is None or len(keypoints) < MIN_FRAMES):
-        return None
-    size_px = next((each.camera.size_px for each in outlines.values()), capture.source.size_px)
-    numbers = set(outlines) | {
-        int(each) for each in ([] if keypoints is None else keypoints.frames)
-    }
+    numbers = {*outlines, *([] if track is None else track.frames.tolist())}
+    sizes = [each.camera.size_px for each in outlines.values()]
+    size_px = sizes[0] if sizes else _reduced_size_px(capture)
     camera_row, frames = associate_cameras(capture.cameras, capture.source), []
     for number in sorted(numbers - capture.cameras.frames_without_camera):
         row = geometry.row_for_frame(number)
@@ -182,22 +172,30 @@ def make_fitter(capture: Capture, keypoints: KeypointTrack | None = None) -> Cli
             mask = outlines.get(number)
             camera = geometry.camera_at(camera_row(number), size_px)
             frames.append(ClipFrame(row=row, number=float(number), camera=camera, mask=mask))
-    space = ProportionSpace.around(capture.shaped)
-    if keypoints is None:
+    if len(frames) < MIN_FRAMES:
+        return None
+    if track is None:
         return ClipFitter(capture.motion, space, frames)
-    cameras = [frame.camera for frame in frames]
-    found = ClipKeypoints.of(
-        keypoints, [int(frame.number) for frame in frames], cameras, capture.shaped.joints
-    )
-    if tracked is None:
-        return ClipFitter(capture.motion, space, frames, keypoints=found)
+    cameras, used = [frame.camera for frame in frames], [int(frame.number) for frame in frames]
     rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
-    sigma = SIGMA_LOG_FOCAL if capture.paths.cameras is not None else SIGMA_LOG_ASSUMED_FOCAL
-    times = _times_s(keypoints, [int(frame.number) for frame in frames])
     return ClipFitter(
-        capture.motion, space, frames, keypoints=found, prior=HumanPosePrior(rotations, times),
-        sigma_log_focal=sigma,
-    )  # fmt: skip
+        capture.motion,
+        space,
+        frames,
+        keypoints=ClipKeypoints.of(track, used, cameras, capture.shaped.joints),
+        prior=HumanPosePrior(rotations, _times_s(track, used)),
+        sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
+    )
+
+
+def _reduced_size_px(capture: Capture) -> tuple[int, int]:
+    """Size at which a person, by its key points, is as tall as in reduced masks."""
+    track, (width, height) = capture.motion.keypoints, capture.source.size_px
+    if track is None or not len(track):
+        return width, height
+    tall = float(np.median(np.ptp(track.image_px[..., 1], axis=1))) * height / track.size_px[1]
+    scale = min(1.0, OUTLINE_PERSON_PX / max(tall, 1.0))
+    return max(8, round(scale * width)), max(8, round(scale * height))
 
 
 def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:

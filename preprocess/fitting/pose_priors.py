@@ -59,8 +59,8 @@ SIGMA_HINGE_RAD = 0.03
 """Standard deviation of how far a hinge bends to the wrong side, radians."""
 SIGMA_FREE = 30.0
 """Standard deviation of what is not known at all, radians or metres."""
-STEADY_FRAMES = 5.0
-"""Standard deviation of the frames over which a motion is nearly steady."""
+STEADY_S = 0.17
+"""Standard deviation of the time over which a motion is nearly steady, seconds."""
 CHANGES_PER_SECOND = (
     (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.07, (1, 2, 4, 5)),
     (0.05, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.11, (16, 17, 18, 19)),
@@ -125,6 +125,7 @@ class HumanPosePrior:
         change[24] = CHANGE_M
         gaps = np.maximum(np.diff(times_s), 1e-3)
         self._change = change.ravel() * np.sqrt(gaps)[:, None]
+        self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
         self._fast_change = FIRST_FAST_CHANGE
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
@@ -155,7 +156,7 @@ class HumanPosePrior:
         after = ClipPoses(rotations=poses.rotations[1:], translations=poses.translations[1:])
         apart = after.steps_from(before, self._cameras[:-1])
         turned = np.linalg.norm(apart[:, :3], axis=1)
-        apart -= gaussian_filter1d(apart, STEADY_FRAMES, axis=0, mode="nearest")
+        apart -= gaussian_filter1d(apart, self._steady_frames, axis=0, mode="nearest")
         size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
         usual = np.repeat(1.0 / (1.0 + size / self._fast_change**2) ** 2, 3, axis=1)
         usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2

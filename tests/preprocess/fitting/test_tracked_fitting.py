@@ -112,18 +112,3 @@ def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
     alone = fit_capture(replace(lifted, masks=None))
     assert alone.taken
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
-
-
-def test_key_points_help_given_poses(truth):
-    """Arms that point at the camera look alike in a mask whatever their bend."""
-    generator = np.random.default_rng(1)
-    off = truth.motion.joint_rotations.copy()
-    off[:, [15, 16, 17, 18]] += 0.15 * generator.normal(size=(4, 3))
-    wrong = replace(truth, motion=replace(truth.motion, joint_rotations=off))
-    without, helped = (
-        fit_capture(wrong, keypoints=points) for points in (None, track_points(truth))
-    )
-    errors = [
-        error_mm(apply_fit(wrong, replace(found, taken=True)), truth) for found in (without, helped)
-    ]
-    assert errors[1] < 0.8 * errors[0]
