@@ -50,13 +50,15 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
     run.check_usable(inputs, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
         asked, arguments = arguments, track_missing_poses(arguments, run, console)
+        threads = None
         if arguments.tracks_stream:  # its frames come as soon as it is open
-            _load_trainer_code(arguments, run, console)
+            threads = _load_trainer_code(arguments, run, console)
         capture = _open_aligned(arguments, run, console)
         with start_camera_solving(arguments.solve_job(capture), capture, run) as solving:
             return _train_and_report(
-                arguments, capture, run, console, solving, started_at, command=asked.as_json()
-            )
+                arguments, capture, run, console, solving, started_at,
+                command=asked.as_json(), threads=threads,
+            )  # fmt: skip
 
 
 def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) -> Capture:
@@ -82,7 +84,8 @@ def _fit_to_masks(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> Capture:
     """Fit body, poses and focal length to the masks, unless they are exact or were fitted."""
-    if not arguments.refine_poses or capture.motion.proportions is not None:
+    was_fitted = capture.motion.proportions is not None or capture.live is not None
+    if not arguments.refine_poses or was_fitted:
         return capture
     resumes = arguments.resume and run.has_checkpoint()
     fit = load_capture_fit(run.fit_file, capture.identity) if resumes else None
@@ -108,12 +111,10 @@ def _describe_capture(capture: Capture) -> str:
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
     """Import torch and load the compiled kernels; return the number of threads."""
-    if "torch" not in sys.modules:
-        with exit_on_interrupt(console, PROGRAM, run.release), console.status("loading torch"):
-            from apps.run import report_writer, training_session  # noqa: F401
-    from apps.run.session_start import load_kernels
-
     with exit_on_interrupt(console, PROGRAM, run.release):
+        with console.status("loading torch"):
+            from apps.run import report_writer, training_session  # noqa: F401
+            from apps.run.session_start import load_kernels
         return load_kernels(arguments, console)
 
 
@@ -126,9 +127,11 @@ def _train_and_report(
     started_at: float,
     *,
     command: dict[str, Any],
+    threads: int | None,
 ) -> int:
     """Train on an aligned capture, bake its package and write the report."""
-    threads = _load_trainer_code(arguments, run, console)
+    if threads is None:
+        threads = _load_trainer_code(arguments, run, console)
     from apps.run.report_writer import print_results, write_report
     from apps.run.session_start import open_viewer, prepare_trainer
     from apps.run.training_session import TrainingSession

@@ -5,7 +5,7 @@ with those of the last few frames, so that it moves as people do.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -25,8 +25,10 @@ from preprocess.tracking.keypoint_track import KeypointTrack
 from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 
-WINDOW_FRAMES = 8
+WINDOW_FRAMES = 10
 """Frames whose poses are fitted together while a stream runs."""
+LAG_FRAMES = 4
+"""Later frames that a frame's pose waits for: without any, poses jitter three times as much."""
 SIGMA_LOG_ASSUMED_FOCAL = 0.2
 """Prior standard deviation of the logarithm of an assumed focal length."""
 FIRST_ITERATIONS = (5, 5)
@@ -73,7 +75,7 @@ def fit_first_frames(
         Poses of the frames, the person, and the camera.
     """
     space = ProportionSpace.around(shaped)
-    fitter = _fitter(seen, None, OutlineModel(space), camera, outlined=len(seen))
+    fitter = _fitter(seen, None, OutlineModel(space), camera, range(len(seen)))
     everything = FitParameters(proportions=not fixed)
     for _ in range(FIRST_ITERATIONS[0]):
         fitter.iterate(everything._replace(outlines=False))
@@ -88,27 +90,21 @@ def fit_first_frames(
 
 @final
 class FramePoseFitter:
-    """Fits the pose of each new frame of a stream, for a known person and camera.
+    """Fits the poses of a stream's last frames, for a known person and camera."""
 
-    Attributes:
-        mask_px: Width and height of the reduced masks.
-    """
-
-    def __init__(self, shaped: ShapedBody, camera: Camera, mask_px: tuple[int, int]) -> None:
+    def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
         """Start without frames.
 
         Args:
             shaped: The person.
             camera: Camera of the frames.
-            mask_px: Width and height of the reduced masks.
         """
-        self.mask_px = mask_px
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
         self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
         self._poses: deque[BodyPose] = deque(maxlen=WINDOW_FRAMES)
 
-    def fit(self, seen: SeenPerson, start: BodyPose | None = None) -> BodyPose:
-        """Fit the pose of the next frame.
+    def add(self, seen: SeenPerson, start: BodyPose | None = None) -> None:
+        """Fit the poses of the window that ends with the next frame.
 
         Args:
             seen: What was found in it.
@@ -119,16 +115,20 @@ class FramePoseFitter:
         if start is None:
             start = _lift([seen], shaped, self._camera)[0]
         self._poses.append(start)
-        fitter = _fitter(self._seen, self._poses, self._model, self._camera, outlined=1)
+        count = len(self._seen)
+        outlined = {count - 1, count - 1 - LAG_FRAMES}
+        fitter = _fitter(self._seen, self._poses, self._model, self._camera, outlined)
         poses_only = FitParameters(proportions=False, focal=False)
         for _ in range(FRAME_ITERATIONS[0]):
             fitter.iterate(poses_only._replace(outlines=False))
         for _ in range(FRAME_ITERATIONS[1]):
             fitter.iterate(poses_only)
-        self._poses = deque(
-            (fitter.pose(index) for index in range(len(self._seen))), maxlen=WINDOW_FRAMES
-        )
-        return self._poses[-1]
+        self._poses = deque((fitter.pose(index) for index in range(count)), maxlen=WINDOW_FRAMES)
+
+    def pose(self, number: int) -> BodyPose:
+        """Present pose of one of the last frames, by its number."""
+        numbers = [each.number for each in self._seen]
+        return self._poses[numbers.index(number)]
 
 
 def _lift(seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera) -> Motion:
@@ -150,10 +150,9 @@ def _fitter(
     poses: Sequence[BodyPose] | None,
     model: OutlineModel,
     camera: Camera,
-    *,
-    outlined: int,
+    outlined: Collection[int],
 ) -> ClipFitter:
-    """The fit of some frames, of which the last ones are compared with their masks."""
+    """The fit of some frames, of which those at some places are compared with their masks."""
     shaped = model.space.shaped
     motion = (
         _lift(seen, shaped, camera) if poses is None else _as_motion(seen, poses, shaped, camera)
@@ -165,7 +164,7 @@ def _fitter(
             row=row,
             number=float(each.number),
             camera=small,
-            mask=OutlineDistances.of(each.mask, small) if row >= len(seen) - outlined else None,
+            mask=OutlineDistances.of(each.mask, small) if row in outlined else None,
         )
         for row, each in enumerate(seen)
     ]

@@ -1,9 +1,9 @@
 """A stream whose person is tracked while its frames come: a source, and poses and masks for it.
 
 The first frames settle the person's proportions and the focal length. Each later frame is tracked
-when it arrives, and its pose fitted to its key points and its mask together with those of the last
-few frames. Frames that come while another is being tracked are left out, so tracking never falls
-behind.
+when it arrives, and its pose fitted to its key points and its mask together with those of the
+frames around it. Frames that come while another is being tracked are left out, so that tracking
+does not fall behind.
 """
 
 import time
@@ -23,6 +23,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.fitting.tracked_frames import (
+    LAG_FRAMES,
     FramePoseFitter,
     SeenPerson,
     fit_first_frames,
@@ -32,7 +33,6 @@ from preprocess.live.live_alignment import LiveAlignment
 from preprocess.masks.mask_origin import Segmenter
 from preprocess.observation import Observation
 from preprocess.observe import DroppedFrame, compose_observation_builder, shrink_to_longer_side
-from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement
 
@@ -40,6 +40,9 @@ START_FRAMES = 8
 """Frames with the person from which proportions and focal length are fitted."""
 MAX_LATENESS_S = 0.04
 """Time after it was due at which a frame is left out: another was being tracked."""
+MAX_SKIPPED = 5
+"""Most frames in a row that are left out; a machine that is too busy to decode a recording at its
+own speed falls behind instead."""
 NOT_FOUND = "person not found"
 """Why a frame without the person is not used."""
 
@@ -48,8 +51,12 @@ NOT_FOUND = "person not found"
 class TrackedStream:
     """A source of frames at their own times, of which only those are taken that can be tracked.
 
+    Frames are handed over `LAG_FRAMES` after they came, so that their poses are fitted together
+    with those of later frames.
+
     Attributes:
         skipped: Number of frames that came while another was being tracked.
+        look: Called with each frame as soon as it is taken.
     """
 
     def __init__(self, source: FrameSource) -> None:
@@ -60,8 +67,9 @@ class TrackedStream:
         """
         self._source = source
         self._frames: Iterator[Frame] | None = None
-        self._first: deque[Frame] = deque()
+        self._waiting: deque[Frame] = deque()
         self.skipped = 0
+        self.look: Callable[[Frame], None] = lambda frame: None
         self.path, self.size_px, self.selection = source.path, source.size_px, source.selection
         self.frames_in_file, self.frame_count = source.frames_in_file, source.frame_count
         self.duration_s, self.has_alpha = source.duration_s, source.has_alpha
@@ -78,21 +86,25 @@ class TrackedStream:
         """Number of frames that the source has lost; those left out here are `skipped`."""
         return self._source.dropped
 
-    def take_first(self) -> Frame | None:
-        """Take a frame before the stream starts, which begins with it again; None at the end."""
+    def take_next(self) -> bool:
+        """Take and look at the next frame; return whether there was one."""
         if self._frames is None:
             self._frames = self._taken()
         frame = next(self._frames, None)
         if frame is not None:
-            self._first.append(frame)
-        return frame
+            self._waiting.append(frame)
+            self.look(frame)
+        return frame is not None
 
     def frames(self) -> Iterator[Frame]:
-        """The frames that are taken, once."""
-        frames = self._frames or self._taken()
-        while self._first:
-            yield self._first.popleft()
-        yield from frames
+        """The frames that are taken, once; those that `take_next` took already come first."""
+        going = True
+        while going:
+            while len(self._waiting) > LAG_FRAMES:
+                yield self._waiting.popleft()
+            going = self.take_next()
+        while self._waiting:
+            yield self._waiting.popleft()
 
     def count_frames(self) -> int:
         """As the source's own."""
@@ -103,11 +115,14 @@ class TrackedStream:
         self._source.close()
 
     def _taken(self) -> Iterator[Frame]:
+        skipped = 0  # since the last frame that was taken
         for frame in self._source.frames():
             late = frame.due_s is not None and time.perf_counter() - frame.due_s > MAX_LATENESS_S
-            if late:
+            if late and skipped < MAX_SKIPPED:
+                skipped += 1
                 self.skipped += 1
             else:
+                skipped = 0
                 yield frame
 
 
@@ -150,9 +165,10 @@ class LiveTracking:
         self.times_s: dict[int, float] = {}
         self.lost: list[int] = []
         self._tracker, self._refine = tracker, refine
-        self._waiting: dict[int, SeenPerson | None] = {}
-        self._poses: dict[int, BodyPose] = {}
+        self._seen: dict[int, SeenPerson] = {}
+        self._mask_px: tuple[int, int] | None = None
         self._fitter: FramePoseFitter | None = None
+        stream.look = self._look
 
     def start(self, shaped: ShapedBody, camera: Camera, *, fixed_body: bool = False) -> StreamStart:
         """Track the first frames, and fit person and camera to them.
@@ -165,21 +181,18 @@ class LiveTracking:
         Raises:
             InputError: If the stream ends before the person was found.
         """
-        seen: list[SeenPerson] = []
-        while len(seen) < START_FRAMES and (frame := self.stream.take_first()) is not None:
-            found = self._look(frame, seen[0].mask.shape[::-1] if seen else None)
-            self._waiting[frame.index] = found
-            if found is not None:
-                seen.append(found)
+        while len(self._seen) < START_FRAMES and self.stream.take_next():
+            pass
+        seen = list(self._seen.values())
         if not seen:
             raise InputError(
                 f"No person was found in {self.stream.path} ({len(self.times_s)} frames were "
                 "searched). Tracking needs one person, from head to feet in the picture."
             )
         motion, person, camera = fit_first_frames(seen, shaped, camera, fixed=fixed_body)
-        height, width = seen[0].mask.shape
-        self._fitter = FramePoseFitter(person, camera, (width, height))
-        self._poses = {each.number: motion[row] for row, each in enumerate(seen)}
+        self._fitter = FramePoseFitter(person, camera)
+        for row, each in enumerate(seen):
+            self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
         return StreamStart(
             motion=motion,
@@ -206,19 +219,15 @@ class LiveTracking:
         assert segment is None
         assert fit is None
         target_px = shrink_to_longer_side(source.size_px, size_px)
-        masks: dict[int, PersonKeypoints] = {}
 
         def pose_of(frame: Frame) -> BodyPose | str:
-            seen = self._seen(frame)
-            if seen is None:
+            if frame.index not in self._seen:
                 return NOT_FOUND
             assert self._fitter is not None
-            masks.clear()
-            masks[frame.index] = seen.keypoints
-            return self._fitter.fit(seen, self._poses.pop(frame.index, None))
+            return self._fitter.pose(frame.index)
 
         def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-            return self._refine(frame.rgb, masks[frame.index].mask, size_px)
+            return self._refine(frame.rgb, self._seen.pop(frame.index).keypoints.mask, size_px)
 
         return compose_observation_builder(pose_of, alpha_of, lambda index: cameras[0], target_px)
 
@@ -237,23 +246,21 @@ class LiveTracking:
                 f"{min(times):.1f} and {max(times):.1f} s."
             )
 
-    def _seen(self, frame: Frame) -> SeenPerson | None:
-        if frame.index in self._waiting:
-            return self._waiting.pop(frame.index)
-        assert self._fitter is not None
-        return self._look(frame, self._fitter.mask_px)
-
-    def _look(self, frame: Frame, mask_px: tuple[int, int] | None) -> SeenPerson | None:
-        """Find the person in a frame; masks are reduced to a size, if there is one already."""
+    def _look(self, frame: Frame) -> None:
+        """Find the person in a frame, and fit its pose once there is a person to fit."""
         self.times_s[frame.index] = frame.time_s
-        found = self._tracker(frame.rgb)
+        found = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
         if found is None:
             self.lost.append(frame.index)
-            return None
-        size_px = mask_px or reduced_size_px(found, frame.size_px)
-        return SeenPerson(
+            return
+        if self._mask_px is None:
+            self._mask_px = reduced_size_px(found, frame.size_px)
+        seen = SeenPerson(
             number=frame.index,
             time_s=frame.time_s,
             keypoints=found,
-            mask=found.mask.resample(frame.size_px, size_px),
+            mask=found.mask.resample(frame.size_px, self._mask_px),
         )
+        self._seen[frame.index] = seen
+        if self._fitter is not None:
+            self._fitter.add(seen)

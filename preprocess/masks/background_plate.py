@@ -1,7 +1,7 @@
 """What a static camera sees behind the person: a running mean and variance of every pixel's color.
 
 A phone's exposure and white balance drift, so each frame is compared after one gain per channel.
-If too much of the background differs nevertheless, the camera has moved, and the plate starts again.
+If too much of the background differs nevertheless, the camera has moved: the plate starts again.
 """
 
 from typing import NamedTuple, final

@@ -1,0 +1,166 @@
+"""Streams without poses: frames are tracked as they come, and late ones are left out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture.frame import Frame
+from capture.input_error import InputError
+from preprocess.body.body_file import load_body_model
+from preprocess.cameras.assumed_camera import assume_camera
+from preprocess.fitting.tracked_frames import LAG_FRAMES
+from preprocess.live import tracked_stream
+from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
+from preprocess.observation import Observation
+from preprocess.observe import DroppedFrame
+from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+
+COUNT = 24
+SIZE = (180, 320)
+
+
+class Pictures:
+    """A source of empty frames; its clock is the test's."""
+
+    live, paced, has_alpha, quarter_turns = False, True, False, 0
+    started_at = waited_s = 0.0
+    dropped, path, size_px = 0, Path("film.mp4"), SIZE
+    selection, frames_in_file, frame_count, duration_s = None, COUNT, COUNT, COUNT / 30.0
+
+    def __init__(self, due_s=None) -> None:
+        self.warnings: list[str] = []
+        self._due_s = due_s
+
+    def frames(self):
+        for index in range(COUNT):
+            rgb = np.full((SIZE[1], SIZE[0], 3), 80, np.uint8)
+            yield Frame(index=index, time_s=index / 30.0, rgb=rgb, due_s=self._due_s)
+
+    def count_frames(self):
+        return COUNT
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def standing():
+    """Key points of the embedded body, who stands before the camera, from its own joints."""
+    shaped = load_body_model(None).with_shape()
+    joints = shaped.joints * (1.0, -1.0, -1.0)  # facing the camera, whose y points down
+    points = np.tile(joints[15], (33, 1))
+    pairs = {
+        11: 16,
+        12: 17,
+        13: 18,
+        14: 19,
+        15: 20,
+        16: 21,
+        23: 1,
+        24: 2,
+        25: 4,
+        26: 5,
+        27: 7,
+        28: 8,
+    }
+    for point, joint in pairs.items():
+        points[point] = joints[joint]
+    points[17:23] = points[[15, 16] * 3]
+    points[29:33] = joints[[7, 8, 10, 11]]
+    camera = assume_camera(Path("film.mp4"), "static", Pictures())
+    pixels = camera.project(points + np.array([0.0, 0.2, 2.6]))
+    values = np.zeros((256, 256), np.uint8)
+    values[40:230, 100:156] = 255
+    scale = np.ptp(pixels[:, 1]) / 190.0
+    corner = pixels.mean(axis=0) - 128.0 * scale
+    return PersonKeypoints(
+        image_px=pixels,
+        world_m=points - joints[[1, 2]].mean(axis=0),
+        visibility=np.ones(33),
+        presence=1.0,
+        mask=CroppedMask(
+            values=values,
+            image_from_crop=np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]]),
+        ),
+    )
+
+
+class Tracker:
+    """Finds the person in all frames but some."""
+
+    def __init__(self, found, absent=()) -> None:
+        self._found, self._absent, self.calls = found, absent, 0
+
+    def __call__(self, rgb):
+        self.calls += 1
+        return None if self.calls - 1 in self._absent else self._found
+
+
+def plain(rgb, mask, size_px):
+    return mask.resample((rgb.shape[1], rgb.shape[0]), size_px)
+
+
+def started(tracker, source=None):
+    stream = TrackedStream(source or Pictures())
+    tracking = LiveTracking(stream, tracker, plain)
+    camera = assume_camera(Path("film.mp4"), "static", stream)
+    start = tracking.start(load_body_model(None).with_shape(), camera)
+    return stream, tracking, start
+
+
+def observe_all(stream, tracking, start):
+    build = tracking.observation_builder(stream, start.cameras, None)
+    return [build(frame) for frame in stream.frames()]
+
+
+def test_every_frame_has_a_pose_and_a_mask(standing):
+    stream, tracking, start = started(Tracker(standing))
+    seen = observe_all(stream, tracking, start)
+    assert [item.frame.index for item in seen] == list(range(COUNT))
+    places = np.array([item.pose.root_translation for item in seen])
+    assert np.ptp(places, axis=0).max() < 0.05
+    assert all(item.alpha.max() > 0.9 for item in seen)
+    assert list(tracking.final_notes()) == []
+
+
+def test_a_frame_waits_for_later_ones(standing):
+    tracker = Tracker(standing)
+    stream, _, _ = started(tracker)
+    frames = stream.frames()
+    for number in range(12):
+        assert next(frames).index == number
+        assert tracker.calls >= number + 1 + LAG_FRAMES
+
+
+def test_frames_without_the_person_are_dropped_and_reported(standing):
+    stream, tracking, start = started(Tracker(standing, absent={10, 11}))
+    seen = observe_all(stream, tracking, start)
+    assert seen[10] == DroppedFrame(index=10, reason=NOT_FOUND)
+    assert isinstance(seen[12], Observation)
+    assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in " ".join(tracking.final_notes())
+
+
+def test_late_frames_are_left_out(standing, monkeypatch):
+    monkeypatch.setattr(tracked_stream.time, "perf_counter", lambda: 100.0)
+    stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
+    seen = observe_all(stream, tracking, start)
+    assert [item.frame.index for item in seen] == [5, 11, 17, 23]  # but not all of them
+    assert stream.skipped == 20
+    assert "20 of 24 frames were left out" in " ".join(tracking.final_notes())
+
+
+def test_a_stream_without_a_person_is_bad_input(standing):
+    with pytest.raises(InputError, match="24 frames were searched"):
+        started(Tracker(standing, absent=set(range(COUNT))))
+
+
+def test_a_finished_avatars_person_keeps_the_body(standing):
+    stream = TrackedStream(Pictures())
+    tracking = LiveTracking(stream, Tracker(standing), plain)
+    shaped = load_body_model(None).with_shape()
+    person = replace(shaped, joints=1.1 * shaped.joints, vertices=1.1 * shaped.vertices)
+    camera = assume_camera(Path("film.mp4"), "static", stream)
+    start = tracking.start(person, camera, fixed_body=True)
+    assert np.allclose(start.shaped.joints, person.joints)
