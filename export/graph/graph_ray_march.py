@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.graph.graph_context import GraphContext, VectorValue, adjugate, dot, gather_vector
+from export.graph.graph_context import GraphContext, VectorValue, dot, gather_vector
 from export.graph.graph_skinning import (
     PosedNodeValues,
     invert_jacobian,
@@ -316,17 +316,16 @@ def composite_samples(
 def _newton_step(
     context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> SegmentValues:
-    """Move canonical positions onto their camera rays where the Jacobian can be inverted."""
+    """Move canonical positions onto their camera rays where these follow the inverse."""
     graph, settings = context.graph, context.settings
     camera, derivative = skin_points(
         context, posed, locate_skinning_cell(context, segment.start_canonical)
     )
-    inverse = invert_jacobian(context, derivative, adjugate(derivative))
+    inverse = invert_jacobian(context, derivative, segment.direction_camera)
     off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
     shift = inverse.apply(off)
     length = (dot(shift, shift) + 1e-20).sqrt()
     share = (settings.max_correction_m / length).minimum(1.0)
-    turned = inverse.apply(segment.direction_camera)
     return SegmentValues(
         direction_camera=segment.direction_camera,
         begin=segment.begin,
@@ -335,7 +334,7 @@ def _newton_step(
             p + s * share for p, s in zip(segment.start_canonical, shift, strict=True)
         ],
         direction_canonical=[
-            graph.where(inverse.trusted, a, b)
-            for a, b in zip(turned, segment.direction_canonical, strict=True)
+            graph.where(inverse.followed, a, b)
+            for a, b in zip(inverse.ray, segment.direction_canonical, strict=True)
         ],
     )

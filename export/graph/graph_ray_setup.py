@@ -8,7 +8,6 @@ from export.graph.graph_context import (
     CameraValues,
     GraphContext,
     VectorValue,
-    adjugate,
     dot,
     gather_vector,
 )
@@ -25,9 +24,10 @@ from export.graph.graph_skinning import (
     invert_jacobian,
     skin_points,
 )
-from export.graph.graph_zbuffer import SplatWindow
+from export.graph.graph_zbuffer import EMPTY_KEY, NUM_AROUND, KeysAround, SplatWindow
 from export.graph.onnx_builder import GraphValue
 from export.package.player_tables import SURFEL_MASK
+from export.package.render_settings import NEIGHBOR_REACH_M
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,19 +79,20 @@ def trace_depth_layer(
     surface: PosedProxySurface,
     keys: GraphValue,
     ray: VectorValue,
-    front_layer: DepthLayer | None,
+    front: "DepthLayer | KeysAround",
 ) -> DepthLayer:
     """Trace rays through one depth layer.
 
     Skinning is linearized about the surfel that a ray sees: the inverse Jacobian carries the ray to
-    where it enters the surface.
+    where it enters the surface. Where the skin is folded, look along its normal at the mean of the
+    surfels about the pixel.
 
     Args:
         context: Tables, settings and inputs.
         surface: In its pose.
         keys: Z-buffer key of each ray.
         ray: Unit directions in the camera's frame.
-        front_layer: The layer in front of the same rays; None for the first.
+        front: The layer in front of the same rays; for the first layer the z-buffer about them.
     """
     graph, surfel = context.graph, keys.bitwise_and(SURFEL_MASK)
     cells = surface.surfels.cell
@@ -99,31 +100,30 @@ def trace_depth_layer(
         rows=gather_vector(cells.rows, surfel), fraction=gather_vector(cells.fraction, surfel)
     )
     camera, derivative = skin_points(context, surface.posed, cell)
-    inverse = invert_jacobian(context, derivative, adjugate(derivative))
-    normal = gather_vector([context.table_values[f"normal_{letter}"] for letter in "xyz"], surfel)
-    # where the skin is folded, look at the surface along its normal
-    above = [-n for n in normal]
-    seen_along = zip(inverse.apply(ray), above, strict=True)
-    direction = [graph.where(inverse.trusted, d, a) for d, a in seen_along]
+    inverse = invert_jacobian(context, derivative, ray)
+    normal = gather_vector(_vector_table(context, "normal"), surfel)
+    direction = [
+        graph.where(inverse.followed, d, -n) for d, n in zip(inverse.ray, normal, strict=True)
+    ]
     along = dot(camera, ray)
     beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
     thickness = context.table_values["thickness"].gather(surfel)
     enter, begin, end = _segment_bounds(context, normal, thickness, direction, beside, along)
-    canonical = gather_vector(
-        [context.table_values[f"position_{letter}"] for letter in "xyz"], surfel
-    )
-    if front_layer is not None:
-        begin = _begin_behind_front_layer(context, front_layer, canonical, camera, begin, end)
+    canonical = gather_vector(_vector_table(context, "position"), surfel)
+    if isinstance(front, DepthLayer):
+        begin = _begin_behind_front_layer(context, front, canonical, camera, begin, end)
+    else:
+        beside = _move_to_mean_of_neighbors(context, front, surfel, inverse.followed, beside)
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = SegmentValues(
         direction_camera=ray, begin=begin, end=end,
         start_canonical=start, direction_canonical=direction,
     )  # fmt: skip
-    if front_layer is None:
-        color, light = march_segments(context, surface.posed, segment)
-    else:
+    if isinstance(front, DepthLayer):
         color, light = _composite_in_one_block(context, segment)
+    else:
+        color, light = march_segments(context, surface.posed, segment)
     return DepthLayer(
         ray=ray,
         surfel=surfel,
@@ -134,6 +134,10 @@ def trace_depth_layer(
         enter=enter,
         end=end,
     )
+
+
+def _vector_table(context: GraphContext, name: str) -> VectorValue:
+    return [context.table_values[f"{name}_{letter}"] for letter in "xyz"]
 
 
 def _composite_in_one_block(
@@ -206,3 +210,30 @@ def _begin_behind_front_layer(
     )
     later = begin.maximum(before.end).minimum(end)
     return context.graph.where(one_sheet, later, begin)
+
+
+def _move_to_mean_of_neighbors(
+    context: GraphContext,
+    around: KeysAround,
+    surfel: GraphValue,
+    followed: GraphValue,
+    beside: VectorValue,
+) -> VectorValue:
+    """Move rays that do not follow the inverse to the mean of the surfels about their pixels.
+
+    Surfels farther away than `NEIGHBOR_REACH_M` in canonical space do not count.
+    """
+    graph = context.graph
+    folded = graph.range(graph.size(surfel).cast(np.int32)).compress(followed.logical_not())
+    own = surfel.gather(folded).reshape(1, -1)
+    key = around.keys_of(folded)
+    neighbor = graph.where(key < EMPTY_KEY, key.bitwise_and(SURFEL_MASK), own)
+    own, neighbor = (own + neighbor * 0).reshape(-1), neighbor.reshape(-1)
+    positions = _vector_table(context, "position")
+    apart = [column.gather(neighbor) - column.gather(own) for column in positions]
+    near = (dot(apart, apart) < NEIGHBOR_REACH_M**2).cast(np.float32)
+    times = (near.reshape(NUM_AROUND, -1).reduce_sum(0) + 1.0).reciprocal()
+    return [
+        b.scatter(folded, (part * near).reshape(NUM_AROUND, -1).reduce_sum(0) * times)
+        for b, part in zip(beside, apart, strict=True)
+    ]

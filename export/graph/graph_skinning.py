@@ -10,11 +10,13 @@ from export.graph.graph_context import (
     GraphContext,
     MatrixValue,
     VectorValue,
+    adjugate,
     cross,
     dot,
     gather_vector,
 )
 from export.graph.onnx_builder import GraphValue
+from export.package.render_settings import MAX_FOLLOWED_COMPRESSION
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,33 +122,42 @@ class InverseJacobian:
 
     Attributes:
         cofactors: Adjugate of the Jacobian per step between nodes.
-        scale: Factor from each row of the adjugate to the inverse's, per metre; almost 0 where the
-            Jacobian is not inverted.
-        trusted: Whether it is inverted: the skin is neither folded nor torn apart.
+        scale: Factor from each row of the adjugate to the inverse's, per metre; 0 where rays do not
+            follow it.
+        ray: Canonical metres per metre along each point's ray.
+        followed: Whether rays follow it: the skin is neither folded nor torn apart, and the ray is
+            not compressed by more than `MAX_FOLLOWED_COMPRESSION`.
     """
 
     cofactors: MatrixValue
     scale: VectorValue
-    trusted: GraphValue
+    ray: VectorValue
+    followed: GraphValue
 
     def apply(self, vector: VectorValue) -> VectorValue:
         """Multiply vectors by the inverse."""
-        return [
-            dot(row, vector) * scale for row, scale in zip(self.cofactors, self.scale, strict=True)
-        ]
+        return _apply_inverse(self.cofactors, self.scale, vector)
+
+
+def _apply_inverse(cofactors: MatrixValue, scale: VectorValue, vector: VectorValue) -> VectorValue:
+    return [dot(row, vector) * factor for row, factor in zip(cofactors, scale, strict=True)]
 
 
 def invert_jacobian(
-    context: GraphContext, jacobian: MatrixValue, cofactors: MatrixValue
+    context: GraphContext, jacobian: MatrixValue, ray: VectorValue
 ) -> InverseJacobian:
-    """Invert Jacobians (metres per step between nodes), given their adjugates."""
+    """Invert Jacobians (metres per step between nodes) that rays (unit directions) follow."""
+    cofactors = adjugate(jacobian)
     per_m = skinning_nodes_per_m(context)
     volume = dot(jacobian[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
     stretch = context.settings.max_volume_ratio
-    trusted = (volume > 1.0 / stretch) & (volume < stretch)
-    one = context.graph.where(trusted, volume, 1e30).reciprocal()
+    sound = (volume > 1.0 / stretch) & (volume < stretch)
+    one = context.graph.where(sound, volume, 1e30).reciprocal()
     scale = [one * float(np.prod(per_m) / step) for step in per_m]
-    return InverseJacobian(cofactors=cofactors, scale=scale, trusted=trusted)
+    direction = _apply_inverse(cofactors, scale, ray)
+    followed = sound & (dot(direction, direction) < MAX_FOLLOWED_COMPRESSION**2)
+    scale = [context.graph.where(followed, factor, 0.0) for factor in scale]
+    return InverseJacobian(cofactors=cofactors, scale=scale, ray=direction, followed=followed)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

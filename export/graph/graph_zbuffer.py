@@ -11,6 +11,10 @@ from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK
 
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
+AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+"""Rows and columns, in halves of a footprint, from a pixel to the places around it."""
+NUM_AROUND = len(AROUND)
+"""Number of these places."""
 INFINITE_DEPTH_M = 1e6
 """Depth beyond all surfels, metres."""
 
@@ -146,8 +150,28 @@ def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
     return side.clip(2.0, float(settings.max_footprint_px)).cast(np.int64)
 
 
-def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
-    """Return the least key of each of the window's pixels, row after row.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class KeysAround:
+    """The z-buffer around some pixels: values of the graph.
+
+    Attributes:
+        buffer: The least key of every cell from the border's first one on, holes not filled.
+        cell: The buffer's cell of each pixel.
+        steps: Cells from a pixel to each of the `NUM_AROUND` places around it, int32.
+    """
+
+    buffer: GraphValue
+    cell: GraphValue
+    steps: GraphValue
+
+    def keys_of(self, number: GraphValue) -> GraphValue:
+        """Return the keys around some of the pixels, one row for each place."""
+        places = self.cell.gather(number).reshape(1, -1) + self.steps.reshape(-1, 1)
+        return self.buffer.gather(places.reshape(-1)).reshape(NUM_AROUND, -1)
+
+
+def nearest_keys(context: GraphContext, splats: SurfelSplats) -> tuple[GraphValue, GraphValue]:
+    """Return the least key of each of the window's pixels, row after row, and the whole buffer.
 
     Where the skin is stretched, surfels lie farther apart than a footprint is wide: a pixel that
     two opposite ones, a footprint away, overtop by far is a hole, and filled.
@@ -170,7 +194,29 @@ def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
     hole = (keys - (steps << SURFEL_BITS)) > neighbors
     keys = context.graph.where(hole, neighbors, keys)
     rows = keys.reshape(-1, window.stride)
-    return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1)
+    return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1), buffer
+
+
+def keys_around(
+    context: GraphContext, splats: SurfelSplats, buffer: GraphValue, cell: GraphValue
+) -> KeysAround:
+    """Look around pixels.
+
+    Args:
+        context: Tables, settings and inputs.
+        splats: All surfels.
+        buffer: From `nearest_keys`, holes not filled.
+        cell: Cells of the pixels, as of `depth_limits`.
+    """
+    side, stride = splats.footprint_px, splats.window.stride
+    rows, columns = (
+        context.graph.constant(np.array(steps, dtype=np.int64))
+        for steps in zip(*AROUND, strict=True)
+    )
+    half = side // 2
+    # footprints lie to the lower right of their cells
+    steps = (stride + 1) * (1 - side) + (rows * stride + columns) * half
+    return KeysAround(buffer=buffer, cell=cell, steps=steps.cast(np.int32))
 
 
 def _scatter_keys(

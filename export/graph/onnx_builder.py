@@ -93,6 +93,10 @@ class GraphValue:
         """Both, of truth values."""
         return self._with("And", other)
 
+    def logical_not(self) -> "GraphValue":
+        """Not, of truth values."""
+        return self._with("Not")
+
     def bitwise_and(self, mask: int) -> "GraphValue":
         """Bitwise and with a constant."""
         return self._with("BitwiseAnd", mask)

@@ -19,6 +19,7 @@ from export.graph.graph_zbuffer import (
     SurfelSplats,
     depth_limits,
     hidden_splats,
+    keys_around,
     keys_behind_limits,
     nearest_keys,
     project_surfels,
@@ -60,11 +61,12 @@ def _draw_picture(context: GraphContext) -> GraphValue:
     surface = PosedProxySurface(surfels=pose_surfels(context, posed), posed=posed)
     splats = project_surfels(context, surface.surfels)
     window = splats.window
-    keys = nearest_keys(context, splats)
+    keys, buffer = nearest_keys(context, splats)
     covered = keys < EMPTY_KEY
     pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
     ray = pixel_rays(context.camera, window, pixel)
-    first = trace_depth_layer(context, surface, keys.gather(pixel), ray, None)
+    around = keys_around(context, splats, buffer, _window_cells(window, pixel))
+    first = trace_depth_layer(context, surface, keys.gather(pixel), ray, around)
     channels = [*first.color, first.transmittance]
     if context.settings.layers > 1:
         channels = _add_further_layers(context, surface, splats, pixel, first)

@@ -2,6 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+MAX_FOLLOWED_COMPRESSION = 3.0
+"""Canonical metres per metre along a ray above which inverse skinning is not followed: a footprint
+would span centimetres of cloth, over which skinning is far from linear."""
+NEIGHBOR_REACH_M = 0.03
+"""Canonical distance up to which neighbors of a surfel belong to the same patch of skin, metres."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
@@ -61,8 +67,10 @@ class RenderSettings:
 
     # Folded skin
     max_volume_ratio: float = 10.0
-    """Where the Jacobian's determinant is outside (1 / ratio, ratio), do not invert it: look at the
-    surfel along its normal and leave the path uncorrected."""
+    """Where the Jacobian's determinant is outside (1 / ratio, ratio), or canonical space is
+    compressed along the ray by more than `MAX_FOLLOWED_COMPRESSION`, do not invert it: look along
+    the surfel's normal at the mean of the surfels about the pixel, and leave the path
+    uncorrected."""
     fold_volume_ratio: float = 0.3
     """Posed over canonical volume below which a surfel counts as folded; negative is inside out."""
     fold_depth_offset_m: float = 0.0
@@ -87,7 +95,9 @@ class RenderSettings:
     """Least transmittance for which a further layer is drawn."""
 
 
-HQ_SETTINGS = RenderSettings(max_compression=1.0, fold_depth_offset_m=0.02)
+HQ_SETTINGS = RenderSettings(
+    layers=3, other_sheet_gap_m=-0.015, max_compression=1.0, fold_depth_offset_m=0.02
+)
 """Settings of the tier that every package has."""
 QUALITY_TIERS = {
     "hq": HQ_SETTINGS,
@@ -106,11 +116,9 @@ QUALITY_TIERS = {
 }
 """Settings by tier; "hq" comes first."""
 THICK_FIELD_TIERS = {
-    "hq": replace(HQ_SETTINGS, layers=3, other_sheet_gap_m=-0.015),
+    "hq": HQ_SETTINGS,
     "lite": replace(
         QUALITY_TIERS["lite"],
-        layers=3,
-        other_sheet_gap_m=-0.015,
         block_samples=3,
         entry_margin_m=0.004,
         min_transmittance=0.02,
@@ -118,5 +126,4 @@ THICK_FIELD_TIERS = {
     ),
 }
 """The same for fields that the usual settings cut short: haze in front of the surface, light that
-passes through a limb, limbs that touch. HQ +1.1 to 1.7 dB, lite +2 dB, for a
-tenth more time, in deep fog half as much again."""
+passes through a limb."""

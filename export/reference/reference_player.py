@@ -14,20 +14,26 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from export.package.graph_tables import skinning_nodes
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK, PlayerTables
-from export.package.render_settings import RenderSettings
+from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables, SurfelTable
+from export.package.render_settings import NEIGHBOR_REACH_M, RenderSettings
 from export.reference.compositor import VoxelCodes, composite_segments
 from export.reference.ray_segments import RaySegments
 from export.reference.reference_skinning import (
     CanonicalRays,
     PosedNodes,
     compression_factor,
+    invert_jacobians,
     skin_tetrahedral,
     skin_trilinear,
 )
-
-EMPTY_PIXEL_KEY = 2**31 - 1
-"""Z-buffer key of a pixel that no surfel covers."""
+from export.reference.reference_zbuffer import (
+    EMPTY_PIXEL_KEY,
+    SurfelFootprints,
+    fill_holes,
+    keys_around,
+    surfel_of_key,
+    z_buffer,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,22 +81,6 @@ class _PosedSurface:
     positions: Float32[np.ndarray, "surfels 3"]
     facing: Float32[np.ndarray, "surfels"]
     volume: Float32[np.ndarray, "surfels"]
-
-
-class _Splats(NamedTuple):
-    """Surfels' footprints, one row for each cell that one covers.
-
-    Attributes:
-        side: Edge of a footprint, pixels.
-        cell: Cells, numbered in a picture with a margin of `side` pixels.
-        key: Z-buffer keys.
-        depth: Depths of surfels that may form a further layer, metres; 0 for the others.
-    """
-
-    side: int
-    cell: Int64[np.ndarray, "splats"]
-    key: Int64[np.ndarray, "splats"]
-    depth: Float32[np.ndarray, "splats"]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -144,16 +134,18 @@ def trace_picture(
     """
     posed = _pose_surface(tables, settings, inputs)
     splats = _splat_surfels(tables, settings, inputs, posed)
-    filled = _fill_holes(_z_buffer(inputs, splats), tables, settings, splats.side).ravel()
+    buffer = z_buffer(inputs.size_px, splats)
+    filled = fill_holes(buffer, tables, settings, splats.side).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
-    rays, depth = _ray_entries(tables, settings, inputs, posed, covered, key, None)
+    keys = np.column_stack([key, keys_around(inputs.size_px, buffer, splats.side, covered)])
+    rays, depth = _ray_entries(tables, settings, inputs, posed, covered, keys, None)
     segments = RaySegments.of_first_layer(
         rays, posed.nodes, tables.bricks, settings, inputs.samples
     )
     alpha = composite_segments(segments, settings, tables.bricks, codes)[:, 3]
     front = _FrontLayer(
-        transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=_surfel_of_key(key)
+        transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=surfel_of_key(key)
     )
     alive = np.arange(len(covered))
     for layer in range(1, settings.layers):
@@ -162,7 +154,7 @@ def trace_picture(
         key = key[covered]
         alive = np.flatnonzero(key < EMPTY_PIXEL_KEY)
         rays, depth = _ray_entries(
-            tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive)
+            tables, settings, inputs, posed, covered[alive], key[alive, None], front.of(alive)
         )
         behind = RaySegments.of_further_layer(
             rays, alive, len(covered), tables.bricks, (settings.further_layer_samples, layer)
@@ -170,20 +162,9 @@ def trace_picture(
         alpha = composite_segments(behind, settings, tables.bricks, codes)[:, 3]
         front.transmittance *= 1.0 - alpha
         front.depth[alive], front.end[alive] = depth, rays.end
-        front.surfel[alive] = _surfel_of_key(key[alive])
+        front.surfel[alive] = surfel_of_key(key[alive])
         segments = segments.append_layer(behind)
     return TracedPicture(covered, segments)
-
-
-def _z_buffer(
-    inputs: PlayerInputs, splats: _Splats, chosen: Bool[np.ndarray, "splats"] | None = None
-) -> Int64[np.ndarray, "rows columns"]:
-    """Return the least key of every cell, of some splats or of all."""
-    (width, height), margin = inputs.size_px, 2 * splats.side
-    buffer = np.full((height + margin, width + margin), EMPTY_PIXEL_KEY, dtype=np.int64)
-    where = slice(None) if chosen is None else chosen
-    np.minimum.at(buffer.reshape(-1), splats.cell[where], splats.key[where])
-    return buffer
 
 
 def _keys_behind(
@@ -191,7 +172,7 @@ def _keys_behind(
     settings: RenderSettings,
     inputs: PlayerInputs,
     posed: _PosedSurface,
-    splats: _Splats,
+    splats: SurfelFootprints,
     pixel: Int64[np.ndarray, "pixels"],
     front: _FrontLayer,
 ) -> Int64[np.ndarray, "all_pixels"]:
@@ -208,9 +189,9 @@ def _keys_behind(
         near = np.flatnonzero(~behind & (splats.depth > limits))
         before = np.pad(passed, side).reshape(-1)[splats.cell[near]]
         behind[near] = ~_one_sheet(
-            settings, tables, posed.positions, _surfel_of_key(splats.key[near]), before
+            settings, tables, posed.positions, surfel_of_key(splats.key[near]), before
         )
-    return _z_buffer(inputs, splats, behind)[side:-side, side:-side].ravel()
+    return z_buffer(inputs.size_px, splats, behind)[side:-side, side:-side].ravel()
 
 
 def _one_sheet(
@@ -248,22 +229,18 @@ def _pose_surface(
 
 
 def _inverse_skinning(
-    settings: RenderSettings, posed: _PosedSurface, points: Float32[np.ndarray, "points 3"]
+    settings: RenderSettings,
+    posed: _PosedSurface,
+    points: Float32[np.ndarray, "points 3"],
+    ray: Float32[np.ndarray, "points 3"],
 ) -> tuple[
     Float32[np.ndarray, "points 3"],
     Float32[np.ndarray, "points 3 3"],
     Bool[np.ndarray, "points"],
 ]:
-    """Return positions in the camera's frame, the inverse Jacobian, and where it is sound."""
+    """Return positions in the camera's frame, the inverse Jacobian, and where rays follow it."""
     camera, derivative = skin_trilinear(posed.nodes, points)
-    volume = np.linalg.det(derivative)
-    sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
-    inverse = np.linalg.inv(np.where(sound[:, None, None], derivative, np.eye(3)))
-    return camera, inverse.astype(np.float32), sound
-
-
-def _surfel_of_key(key: Int64[np.ndarray, "pixels"]) -> Int64[np.ndarray, "pixels"]:
-    return key & SURFEL_MASK
+    return camera, *invert_jacobians(settings, derivative, ray)
 
 
 def _project_surfels(
@@ -291,7 +268,7 @@ def _footprint_px(
 
 def _splat_surfels(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
-) -> _Splats:
+) -> SurfelFootprints:
     """Splat every visible surfel onto the cells of its footprint."""
     side = _footprint_px(tables, settings, inputs, posed)
     width, height = inputs.size_px
@@ -315,22 +292,7 @@ def _splat_surfels(
     shape = inside.shape
     cell = (row * (width + 2 * side) + column)[inside]
     key, depth = (np.broadcast_to(part, shape)[inside] for part in (key, deep_enough))
-    return _Splats(side, cell, key, depth)
-
-
-def _fill_holes(
-    keys: Int64[np.ndarray, "rows columns"],
-    tables: PlayerTables,
-    settings: RenderSettings,
-    side: int,
-) -> Int64[np.ndarray, "height width"]:
-    """Fill pixels that two opposite ones, a footprint away, overtop by far; cut off the margin."""
-    here = slice(side, -side)
-    across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
-    along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
-    neighbors, keys = np.minimum(across, along), keys[here, here]
-    steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
-    return np.where(keys - (steps << SURFEL_BITS) > neighbors, neighbors, keys)
+    return SurfelFootprints(side, cell, key, depth)
 
 
 def _ray_entries(
@@ -339,20 +301,23 @@ def _ray_entries(
     inputs: PlayerInputs,
     posed: _PosedSurface,
     pixel: Int64[np.ndarray, "pixels"],
-    key: Int64[np.ndarray, "pixels"],
+    keys: Int64[np.ndarray, "pixels _"],
     front: _FrontLayer | None,
 ) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"]]:
-    """Return the canonical rays of covered pixels, and the depths at which they enter."""
-    surfels, surfel = tables.surfels, _surfel_of_key(key)
+    """Return the canonical rays of covered pixels, and the depths at which they enter.
+
+    The first key is a pixel's own, the others lie around it.
+    """
+    surfels, surfel = tables.surfels, surfel_of_key(keys[:, 0])
     row, column = np.divmod(pixel, inputs.size_px[0])
     plane = (np.stack([column, row], axis=1) + 0.5 - inputs.center) / inputs.focal
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    camera, inverse, sound = _inverse_skinning(settings, posed, surfels.positions[surfel])
+    camera, inverse, sound = _inverse_skinning(settings, posed, surfels.positions[surfel], ray)
     along = (camera * ray).sum(axis=1)
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
-    # where the skin is folded, look at the surface along its normal
+    # where the skin is folded, look along its normal at the mean of the surfels about the pixel
     direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
     nearest = ray * along[:, None] - camera
     beside = np.einsum("nij,nj->ni", inverse, nearest)  # from the surfel to the ray
@@ -379,6 +344,21 @@ def _ray_entries(
         one_sheet = apart < in_camera * settings.same_sheet_ratio + settings.same_sheet_m
         later = np.minimum(np.maximum(begin, front.end), end)
         begin = np.where(one_sheet, later, begin)
+    beside[~sound] = _mean_of_neighbors(surfels, keys[~sound])
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = CanonicalRays(*(part.astype(np.float32) for part in (ray, begin, end, start, direction)))
     return rays, (enter * ray[:, 2]).astype(np.float32)
+
+
+def _mean_of_neighbors(
+    surfels: SurfelTable, keys: Int64[np.ndarray, "pixels keys"]
+) -> Float32[np.ndarray, "pixels 3"]:
+    """Return where the mean of surfels lies in canonical space as seen from the first of them.
+
+    Surfels farther away than `NEIGHBOR_REACH_M` belong to another patch and do not count.
+    """
+    surfel = surfel_of_key(np.where(keys < EMPTY_PIXEL_KEY, keys, keys[:, :1]))
+    apart = surfels.positions[surfel] - surfels.positions[surfel[:, :1]]
+    near = (apart**2).sum(axis=2) < NEIGHBOR_REACH_M**2
+    total = (apart * near[..., None]).sum(axis=1)
+    return (total / near.sum(axis=1, keepdims=True)).astype(np.float32)

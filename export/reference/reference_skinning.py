@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from export.package.graph_tables import SkinningNodes
-from export.package.render_settings import RenderSettings
+from export.package.render_settings import MAX_FOLLOWED_COMPRESSION, RenderSettings
 
 
 class PosedNodes(NamedTuple):
@@ -114,14 +114,26 @@ def compression_factor(
     return np.minimum(np.float32(settings.max_compression) / canonical_per_m, np.float32(1.0))
 
 
+def invert_jacobians(
+    settings: RenderSettings,
+    jacobian: Float32[np.ndarray, "rays 3 3"],
+    ray: Float32[np.ndarray, "rays 3"],
+) -> tuple[Float32[np.ndarray, "rays 3 3"], Bool[np.ndarray, "rays"]]:
+    """Return inverse Jacobians, and which of them rays may follow; the others are arbitrary."""
+    volume = np.linalg.det(jacobian)
+    sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
+    inverse = np.linalg.inv(np.where(sound[:, None, None], jacobian, np.eye(3)))
+    squares = (np.einsum("nij,nj->ni", inverse, ray) ** 2).sum(axis=1)
+    return inverse.astype(np.float32), sound & (squares < MAX_FOLLOWED_COMPRESSION**2)
+
+
 def newton_correction(
     settings: RenderSettings, posed: PosedNodes, rays: CanonicalRays
 ) -> CanonicalRays:
     """Move canonical starts one Newton step onto their camera rays; update the directions."""
     camera, jacobian = skin_trilinear(posed, rays.start_canonical)
-    volume = np.linalg.det(jacobian)
-    sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
-    inverse = np.linalg.inv(jacobian[sound])
+    inverse, sound = invert_jacobians(settings, jacobian, rays.direction_camera)
+    inverse = inverse[sound]
     off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
     shift = np.einsum("nij,nj->ni", inverse, off)
     length = np.linalg.norm(shift, axis=1, keepdims=True)

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import onnxruntime
 import pytest
+from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
 from capture.input_error import InputError
 from export.graph.player_graph import build_graph
+from export.mesh.skinned_mesh import extract_mesh, skinning_weights
 from export.package.graph_tables import subdivided_skinning_nodes
 from export.package.package_file import read_package
 from export.package.render_settings import RenderSettings
@@ -77,6 +79,34 @@ def test_folded_surfels_stand_behind_their_neighbors(exported, tables, camera, t
     assert PictureDifference.of(drawn, before).close_fraction < 0.99
 
 
+@pytest.mark.parametrize(("tier", "largest_mean"), [("hq", 0.037), ("lite", 0.09)])
+def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, largest_mean):
+    """An arm turned half round folds the sleeve; vertices that are in front are seen as they are.
+
+    A linearized inverse would carry rays from there to other places of the cloth, or past it.
+    """
+    rotations = np.zeros((23, 3))
+    rotations[15], rotations[16] = [3.0, 0, 0.6], [-3.0, 0, -0.6]
+    pose = replace(BodyPose.rest(), joint_rotations=rotations)
+    view = replace(camera(192, 192), focal_px=(1600.0, 1600.0), center_px=(196.0, 368.0))
+    player, mesh = Player.load(exported.path, tier=tier), extract_mesh(tables)
+    bones = skinning_weights(tables, mesh.positions) @ player.bones(pose, view).reshape(24, 12)
+    bones = bones.reshape(-1, 3, 4)
+    x, y, depth = (np.einsum("nij,nj->ni", bones[..., :3], mesh.positions) + bones[..., 3]).T
+    place = np.stack([y, x], axis=1) / depth[:, None] * view.focal_px + view.center_px[::-1]
+    place = place.astype(int)
+    inside = ((place >= 0) & (place < 192)).all(axis=1)
+    block = tuple(np.clip(place // 8, -1, 24).T + 1)  # of a coarse z-buffer with a border
+    nearest = np.full((26, 26), np.inf)
+    np.minimum.at(nearest, block, depth)
+    front = inside & (depth < ndimage.minimum_filter(nearest, 3)[block] + 0.006)
+    drawn = premultiply(player.render(pose, view))[tuple(place[front].T)]
+    assert front.sum() > 500
+    assert drawn[:, 3].min() > 0.6
+    error = np.abs(on_white(drawn) - mesh.colors[front] / 255.0).max(axis=1)
+    assert error.mean() < largest_mean
+
+
 @pytest.mark.parametrize("other_sheet_gap_m", [0.01, -0.015])
 @pytest.mark.parametrize("layers", [1, 2, 3, 4])
 def test_any_number_of_layers_is_drawn_as_in_the_reference(
@@ -106,7 +136,7 @@ def test_any_number_of_layers_is_drawn_as_in_the_reference(
     assert PictureDifference.of(drawn, draw_reference(tables, settings, inputs)).matches
 
 
-@pytest.mark.parametrize(("posed", "least"), [("canonical", 44.0), ("bent", 34.5)])
+@pytest.mark.parametrize(("posed", "least"), [("canonical", 44.0), ("bent", 41.0)])
 def test_the_player_shows_what_volume_rendering_shows(player, views, truth, posed, least):
     drawn, exact = premultiply(player.render(*views[posed])), truth[posed]
     assert psnr(on_white(drawn), on_white(exact)) > least
