@@ -13,6 +13,7 @@ from export.graph.graph_skinning import (
 )
 from export.graph.onnx_builder import GraphBuilder, GraphValue
 from export.package.player_tables import BRICK_NODES, BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
+from export.package.render_settings import MAX_FOLLOWED_COMPRESSION
 
 VOXEL_STRIDES = (BRICK_NODES * BRICK_NODES, BRICK_NODES, 1)
 """Steps along x, y and z between addresses inside a brick."""
@@ -325,7 +326,9 @@ def _newton_step(
     off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
     shift = inverse.apply(off)
     length = (dot(shift, shift) + 1e-20).sqrt()
-    share = (settings.max_correction_m / length).minimum(1.0)
+    before, after = (dot(d, d) for d in (segment.direction_canonical, inverse.ray))
+    followed = inverse.trusted & (after < before.maximum(1.0) * MAX_FOLLOWED_COMPRESSION**2)
+    share = graph.where(followed, (settings.max_correction_m / length).minimum(1.0), 0.0)
     return SegmentValues(
         direction_camera=segment.direction_camera,
         begin=segment.begin,
@@ -334,7 +337,7 @@ def _newton_step(
             p + s * share for p, s in zip(segment.start_canonical, shift, strict=True)
         ],
         direction_canonical=[
-            graph.where(inverse.followed, a, b)
+            graph.where(followed, a, b)
             for a, b in zip(inverse.ray, segment.direction_canonical, strict=True)
         ],
     )

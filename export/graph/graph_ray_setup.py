@@ -18,6 +18,7 @@ from export.graph.graph_ray_march import (
     march_segments,
 )
 from export.graph.graph_skinning import (
+    InverseJacobian,
     PosedNodeValues,
     PosedSurfels,
     SkinningCell,
@@ -27,7 +28,11 @@ from export.graph.graph_skinning import (
 from export.graph.graph_zbuffer import EMPTY_KEY, NUM_AROUND, KeysAround, SplatWindow
 from export.graph.onnx_builder import GraphValue
 from export.package.player_tables import SURFEL_MASK
-from export.package.render_settings import NEIGHBOR_REACH_M
+from export.package.render_settings import (
+    MAX_FOLLOWED_COMPRESSION,
+    MAX_GRAZING_COSINE,
+    NEIGHBOR_REACH_M,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,18 +107,18 @@ def trace_depth_layer(
     camera, derivative = skin_points(context, surface.posed, cell)
     inverse = invert_jacobian(context, derivative, ray)
     normal = gather_vector(_vector_table(context, "normal"), surfel)
-    direction = [
-        graph.where(inverse.followed, d, -n) for d, n in zip(inverse.ray, normal, strict=True)
-    ]
+    followed = _follows_inverse(context, inverse, normal)
+    direction = [graph.where(followed, d, -n) for d, n in zip(inverse.ray, normal, strict=True)]
     along = dot(camera, ray)
     beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
+    beside = [graph.where(followed, b, 0.0) for b in beside]
     thickness = context.table_values["thickness"].gather(surfel)
     enter, begin, end = _segment_bounds(context, normal, thickness, direction, beside, along)
     canonical = gather_vector(_vector_table(context, "position"), surfel)
     if isinstance(front, DepthLayer):
         begin = _begin_behind_front_layer(context, front, canonical, camera, begin, end)
     else:
-        beside = _move_to_mean_of_neighbors(context, front, surfel, inverse.followed, beside)
+        beside = _move_to_mean_of_neighbors(context, front, surfel, followed, beside)
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = SegmentValues(
@@ -134,6 +139,17 @@ def trace_depth_layer(
         enter=enter,
         end=end,
     )
+
+
+def _follows_inverse(
+    context: GraphContext, inverse: InverseJacobian, normal: VectorValue
+) -> GraphValue:
+    """Tell which rays follow the inverse: compressed ones only where they graze the surface."""
+    posed, falling = inverse.apply_transposed(normal), dot(normal, inverse.ray)
+    grazing = falling * falling < dot(posed, posed) * MAX_GRAZING_COSINE**2
+    anything = context.graph.constant(np.float32(1e30))
+    limit = context.graph.where(grazing, anything, MAX_FOLLOWED_COMPRESSION**2)
+    return inverse.trusted & (dot(inverse.ray, inverse.ray) < limit)
 
 
 def _vector_table(context: GraphContext, name: str) -> VectorValue:

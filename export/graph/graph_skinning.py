@@ -16,7 +16,6 @@ from export.graph.graph_context import (
     gather_vector,
 )
 from export.graph.onnx_builder import GraphValue
-from export.package.render_settings import MAX_FOLLOWED_COMPRESSION
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,21 +121,25 @@ class InverseJacobian:
 
     Attributes:
         cofactors: Adjugate of the Jacobian per step between nodes.
-        scale: Factor from each row of the adjugate to the inverse's, per metre; 0 where rays do not
-            follow it.
+        scale: Factor from each row of the adjugate to the inverse's, per metre; almost 0 where the
+            Jacobian is not inverted.
         ray: Canonical metres per metre along each point's ray.
-        followed: Whether rays follow it: the skin is neither folded nor torn apart, and the ray is
-            not compressed by more than `MAX_FOLLOWED_COMPRESSION`.
+        trusted: Whether it is inverted: the skin is neither folded nor torn apart.
     """
 
     cofactors: MatrixValue
     scale: VectorValue
     ray: VectorValue
-    followed: GraphValue
+    trusted: GraphValue
 
     def apply(self, vector: VectorValue) -> VectorValue:
         """Multiply vectors by the inverse."""
         return _apply_inverse(self.cofactors, self.scale, vector)
+
+    def apply_transposed(self, vector: VectorValue) -> VectorValue:
+        """Multiply vectors by the transpose of the inverse."""
+        scaled = [part * factor for part, factor in zip(vector, self.scale, strict=True)]
+        return [dot(column, scaled) for column in zip(*self.cofactors, strict=True)]
 
 
 def _apply_inverse(cofactors: MatrixValue, scale: VectorValue, vector: VectorValue) -> VectorValue:
@@ -146,18 +149,16 @@ def _apply_inverse(cofactors: MatrixValue, scale: VectorValue, vector: VectorVal
 def invert_jacobian(
     context: GraphContext, jacobian: MatrixValue, ray: VectorValue
 ) -> InverseJacobian:
-    """Invert Jacobians (metres per step between nodes) that rays (unit directions) follow."""
+    """Invert Jacobians (metres per step between nodes); apply them to unit directions of rays."""
     cofactors = adjugate(jacobian)
     per_m = skinning_nodes_per_m(context)
     volume = dot(jacobian[0], [row[0] for row in cofactors]) * float(np.prod(per_m))
     stretch = context.settings.max_volume_ratio
-    sound = (volume > 1.0 / stretch) & (volume < stretch)
-    one = context.graph.where(sound, volume, 1e30).reciprocal()
+    trusted = (volume > 1.0 / stretch) & (volume < stretch)
+    one = context.graph.where(trusted, volume, 1e30).reciprocal()
     scale = [one * float(np.prod(per_m) / step) for step in per_m]
     direction = _apply_inverse(cofactors, scale, ray)
-    followed = sound & (dot(direction, direction) < MAX_FOLLOWED_COMPRESSION**2)
-    scale = [context.graph.where(followed, factor, 0.0) for factor in scale]
-    return InverseJacobian(cofactors=cofactors, scale=scale, ray=direction, followed=followed)
+    return InverseJacobian(cofactors=cofactors, scale=scale, ray=direction, trusted=trusted)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 MAX_FOLLOWED_COMPRESSION = 3.0
 """Canonical metres per metre along a ray above which inverse skinning is not followed: a footprint
 would span centimetres of cloth, over which skinning is far from linear."""
+MAX_GRAZING_COSINE = 0.7
+"""Cosine between ray and posed normal below which it is followed all the same, to the outline."""
 NEIGHBOR_REACH_M = 0.03
 """Canonical distance up to which neighbors of a surfel belong to the same patch of skin, metres."""
 
@@ -68,9 +70,9 @@ class RenderSettings:
     # Folded skin
     max_volume_ratio: float = 10.0
     """Where the Jacobian's determinant is outside (1 / ratio, ratio), or canonical space is
-    compressed along the ray by more than `MAX_FOLLOWED_COMPRESSION`, do not invert it: look along
-    the surfel's normal at the mean of the surfels about the pixel, and leave the path
-    uncorrected."""
+    compressed by more than `MAX_FOLLOWED_COMPRESSION` along a ray that does not graze the surface,
+    do not invert it: look along the surfel's normal at the mean of the surfels about the pixel, and
+    leave the path uncorrected."""
     fold_volume_ratio: float = 0.3
     """Posed over canonical volume below which a surfel counts as folded; negative is inside out."""
     fold_depth_offset_m: float = 0.0

@@ -15,7 +15,12 @@ from jaxtyping import Bool, Float32, Int64
 
 from export.package.graph_tables import skinning_nodes
 from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables, SurfelTable
-from export.package.render_settings import NEIGHBOR_REACH_M, RenderSettings
+from export.package.render_settings import (
+    MAX_FOLLOWED_COMPRESSION,
+    MAX_GRAZING_COSINE,
+    NEIGHBOR_REACH_M,
+    RenderSettings,
+)
 from export.reference.compositor import VoxelCodes, composite_segments
 from export.reference.ray_segments import RaySegments
 from export.reference.reference_skinning import (
@@ -233,6 +238,7 @@ def _inverse_skinning(
     posed: _PosedSurface,
     points: Float32[np.ndarray, "points 3"],
     ray: Float32[np.ndarray, "points 3"],
+    normal: Float32[np.ndarray, "points 3"],
 ) -> tuple[
     Float32[np.ndarray, "points 3"],
     Float32[np.ndarray, "points 3 3"],
@@ -240,7 +246,12 @@ def _inverse_skinning(
 ]:
     """Return positions in the camera's frame, the inverse Jacobian, and where rays follow it."""
     camera, derivative = skin_trilinear(posed.nodes, points)
-    return camera, *invert_jacobians(settings, derivative, ray)
+    inverse, sound = invert_jacobians(settings, derivative)
+    direction = np.einsum("nij,nj->ni", inverse, ray)
+    posed = np.einsum("nij,ni->nj", inverse, normal)
+    grazing = (normal * direction).sum(axis=1) ** 2 < MAX_GRAZING_COSINE**2 * (posed**2).sum(axis=1)
+    near = (direction**2).sum(axis=1) < MAX_FOLLOWED_COMPRESSION**2
+    return camera, inverse, sound & (near | grazing)
 
 
 def _project_surfels(
@@ -314,9 +325,11 @@ def _ray_entries(
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
-    camera, inverse, sound = _inverse_skinning(settings, posed, surfels.positions[surfel], ray)
-    along = (camera * ray).sum(axis=1)
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
+    camera, inverse, sound = _inverse_skinning(
+        settings, posed, surfels.positions[surfel], ray, normal
+    )
+    along = (camera * ray).sum(axis=1)
     # where the skin is folded, look along its normal at the mean of the surfels about the pixel
     direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
     nearest = ray * along[:, None] - camera

@@ -117,14 +117,12 @@ def compression_factor(
 def invert_jacobians(
     settings: RenderSettings,
     jacobian: Float32[np.ndarray, "rays 3 3"],
-    ray: Float32[np.ndarray, "rays 3"],
 ) -> tuple[Float32[np.ndarray, "rays 3 3"], Bool[np.ndarray, "rays"]]:
-    """Return inverse Jacobians, and which of them rays may follow; the others are arbitrary."""
+    """Return inverse Jacobians, and which of them are sound; the others are arbitrary."""
     volume = np.linalg.det(jacobian)
     sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
     inverse = np.linalg.inv(np.where(sound[:, None, None], jacobian, np.eye(3)))
-    squares = (np.einsum("nij,nj->ni", inverse, ray) ** 2).sum(axis=1)
-    return inverse.astype(np.float32), sound & (squares < MAX_FOLLOWED_COMPRESSION**2)
+    return inverse.astype(np.float32), sound
 
 
 def newton_correction(
@@ -132,12 +130,15 @@ def newton_correction(
 ) -> CanonicalRays:
     """Move canonical starts one Newton step onto their camera rays; update the directions."""
     camera, jacobian = skin_trilinear(posed, rays.start_canonical)
-    inverse, sound = invert_jacobians(settings, jacobian, rays.direction_camera)
+    inverse, sound = invert_jacobians(settings, jacobian)
+    turned = np.einsum("nij,nj->ni", inverse, rays.direction_camera)
+    before, after = ((d**2).sum(axis=1) for d in (rays.direction_canonical, turned))
+    sound &= after < np.maximum(before, 1.0) * MAX_FOLLOWED_COMPRESSION**2
     inverse = inverse[sound]
     off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
     shift = np.einsum("nij,nj->ni", inverse, off)
     length = np.linalg.norm(shift, axis=1, keepdims=True)
     start, direction = rays.start_canonical.copy(), rays.direction_canonical.copy()
     start[sound] += shift * np.minimum(settings.max_correction_m / np.maximum(length, 1e-10), 1.0)
-    direction[sound] = np.einsum("nij,nj->ni", inverse, rays.direction_camera[sound])
+    direction[sound] = turned[sound]
     return rays._replace(start_canonical=start, direction_canonical=direction)

