@@ -248,8 +248,10 @@ def _inverse_skinning(
     camera, derivative = skin_trilinear(posed.nodes, points)
     inverse, sound = invert_jacobians(settings, derivative)
     direction = np.einsum("nij,nj->ni", inverse, ray)
-    posed = np.einsum("nij,ni->nj", inverse, normal)
-    grazing = (normal * direction).sum(axis=1) ** 2 < MAX_GRAZING_COSINE**2 * (posed**2).sum(axis=1)
+    upward = np.einsum("nij,ni->nj", inverse, normal)
+    grazing = (normal * direction).sum(axis=1) ** 2 < MAX_GRAZING_COSINE**2 * (upward**2).sum(
+        axis=1
+    )
     near = (direction**2).sum(axis=1) < MAX_FOLLOWED_COMPRESSION**2
     return camera, inverse, sound & (near | grazing)
 
