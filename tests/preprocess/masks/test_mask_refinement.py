@@ -87,6 +87,28 @@ def test_static_background_gains_more_than_a_changing_one() -> None:
     assert moving > soft + 0.005
 
 
+def test_hand_held_camera_does_no_harm() -> None:
+    """A background that shakes by some pixels is not taken for person."""
+    shakes = np.random.default_rng(0).integers(-6, 7, (16, 2))
+    soft, shaken = _refine_clip(
+        [np.roll(_background(1), tuple(shake), axis=(0, 1)) for shake in shakes]
+    )
+    assert shaken > soft + 0.01
+
+
+def test_shadow_of_the_person_stays_background() -> None:
+    """Background that was seen before and is darker now is shaded, not person."""
+    background = np.full((SIZE_PX[1], SIZE_PX[0], 3), (110.0, 140.0, 170.0), np.float32)
+    refiner = MaskRefiner(SIZE_PX)
+    for shift_px in (-20, 20, -15, 15, -10, 10):
+        refiner(*_frame(shift_px, background)[:2])
+    shade = np.zeros(SIZE_PX[::-1], np.uint8)
+    cv2.ellipse(shade, (112, 212), (14, 8), 0, 0, 360, 1, -1)
+    rgb, mask, truth = _frame(0, background * (1.0 - 0.3 * shade[..., None]))
+    found = refiner(rgb, mask)[(shade > 0) & (truth < 0.01)]
+    assert (found > 0.5).mean() < 0.1
+
+
 def test_exposure_that_drifts_leaves_the_background_known() -> None:
     """A phone's exposure changes by the frame, by channels of their own."""
     gains = 1.0 + 0.12 * np.sin(np.arange(16)[:, None] * np.array([0.7, 0.9, 1.1]))
