@@ -81,8 +81,8 @@ class ShootConfig:
 
     def _validate_phone(self) -> None:
         own_noise = self.pose_noise_deg or self.pose_noise_cm or self.mask_noise_px
-        if self.motion != "turn" or self.background in ("room", "tiles") or own_noise:
+        if self.camera_moves or self.background in ("room", "tiles") or own_noise:
             raise InputError(
-                "--like-a-phone films --motion turn before --background plain or clutter, and has "
-                "noise of its own: leave --motion and the noise out."
+                "--like-a-phone films --motion turn or dance before --background plain or clutter, "
+                "and has noise of its own: leave out --motion walkaround and the noise."
             )

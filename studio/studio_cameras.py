@@ -23,6 +23,8 @@ HEADROOM_SHARE = 0.110
 
 PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE = 0.85, 0.075
 """The same of a portrait."""
+DANCE_HEIGHT_SHARE, DANCE_HEADROOM_SHARE = 0.62, 0.20
+"""The same of a portrait of a dance: arms and legs reach to all sides."""
 
 
 def static_camera(actor: Actor, size: int) -> Camera:
@@ -30,9 +32,17 @@ def static_camera(actor: Actor, size: int) -> Camera:
     return _frame_actor(actor, (size, size), PERSON_HEIGHT_SHARE, HEADROOM_SHARE)
 
 
-def portrait_camera(actor: Actor, width: int) -> Camera:
-    """A phone held upright on a tripod, 9:16, set up for one actor; sides are even numbers."""
+def portrait_camera(actor: Actor, width: int, *, dances: bool = False) -> Camera:
+    """A phone held upright on a tripod, 9:16, set up for one actor; sides are even numbers.
+
+    Args:
+        actor: Who is filmed.
+        width: Of the pictures, px.
+        dances: Whether there must be room for a dance.
+    """
     size_px = 2 * round(width / 2), 2 * round(width * 8 / 9)
+    if dances:
+        return _frame_actor(actor, size_px, DANCE_HEIGHT_SHARE, DANCE_HEADROOM_SHARE)
     return _frame_actor(actor, size_px, PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE)
 
 

@@ -39,7 +39,7 @@ def write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgre
     never filmed with sharp, neutrally exposed images, masks and cameras.npz).
     """
     actor = Actor.of(config.subject, config.seed, SUBJECT_PROPORTIONS[config.subject])
-    camera = portrait_camera(actor, config.size)
+    camera = portrait_camera(actor, config.size, dances=config.motion == "dance")
     backdrop = painted_backdrop.paint_backdrop(
         "plain" if config.background == "plain" else "clutter",
         camera,
@@ -53,14 +53,7 @@ def write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgre
         cloth=MovingCloth(actor, config.seed),
         fps=config.fps,
     )
-    truth = actor_motions.turning_motion(
-        actor,
-        frames=config.frames,
-        fps=config.fps,
-        turns=TURNS if config.turns is None else config.turns,
-        seed=config.seed,
-        arm_lift_deg=ARM_LIFT_DEG,
-    )
+    truth = _choose_motion(actor, config)
     novel = actor_motions.novel_poses(actor)
     total = len(truth) + len(novel)
     _film(folder, scene, truth, config, lambda done: progress(done, total))
@@ -72,6 +65,22 @@ def write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgre
     write_cameras(folder / "truth" / "cameras.npz", (camera,))
     write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
     _write_inputs(folder, scene, truth, config)
+
+
+def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    turns = TURNS if config.turns is None else config.turns
+    if config.motion == "dance":
+        return actor_motions.dancing_motion(
+            actor, frames=config.frames, fps=config.fps, turns=turns, seed=config.seed
+        )
+    return actor_motions.turning_motion(
+        actor,
+        frames=config.frames,
+        fps=config.fps,
+        turns=turns,
+        seed=config.seed,
+        arm_lift_deg=ARM_LIFT_DEG,
+    )
 
 
 def _film(

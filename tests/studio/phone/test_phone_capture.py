@@ -1,6 +1,7 @@
 """Captures as a phone gives them: what is wrong with them, and the truth beside it."""
 
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -169,3 +170,17 @@ def test_the_same_seed_films_the_same_phone_capture(tmp_path):
 def test_what_a_phone_on_a_tripod_cannot_film_is_refused(tmp_path, wrong):
     with pytest.raises(InputError, match="--like-a-phone"):
         film_capture(tmp_path / "c", ShootConfig(like_a_phone=True, **wrong))
+
+
+def test_a_dance_fits_into_the_portrait(tmp_path):
+    film_capture(tmp_path / "c", replace(PHONE, frames=10, size=36, motion="dance"))
+    truth = tmp_path / "c" / "truth"
+    motion, body = (
+        read_motion(truth / "poses.npz"),
+        load_body_model(truth / "body.npz").with_shape(),
+    )
+    camera = read_cameras(truth / "cameras.npz", (36, 64))[0]
+    pixels = np.stack([camera.project(body.with_pose(pose).joints()) for pose in motion])
+    assert pixels.min() > 0.0
+    assert (pixels < (36.0, 64.0)).all()
+    assert np.ptp(motion.joint_rotations, axis=0).max() > 1.0
