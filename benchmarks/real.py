@@ -135,20 +135,34 @@ def measure_all(job: RealJob) -> Iterator[tuple[str, Figures]]:
 
 
 def measure_phone_capture(job: RealJob, subject: Literal[1, 2, 3]) -> Figures:
-    """Films a phone-like capture, unless it lies there already, and learns it, twice."""
-    width = 2 * round(job.size * 9 / 32)
-    config = ShootConfig(
-        frames=job.frames, size=width, seed=job.seed, subject=subject, like_a_phone=True
-    )
-    capture = job.folder / f"phone-{subject}-{width}px-{job.frames}-seed{job.seed}"
-    if not capture.exists():
-        film_capture(capture, config)
+    """Films a phone-like capture and learns it, twice."""
+    capture = film_phone_capture(job, subject)
     run = IngestRun(ingest_command(job, capture), job.folder / f"run-{subject}")
     figures = run_figures(run) | truth_figures(run.folder, capture)
     if not job.exact:
         return figures
     exact = IngestRun(ingest_command(job, capture, exact=True), job.folder / f"run-{subject}-exact")
     return figures | exact_figures(exact, capture, figures)
+
+
+def film_phone_capture(
+    job: RealJob, subject: Literal[1, 2, 3], motion: Literal["turn", "dance"] = "turn"
+) -> Path:
+    """The folder of a phone-like capture, which is filmed unless it lies there already."""
+    width = 2 * round(job.size * 9 / 32)
+    named = f"phone-{subject}-{width}px-{job.frames}-seed{job.seed}"
+    capture = job.folder / (named if motion == "turn" else f"{named}-{motion}")
+    if not capture.exists():
+        config = ShootConfig(
+            frames=job.frames,
+            size=width,
+            seed=job.seed,
+            subject=subject,
+            like_a_phone=True,
+            motion=motion,
+        )
+        film_capture(capture, config)
+    return capture
 
 
 def ingest_command(job: RealJob, capture: Path, *, exact: bool = False) -> list[str]:

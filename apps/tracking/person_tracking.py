@@ -133,7 +133,7 @@ def track_person(
     with atomic_folder(folder) if own_masks else nullcontext() as part:
         tracked = _run_networks(source, inputs, part, console, stop)
         with console.status("fitting body and poses to key points and masks"):
-            capture = _fit_capture(source, tracked, inputs, part)
+            capture = fit_tracked_video(source, tracked, inputs, part)
             grade = _grade(capture, tracked.frame_times_s)
         with atomic_file(poses, replace=may_replace) as unfinished:
             write_motion(unfinished, capture.motion)
@@ -173,10 +173,20 @@ def _run_networks(
         )
 
 
-def _fit_capture(
+def fit_tracked_video(
     source: FrameSource, tracked: TrackedVideo, inputs: CaptureInputs, masks: Path | None
 ) -> Capture:
-    """The recording with poses lifted from the key points and fitted to them and to the masks."""
+    """The recording with poses lifted from the key points and fitted to them and to the masks.
+
+    Args:
+        source: The recording.
+        tracked: What the networks found in it.
+        inputs: What the user named.
+        masks: Folder of tracked masks; None if others are used.
+
+    Raises:
+        InputError: If the parts cannot be opened.
+    """
     shaped = load_body_model(inputs.body).with_shape()
     lifted = lift_keypoints(
         tracked.keypoints, shaped, assume_camera(inputs.video, inputs.cameras, source)
