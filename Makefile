@@ -18,6 +18,9 @@ $(VENV)/installed: pyproject.toml constraints.txt
 demo: install
 	$(BIN)/python -m apps.sample $(DEMO)/capture --size 256 --overwrite
 	$(BIN)/python -m apps.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
+	cp $(DEMO)/capture/video.mp4 $(DEMO)/video.mp4
+	$(BIN)/python -m apps.ingest $(DEMO)/video.mp4 --out $(DEMO)/from-video --seconds 60 --overwrite
+	$(BIN)/python -m apps.evaluate $(DEMO)/run $(DEMO)/from-video --markdown $(DEMO)/comparison.md --overwrite
 	$(BIN)/python -m apps.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm --overwrite
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
