@@ -116,11 +116,12 @@ class StreamMeter:
         dropped, late = self._source.dropped + self.inbox_dropped, self.lateness_s
         if dropped:
             yield (
-                f"{dropped} frames were dropped because preprocessing is slower than the frame "
-                "rate. Reduce --size."
+                f"{dropped} frames were dropped because tracking or preprocessing is slower than "
+                "the frame rate. The others are enough if the person moves slowly; else reduce "
+                "--size."
             )
         playback = self._source.paced and not self._source.live
-        if playback and late.percentile(95.0) > LATENESS_WARNING_S:
+        if playback and not dropped and late.percentile(95.0) > LATENESS_WARNING_S:
             yield (
                 f"Playback lagged by up to {late.largest:.1f} s (median "
                 f"{late.percentile(50.0):.1f} s): preprocessing is slower than the frame rate. No "

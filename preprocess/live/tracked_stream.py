@@ -55,7 +55,6 @@ class TrackedStream:
     with those of later frames.
 
     Attributes:
-        skipped: Number of frames that came while another was being tracked.
         look: Called with each frame as soon as it is taken.
     """
 
@@ -68,7 +67,7 @@ class TrackedStream:
         self._source = source
         self._frames: Iterator[Frame] | None = None
         self._waiting: deque[Frame] = deque()
-        self.skipped = 0
+        self._skipped = 0
         self.look: Callable[[Frame], None] = lambda frame: None
         self.path, self.size_px, self.selection = source.path, source.size_px, source.selection
         self.frames_in_file, self.frame_count = source.frames_in_file, source.frame_count
@@ -83,8 +82,8 @@ class TrackedStream:
 
     @property
     def dropped(self) -> int:
-        """Number of frames that the source has lost; those left out here are `skipped`."""
-        return self._source.dropped
+        """Number of frames that were lost, most of them while another was being tracked."""
+        return self._source.dropped + self._skipped
 
     def take_next(self) -> bool:
         """Take and look at the next frame; return whether there was one."""
@@ -120,7 +119,7 @@ class TrackedStream:
             late = frame.due_s is not None and time.perf_counter() - frame.due_s > MAX_LATENESS_S
             if late and skipped < MAX_SKIPPED:
                 skipped += 1
-                self.skipped += 1
+                self._skipped += 1
             else:
                 skipped = 0
                 yield frame
@@ -234,11 +233,6 @@ class LiveTracking:
     def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""
         looked = len(self.times_s)
-        if self.stream.skipped:
-            yield (
-                f"{self.stream.skipped} of {looked + self.stream.skipped} frames were left out: "
-                "they came while another was being tracked."
-            )
         if self.lost:
             times = [self.times_s[number] for number in self.lost]
             yield (

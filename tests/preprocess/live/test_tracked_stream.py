@@ -120,7 +120,7 @@ def test_every_frame_has_a_pose_and_a_mask(standing):
     seen = observe_all(stream, tracking, start)
     assert [item.frame.index for item in seen] == list(range(COUNT))
     places = np.array([item.pose.root_translation for item in seen])
-    assert np.ptp(places, axis=0).max() < 0.05
+    assert np.abs(np.diff(places, axis=0)).max() < 0.02
     assert all(item.alpha.max() > 0.9 for item in seen)
     assert list(tracking.final_notes()) == []
 
@@ -147,8 +147,7 @@ def test_late_frames_are_left_out(standing, monkeypatch):
     stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
     seen = observe_all(stream, tracking, start)
     assert [item.frame.index for item in seen] == [5, 11, 17, 23]  # but not all of them
-    assert stream.skipped == 20
-    assert "20 of 24 frames were left out" in " ".join(tracking.final_notes())
+    assert stream.dropped == 20
 
 
 def test_a_stream_without_a_person_is_bad_input(standing):
