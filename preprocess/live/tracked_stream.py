@@ -40,6 +40,9 @@ START_FRAMES = 8
 """Frames with the person from which proportions and focal length are fitted."""
 MAX_LATENESS_S = 0.04
 """Time after it was due at which a frame is left out: another was being tracked."""
+MIN_INTERVAL_S = 0.06
+"""Time between two frames that are taken: more of them teach no more, and their poses would jitter,
+for the frames around a frame would span too short a time."""
 MAX_SKIPPED = 5
 """Most frames in a row that are left out; a machine that is too busy to decode a recording at its
 own speed falls behind instead."""
@@ -114,14 +117,16 @@ class TrackedStream:
         self._source.close()
 
     def _taken(self) -> Iterator[Frame]:
-        skipped = 0  # since the last frame that was taken
+        skipped, last_s = 0, -np.inf  # since the last frame that was taken; its time
         for frame in self._source.frames():
+            if frame.due_s is not None and frame.time_s - last_s < MIN_INTERVAL_S:
+                continue
             late = frame.due_s is not None and time.perf_counter() - frame.due_s > MAX_LATENESS_S
             if late and skipped < MAX_SKIPPED:
                 skipped += 1
                 self._skipped += 1
             else:
-                skipped = 0
+                skipped, last_s = 0, frame.time_s
                 yield frame
 
 

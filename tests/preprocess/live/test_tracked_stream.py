@@ -9,6 +9,7 @@ import pytest
 from capture.frame import Frame
 from capture.input_error import InputError
 from preprocess.body.body_file import load_body_model
+from preprocess.body.silhouette import splat_silhouette
 from preprocess.cameras.assumed_camera import assume_camera
 from preprocess.fitting.tracked_frames import LAG_FRAMES
 from preprocess.live import tracked_stream
@@ -71,18 +72,15 @@ def standing():
     points[29:33] = joints[[7, 8, 10, 11]]
     camera = assume_camera(Path("film.mp4"), "static", Pictures())
     pixels = camera.project(points + np.array([0.0, 0.2, 2.6]))
-    values = np.zeros((256, 256), np.uint8)
-    values[40:230, 100:156] = 255
-    scale = np.ptp(pixels[:, 1]) / 190.0
-    corner = pixels.mean(axis=0) - 128.0 * scale
+    skin = shaped.vertices * (1.0, -1.0, -1.0) + np.array([0.0, 0.2, 2.6])
     return PersonKeypoints(
         image_px=pixels,
         world_m=points - joints[[1, 2]].mean(axis=0),
         visibility=np.ones(33),
         presence=1.0,
         mask=CroppedMask(
-            values=values,
-            image_from_crop=np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]]),
+            values=np.where(splat_silhouette(skin, camera), 255, 0).astype(np.uint8),
+            image_from_crop=np.eye(3)[:2],
         ),
     )
 
@@ -146,8 +144,16 @@ def test_late_frames_are_left_out(standing, monkeypatch):
     monkeypatch.setattr(tracked_stream.time, "perf_counter", lambda: 100.0)
     stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
     seen = observe_all(stream, tracking, start)
-    assert [item.frame.index for item in seen] == [5, 11, 17, 23]  # but not all of them
-    assert stream.dropped == 20
+    assert [item.frame.index for item in seen] == [5, 12, 19]  # but not all of them
+    assert stream.dropped == 18
+
+
+def test_of_a_fast_camera_every_second_frame_is_taken(standing, monkeypatch):
+    monkeypatch.setattr(tracked_stream.time, "perf_counter", lambda: 90.0)
+    stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
+    seen = observe_all(stream, tracking, start)
+    assert [item.frame.index for item in seen] == list(range(0, COUNT, 2))
+    assert stream.dropped == 0
 
 
 def test_a_stream_without_a_person_is_bad_input(standing):
