@@ -34,6 +34,8 @@ MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 60
 """The same for poses that were made of key points, which tell the poses between them."""
+TRACKED_FRAMES_PER_PRIOR = 30.0
+"""Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = (4, 5)
@@ -185,6 +187,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         keypoints=ClipKeypoints.of(track, used, cameras, capture.shaped.joints),
         prior=HumanPosePrior(rotations, _times_s(track, used)),
         sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
+        frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
     )
 
 

@@ -92,6 +92,7 @@ class ClipFitter:
         prior: ClipPrior | None = None,
         keypoints: ClipKeypoints | None = None,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
+        frames_per_prior: float = FRAMES_PER_PRIOR,
         model: OutlineModel | None = None,
     ) -> None:
         """Starts with the poses, the proportions and the focal length as they are.
@@ -103,12 +104,14 @@ class ClipFitter:
             prior: What is known of the poses; if None, that they are near the motion's.
             keypoints: Key points of these frames, as further evidence.
             sigma_log_focal: How uncertain the focal length is.
+            frames_per_prior: Frames that count as one for the proportions.
             model: The person at the space's origin, where several clips share it.
         """
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
         self._keypoints = keypoints
+        self._frames_per_prior = frames_per_prior
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
@@ -212,7 +215,7 @@ class ClipFitter:
         """Adds the priors of all parameters, and holds those that are not fitted."""
         self._prior.add_to(equations, self.poses)
         precision = np.full(len(self.coefficients) + 1, 1.0)
-        precision *= max(1.0, len(self.frames) / FRAMES_PER_PRIOR)
+        precision *= max(1.0, len(self.frames) / self._frames_per_prior)
         state = np.concatenate([self.coefficients, [self.log_focal / self._sigma_log_focal]])
         equations.add_shared(precision, state)
         held = np.zeros(len(state))
