@@ -53,10 +53,6 @@ LEFT_PRIORS = {
 collar, shoulder, elbow, wrist, hand."""
 MIDDLE_PRIORS = {3: 0.08, 6: 0.07, 9: 0.07, 12: 0.20, 15: 0.20}
 """Standard deviation of the axis-angles of spine, neck and head, radians."""
-HINGES = ((4, 0, 1.0), (5, 0, 1.0), (18, 1, -1.0), (19, 1, 1.0))
-"""Knees and elbows, the axis that they bend about, and to which side."""
-SIGMA_HINGE_RAD = 0.03
-"""Standard deviation of how far a hinge bends to the wrong side, radians."""
 SIGMA_FREE = 30.0
 """Standard deviation of what is not known at all, radians or metres."""
 STEADY_S = 0.17
@@ -110,7 +106,7 @@ class GivenPosePrior:
 
 @final
 class HumanPosePrior:
-    """Joints turn as people's do: knees and elbows one way, and slowly most of the time."""
+    """Joints turn as people's do: about few axes, and steadily most of the time."""
 
     def __init__(
         self,
@@ -132,14 +128,9 @@ class HumanPosePrior:
         """See `ClipPrior`."""
         vectors = rotation_vectors(poses.rotations)
         by_step = _inverse_right_jacobian(vectors)
-        weights, residuals = np.broadcast_to(1.0 / _SIGMA**2, vectors.shape).copy(), vectors - _MEAN
-        for joint, axis, side in HINGES:
-            wrong = side * vectors[:, joint, axis] < 0.0
-            weights[wrong, joint, axis] = SIGMA_HINGE_RAD**-2
-            residuals[wrong, joint, axis] = vectors[wrong, joint, axis]
-        heavy = weights[..., None] * by_step
+        heavy = by_step / _SIGMA[..., None] ** 2
         blocks = by_step.swapaxes(-1, -2) @ heavy
-        right = -(heavy.swapaxes(-1, -2) @ residuals[..., None])[..., 0]
+        right = -(heavy.swapaxes(-1, -2) @ (vectors - _MEAN)[..., None])[..., 0]
         units = POSE_SIGMA[:72].reshape(24, 3)
         blocks *= units[:, :, None] * units[:, None]
         for joint in range(24):
