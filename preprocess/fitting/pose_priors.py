@@ -112,8 +112,16 @@ class HumanPosePrior:
         self,
         camera_rotations: Float[np.ndarray, "frames 3 3"],
         times_s: Float[np.ndarray, "frames"],
+        *,
+        settled: bool = False,
     ) -> None:
-        """Takes the times of the frames."""
+        """Takes what the poses are compared by.
+
+        Args:
+            camera_rotations: Camera from world of each frame.
+            times_s: Times of the frames.
+            settled: Whether the poses were fitted before: no frame is far off its neighbors.
+        """
         self._cameras = camera_rotations
         change = np.zeros((25, 3))
         for value, joints in CHANGES_PER_SECOND:
@@ -122,7 +130,7 @@ class HumanPosePrior:
         gaps = np.maximum(np.diff(times_s), 1e-3)
         self._change = change.ravel() * np.sqrt(gaps)[:, None]
         self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
-        self._fast_change = FIRST_FAST_CHANGE
+        self._fast_change = FAST_CHANGE if settled else FIRST_FAST_CHANGE
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
         """See `ClipPrior`."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
@@ -114,6 +114,8 @@ class FramePoseFitter:
         shaped = self._model.space.shaped
         if start is None:
             start = _lift([seen], shaped, self._camera)[0]
+            if self._poses:
+                start = _at_distance_of(start, self._poses[-1], shaped.joints[0])
         self._poses.append(start)
         count = len(self._seen)
         outlined = {count - 1, count - 1 - LAG_FRAMES}
@@ -129,6 +131,12 @@ class FramePoseFitter:
         """Present pose of one of the last frames, by its number."""
         numbers = [each.number for each in self._seen]
         return self._poses[numbers.index(number)]
+
+
+def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "3"]) -> BodyPose:
+    """A pose moved along its view, from a camera at the origin, to the distance of another."""
+    place, away = pelvis + pose.root_translation, (pelvis + other.root_translation)[2]
+    return replace(pose, root_translation=place * (away / max(float(place[2]), 1e-3)) - pelvis)
 
 
 def _lift(seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera) -> Motion:
@@ -176,7 +184,8 @@ def _fitter(
     times = np.array([each.time_s for each in seen])
     return ClipFitter(
         motion, model.space, frames, model=model, keypoints=keypoints,
-        prior=HumanPosePrior(rotations, times), sigma_log_focal=SIGMA_LOG_ASSUMED_FOCAL,
+        prior=HumanPosePrior(rotations, times, settled=poses is not None),
+        sigma_log_focal=SIGMA_LOG_ASSUMED_FOCAL,
     )  # fmt: skip
 
 
