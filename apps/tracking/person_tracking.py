@@ -20,7 +20,7 @@ from preprocess.body.silhouette import SkinPoints
 from preprocess.cameras.assumed_camera import assume_camera
 from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.fitting.capture_fitting import fit_capture
+from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_origin import segmenter_name
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -202,14 +202,12 @@ def fit_tracked_video(
         fit = fit_capture(capture)
     if fit is None:
         return capture
-    geometry = CaptureGeometry.of(capture.motion, capture.cameras, source)
-    cameras = fit.scale_focal_lengths(capture.cameras)
-    motion = replace(
-        fit.correct_motion(geometry),
-        proportions=fit.coefficients,
-        intrinsic=None if cameras.is_moving else cameras[0].intrinsic,
+    return replace(
+        capture,
+        motion=fitted_motion(capture, fit),
+        cameras=fit.scale_focal_lengths(capture.cameras),
+        shaped=fit.shape(capture.shaped),
     )
-    return replace(capture, motion=motion, cameras=cameras, shaped=fit.shape(capture.shaped))
 
 
 def person_number(person: str | None) -> int | None:

@@ -202,7 +202,7 @@ def _reduced_size_px(capture: Capture) -> tuple[int, int]:
 
 
 def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
-    """What a pose file should hold of tracked poses after their fit: with proportions and K.
+    """What a pose file should hold of tracked poses after their fit: proportions, K unless it moves.
 
     Args:
         capture: What was fitted: poses made of key points, for the mean body.
@@ -210,7 +210,8 @@ def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
     """
     moved = fit.correct_motion(_geometry(capture))
     betas = SIGMA_BETA * fit.coefficients[: capture.shaped.body.shape_directions.shape[-1]]
-    intrinsic = fit.scale_focal_lengths(capture.cameras)[0].intrinsic
+    cameras = fit.scale_focal_lengths(capture.cameras)
+    intrinsic = None if cameras.is_moving else cameras[0].intrinsic
     return replace(moved, betas=betas, proportions=fit.coefficients, intrinsic=intrinsic)
 
 
