@@ -202,7 +202,7 @@ def _reduced_size_px(capture: Capture) -> tuple[int, int]:
 
 
 def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
-    """What a pose file should hold of tracked poses after their fit: proportions, K unless it moves.
+    """What a pose file should hold of tracked poses after their fit: proportions, and a static K.
 
     Args:
         capture: What was fitted: poses made of key points, for the mean body.
