@@ -139,8 +139,9 @@ def track_person(
             write_motion(unfinished, capture.motion)
     inputs = replace(inputs, poses=poses, person=None)
     if own_masks:
-        inputs = replace(inputs, masks=folder, invert_masks=False)
         capture = replace(capture, masks=open_masks(folder, invert=False))
+        if segmenter_name(inputs.masks) is None:  # else it makes the masks to learn from
+            inputs = replace(inputs, masks=folder, invert_masks=False)
     return PersonTracking(
         capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
     )
