@@ -4,7 +4,7 @@ Networks run on one thread; masks are refined and written on another, so two cor
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,8 @@ from preprocess.tracking.tracking_problems import PROBLEM_BITS, ProblemFinder
 
 MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
+FRAMES_REFINED_AGAIN = 60
+"""First frames whose masks are made again in the end, when the background behind them is known."""
 QUEUED_MASKS = 8
 """Most masks that wait to be written."""
 
@@ -106,18 +108,41 @@ def track_video(
                 found.append(person)
                 problems.append(sum(PROBLEM_BITS[each] for each in seen))
             if mask_folder is not None:
-                path = mask_folder / f"{frame.index:06d}.png"
+                path = _mask_path(mask_folder, frame.index)
                 waiting.append(pool.submit(_write_mask, path, frame.rgb, person, refine))
             while len(waiting) > QUEUED_MASKS or (waiting and waiting[0].done()):
                 waiting.pop(0).result()
             advance(len(times))
         for each in waiting:
             each.result()
+    if mask_folder is not None and not interrupted:
+        first = dict(zip(frames[:FRAMES_REFINED_AGAIN], found, strict=False))
+        _refine_again(source, first, refine, mask_folder)
     if len(found) < min(MIN_FOUND, max(1, len(times) // 4)) or not found:
         raise InputError(_too_few_message(source, len(found), len(times)))
     track = KeypointTrack.of(frames, found, source.size_px, [times[number] for number in frames])
     track = replace(track, problems=np.array(problems, dtype=np.int64))
     return TrackedVideo(keypoints=track, frame_times_s=times, interrupted=interrupted)
+
+
+def _refine_again(
+    source: FrameSource,
+    found: Mapping[int, PersonKeypoints],
+    refine: MaskRefinement,
+    mask_folder: Path,
+) -> None:
+    """Make the masks of some frames again, by what later frames have shown."""
+    left = set(found)
+    for frame in source.frames():
+        if frame.index in left:
+            _write_mask(_mask_path(mask_folder, frame.index), frame.rgb, found[frame.index], refine)
+            left.remove(frame.index)
+        if not left:
+            return
+
+
+def _mask_path(folder: Path, index: int) -> Path:
+    return folder / f"{index:06d}.png"
 
 
 def _write_mask(

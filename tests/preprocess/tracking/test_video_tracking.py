@@ -8,6 +8,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source_opening import open_source
+from preprocess.tracking import video_tracking
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 from preprocess.tracking.video_tracking import track_video
 
@@ -83,3 +84,18 @@ def test_a_stop_keeps_what_was_found(pictures):
 def test_a_failing_mask_writer_is_not_swallowed(pictures, tmp_path):
     with pytest.raises(OSError, match="gone"):
         track_video(pictures, FakeTracker(), plain, tmp_path / "gone")
+
+
+def test_first_masks_are_made_again_once_the_background_is_known(pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr(video_tracking, "FRAMES_REFINED_AGAIN", 2)
+    refined: list[int] = []
+
+    def refine(rgb, mask, size_px):
+        refined.append(round(float(rgb.mean())) // 10)
+        share = 1.0 if len(refined) > COUNT else 0.5
+        return np.full(size_px[::-1], share, dtype=np.float32)
+
+    track_video(pictures, FakeTracker(), refine, tmp_path)
+    assert refined == [*range(COUNT), 0, 1]
+    masks = [cv2.imread(str(file), 0).max() for file in sorted(tmp_path.glob("*.png"))]
+    assert masks == [255, 255] + [128] * (COUNT - 2)
