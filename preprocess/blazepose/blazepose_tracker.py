@@ -38,6 +38,9 @@ OVERLAPPING = 0.3
 """Distance within which two persons hide each other."""
 MAX_COLOR_DISTANCE = 8.0
 """Largest difference of a person's colors, in units of CIELAB, if the others' are not known."""
+MAX_UNSEEN_COLOR_DISTANCE = 12.0
+"""The same for a place where the detector finds no person: past it the networks hold on to a thing
+that the person passed."""
 CROWD_MEMORY = 20
 """Frames after which another person who was near and is not seen any more does not count."""
 
@@ -101,7 +104,15 @@ class BlazePoseTracker:
         """The person, where the last frame's key points say; None if it is not there."""
         if self._last is None or self._last.frames_ago > 1:
             return None
-        return self._accept(rgb, self._find_landmarks(rgb, self._last.square))
+        found = self._accept(rgb, self._find_landmarks(rgb, self._last.square))
+        return None if found is None or self._is_a_thing(rgb, found) else found
+
+    def _is_a_thing(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
+        """Whether what was found has strange colors, and is no person to the detector."""
+        distance = self._looks.distance(colors_of(rgb, found.keypoints))
+        return distance > MAX_UNSEEN_COLOR_DISTANCE and not any(
+            distance_in_sides(found.square, each.square) < NEAR for each in self._detect(rgb)
+        )
 
     def _accept(
         self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks
@@ -161,28 +172,34 @@ class BlazePoseTracker:
         nearest = 1.0
         for other in self._detect(rgb):
             apart = distance_in_sides(found.square, other.square)
-            if apart > SAME_PERSON_DISTANCE:
+            if apart > SAME_PERSON_DISTANCE and not self._is_same(rgb, found.square, other.square):
                 self._has_company = True
                 nearest = min(nearest, apart)
-                if OVERLAPPING < apart < NEAR:
-                    self._learn_company(rgb, found.square, other.square)
         if nearest < NEAR:
             self._crowded_frames = CROWD_MEMORY
         is_clear = nearest > OVERLAPPING and self._crowded_frames in (0, CROWD_MEMORY)
         if is_clear or not self._looks.is_known:
             self._looks.learn(colors_of(rgb, found.keypoints))
 
-    def _learn_company(
+    def _is_same(
         self,
         rgb: UInt8[np.ndarray, "height width 3"],
         person: PersonSquare,
         other: PersonSquare,
-    ) -> None:
-        """Remember the looks of another person who is near."""
+    ) -> bool:
+        """Whether a detection near the person is the person; another one's looks are remembered.
+
+        The detector's squares around small persons lie beside them; their key points do not.
+        """
+        if distance_in_sides(person, other) >= NEAR:
+            return False
         found = self._find_landmarks(rgb, other)
-        is_other = distance_in_sides(person, found.square) > OVERLAPPING
-        if is_other and found.keypoints.presence >= MIN_PRESENCE:
-            self._company.learn(colors_of(rgb, found.keypoints))
+        if found.keypoints.presence < MIN_PRESENCE:
+            return False
+        if distance_in_sides(person, found.square) <= OVERLAPPING:
+            return True
+        self._company.learn(colors_of(rgb, found.keypoints))
+        return False
 
     def _looks_right(self, colors: Float[np.ndarray, "numbers"]) -> bool:
         """Whether colors are rather the person's than those of another one."""

@@ -183,6 +183,15 @@ def test_a_person_who_walks_past_is_not_followed(striped, plain, is_in_front):
     assert len(found_frames) == 24 if not is_in_front else len(found_frames) > 10
 
 
+def test_a_small_person_is_not_another_one(striped):
+    """The detector's square lies beside so small a person."""
+    tracker, size = BlazePoseTracker(), (67, 120)
+    picture = np.full((480, 480, 3), 130, np.uint8)
+    picture[200:320, 200:267] = cv2.resize(scene((striped, 0)), size, interpolation=cv2.INTER_AREA)
+    found = [tracker(picture) for _ in range(12)]
+    assert not any(each is None or each.crowded for each in found)
+
+
 def test_a_person_who_leaves_and_returns_is_found_again(plain):
     tracker, finder, size_px = BlazePoseTracker(), ProblemFinder(), (400, 480)
     lefts = [65, 120, 180, 230, 270, 320, 400, 400, 320, 270, 230, 180]
