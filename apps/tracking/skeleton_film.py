@@ -1,5 +1,6 @@
 """A film of the tracked person for checking: the body's skeleton and outline over the frames."""
 
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from preprocess.observe import shrink_to_longer_side
 
 LONGER_SIDE_PX = 720
 """Longer side of the film, px."""
+SHORTER_SIDE_PX = 320
+"""Least shorter side of the film, px: smaller frames are enlarged, so that text can be read."""
+LETTER_PX, LINE_PX = 9, 16
+"""Width of a letter and height of a line of text, px."""
 SILHOUETTE_PX = 256
 """Longer side of the images in which the body's outline is found, px."""
 LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
@@ -61,19 +66,28 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
     for item in capture.observations():
         if not isinstance(item, Observation):
             continue
-        picture = item.frame.rgb.copy()
+        size_px = _film_size_px(item.frame.size_px)
+        picture = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
+        camera = item.camera.resize(size_px)
         small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
         drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
-        _draw_outline(picture, item.alpha > 0.5, MASK_COLOR)
-        _draw_outline(picture, cv2.resize(drawn, item.frame.size_px) > 0.5, BODY_COLOR)
-        joints = capture.shaped.with_pose(item.pose).joints()
-        pixels = item.camera.project(joints)
+        _draw_outline(picture, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
+        _draw_outline(picture, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)
+        pixels = camera.project(capture.shaped.with_pose(item.pose).joints())
         for joint, parent in enumerate(capture.shaped.body.parents):
             if parent >= 0:
                 _draw_bone(picture, pixels[parent], pixels[joint], _joint_color(joint))
         doubt = doubts.get(item.frame.index, "")
         _draw_text(picture, f"{item.frame.time_s:5.1f} s  {doubt}".rstrip(), bool(doubt))
         yield picture
+
+
+def _film_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Size of the film of frames of a size; even numbers, as encoders want."""
+    scale = max(1.0, SHORTER_SIDE_PX / min(size_px))
+    scale = min(scale, LONGER_SIDE_PX / max(size_px))
+    width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
+    return width, height
 
 
 def _joint_color(joint: int) -> tuple[int, int, int]:
@@ -96,7 +110,12 @@ def _draw_outline(picture: Rgb, inside: np.ndarray, color: tuple[int, int, int])
 
 
 def _draw_text(picture: Rgb, text: str, doubtful: bool) -> None:
-    for color, thick in (((20, 20, 20), 3), (DOUBT_COLOR if doubtful else MASK_COLOR, 1)):
-        cv2.putText(
-            picture, text, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, thick, cv2.LINE_AA
-        )
+    """Write lines at the top, on a dark ground, as many as the width asks for."""
+    letters = max(12, (picture.shape[1] - 12) // LETTER_PX)
+    lines = textwrap.wrap(text, letters)
+    ground = picture[: 6 + LINE_PX * len(lines)]
+    ground[:] = ground // 4
+    color = DOUBT_COLOR if doubtful else MASK_COLOR
+    for row, line in enumerate(lines):
+        at = (6, LINE_PX * (row + 1))
+        cv2.putText(picture, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)

@@ -37,6 +37,10 @@ BRIDGED_S = 0.35
 """Gap between two doubtful stretches with the same reason that are joined, seconds."""
 MIN_STRETCH_FRAMES = 3
 """Fewest frames of a doubtful stretch that is reported."""
+MIN_FRAMES = 4
+"""Fewest frames with the person of poses that are good enough for an avatar."""
+FEW_DIRECTIONS = 0.5
+"""Share of the directions below which the verdict says that the avatar will be one-sided."""
 DIRECTIONS = 12
 """Directions, 30 degrees each, from which the camera may see the person."""
 LIMBS = {
@@ -101,6 +105,9 @@ class TrackingGrade:
         found = []
         if self.found_share < MIN_FOUND_SHARE:
             found.append(f"the person was found in only {self.found_share:.0%} of the frames")
+        count = round(self.found_share * self.frames)
+        if count < MIN_FRAMES:
+            found.append(f"{count} frames with the person are too few (expected {MIN_FRAMES})")
         if self.iou_mean < MIN_IOU:
             found.append(
                 f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"
@@ -119,18 +126,24 @@ class TrackingGrade:
         return not self.objections
 
     def describe(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict, for people."""
+        jitter = (
+            ""
+            if np.isnan(self.jitter_mm)
+            else f"jitter {self.jitter_mm:.1f} mm per frame squared; "
+        )
         scores = (
             f"found in {self.found_share:.0%} of {self.frames} frames; IoU of body and masks "
-            f"{self.iou_mean:.2f} (worst frame {self.iou_worst:.2f}); jitter {self.jitter_mm:.1f} "
-            f"mm per frame squared; seen from {self.directions_seen:.0%} of the directions around"
+            f"{self.iou_mean:.2f} (worst frame {self.iou_worst:.2f}); {jitter}seen from "
+            f"{self.directions_seen:.0%} of the directions around"
         )
-        if self.is_good_enough:
-            return f"Good enough for an avatar: yes, because the person was {scores}."
-        return (
-            f"Good enough for an avatar: no, because {'; and '.join(self.objections)}. The person "
-            f"was {scores}."
-        )
+        if not self.is_good_enough:
+            why = "; and ".join(self.objections)
+            return f"Good enough for an avatar: no, because {why}. The person was {scores}."
+        told = f"Good enough for an avatar: yes, because the person was {scores}."
+        if self.directions_seen < FEW_DIRECTIONS:
+            told += " The sides that the camera never saw will be guesses: let the person turn."
+        return told
 
     def as_json(self) -> dict[str, Any]:
         """Figures for a report; NaN becomes null."""

@@ -11,6 +11,11 @@ BORDER_SAMPLES = 128
 """Places along each border of a frame at which the mask is read."""
 MIN_TOUCHING = 2
 """Places with the person in them that make a touch."""
+BODY_POINTS = (0, 7, 8, *range(11, 17), *range(23, 29))
+"""Key points of the body, without fingers, heels and toes."""
+CUT_MARGIN = 0.05
+"""Distance of a key point of the body from a border within which the person is cut there, person
+heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
 
@@ -61,8 +66,17 @@ class ProblemFinder:
 
 
 def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[TrackingProblem]:
-    """The borders of the frame that a person's mask touches."""
+    """The borders of the frame that cut a person: the mask touches them, key points are near."""
     width, height = size_px
+    body = found.image_px[list(BODY_POINTS)]
+    low_xy, high_xy = body.min(axis=0), body.max(axis=0)
+    margin = CUT_MARGIN * float(np.ptp(found.image_px, axis=0).max())
+    near = {
+        TrackingProblem.LEFT: low_xy[0] < margin,
+        TrackingProblem.RIGHT: high_xy[0] > width - margin,
+        TrackingProblem.TOP: low_xy[1] < margin,
+        TrackingProblem.BOTTOM: high_xy[1] > height - margin,
+    }
     crop_from_image = np.linalg.inv(np.vstack([found.mask.image_from_crop, [0, 0, 1]]))[:2]
     inset = np.hypot(*found.mask.image_from_crop[:, 0])  # one of the mask's own pixels
     along = (np.arange(BORDER_SAMPLES) + 0.5) / BORDER_SAMPLES
@@ -76,6 +90,8 @@ def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[Tra
     rows, columns = found.mask.values.shape
     touched = set()
     for problem, (x, y) in lines.items():
+        if not near[problem]:
+            continue
         column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:

@@ -82,6 +82,18 @@ def test_who_did_not_turn_was_seen_from_few_directions(shaped):
     assert grade(shaped, motion=a_motion(turns=0.0)).directions_seen == pytest.approx(1 / 12)
 
 
+def test_sides_that_were_never_seen_are_named(shaped):
+    assert "never saw" in grade(shaped, motion=a_motion(turns=0.0)).describe()
+    assert "never saw" not in grade(shaped).describe()
+
+
+def test_three_frames_are_too_few(shaped):
+    found = replace(grade(shaped), frames=3, jitter_mm=float("nan"))
+    assert not found.is_good_enough
+    assert "3 frames with the person are too few" in found.describe()
+    assert "nan" not in found.describe()
+
+
 def test_jitter_grows_with_noise(shaped):
     calm, noisy = grade(shaped), grade(shaped, motion=a_motion(noise_rad=0.05))
     assert calm.jitter_mm < 5.0

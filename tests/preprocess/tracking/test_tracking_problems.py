@@ -1,5 +1,7 @@
 """Frames at the picture's border, among others, or after a loss are found to be doubtful."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,8 @@ def person(x=100.0, *, radius=10.0, crowded=False):
     rows, columns = np.mgrid[:64, :64] + 0.5
     disc = np.hypot(rows - 32, columns - 32) < radius / 2
     return PersonKeypoints(
-        image_px=np.zeros((33, 2)),
+        image_px=np.array([x, 50.0])
+        + radius * np.resize([[-1, 0], [1, 0], [0, -1], [0, 1]], (33, 2)),
         world_m=np.zeros((33, 3)),
         visibility=np.ones(33),
         presence=1.0,
@@ -51,6 +54,13 @@ def test_a_mask_that_reaches_a_border_touches_it(x, problem):
 def test_a_mask_as_high_as_the_frame_touches_both_borders():
     both = {TrackingProblem.TOP, TrackingProblem.BOTTOM}
     assert touched_borders(person(radius=51.0), SIZE) == both
+
+
+def test_shoes_that_touch_the_border_cut_nothing_off():
+    standing = person(radius=51.0)
+    ankles = np.clip(standing.image_px, None, [np.inf, 85.0])  # 15 px above the lower border
+    touched = touched_borders(replace(standing, image_px=ankles), SIZE)
+    assert touched == {TrackingProblem.TOP}
 
 
 def test_a_person_found_far_from_the_last_place_may_be_another():
