@@ -19,7 +19,7 @@ LONGER_SIDE_PX = 720
 """Longer side of the film, px."""
 SHORTER_SIDE_PX = 320
 """Least shorter side of the film, px: smaller frames are enlarged, so that text can be read."""
-LETTER_PX, LINE_PX = 9, 16
+LETTER_PX, LINE_PX = 7, 16
 """Width of a letter and height of a line of text, px."""
 SILHOUETTE_PX = 256
 """Longer side of the images in which the body's outline is found, px."""

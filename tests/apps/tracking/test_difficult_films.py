@@ -102,7 +102,7 @@ def test_a_person_who_leaves_and_returns_is_lost_meanwhile(track_film):
     assert code == 0
     lost = [each for each in grade["doubtful"] if each["reason"] == "the person was not found"]
     assert len(lost) == 1
-    # frames 17 to 26 show nobody but the plant
+    # frames 17 to 26 show the plant alone
     assert lost[0]["start_s"] <= 18 / FPS
     assert lost[0]["end_s"] >= 25 / FPS
 
