@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 from apps.checks.preflight_check import correction_hint, preflight_check
@@ -45,6 +46,8 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
         CommandExit: If there is no usable avatar.
     """
     started_at = time.perf_counter()
+    if find_spec("torch") is None:  # said before minutes of tracking
+        raise ModuleNotFoundError(name="torch")
     arguments.validate()
     run, inputs = arguments.run_folder(), arguments.capture_inputs().input_paths()
     run.check_usable(inputs, resume=arguments.resume, overwrite=arguments.overwrite)

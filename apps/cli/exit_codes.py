@@ -22,8 +22,9 @@ def install_advice(error: ModuleNotFoundError) -> str | None:
     package = (error.name or "").split(".")[0]
     if package in LEARN_PACKAGES:
         return (
-            f"{package} is not installed: this installation plays avatars, checks captures and "
-            f"exports meshes, but cannot train. To train: pip install '{DISTRIBUTION}[learn]'"
+            f"{package} is not installed: this installation plays avatars, tracks people, checks "
+            "captures and exports meshes, but cannot train. To train: pip install "
+            f"'{DISTRIBUTION}[learn]'"
         )
     if package in SMALL_PACKAGES:
         return f"{package} is not installed. Install it: pip install {package}"
