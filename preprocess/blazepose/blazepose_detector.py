@@ -82,11 +82,19 @@ class BlazePoseDetector:
                 found.append(detection)
         return found
 
-    def find_all(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
-        """Find the persons in a frame, small ones as well."""
+    def find_all(
+        self, rgb: UInt8[np.ndarray, "height width 3"], *, in_parts: bool = False
+    ) -> list[PersonDetection]:
+        """Find the persons in a frame, small ones as well.
+
+        Args:
+            rgb: The frame.
+            in_parts: Whether to look into each part of the frame even if a person was found: of
+                two the network often sees only one.
+        """
         whole = PersonSquare.of_frame(rgb)
         found = self(rgb, whole)
-        if not found:
+        if in_parts or not found:
             whole = replace(whole, side=float(min(rgb.shape[:2])))
             for part in parts_of_frame(rgb):
                 for detection in self(rgb, part):

@@ -145,7 +145,7 @@ class BlazePoseTracker:
         """Detections that may be the person, the most likely one first."""
         last = self._last
         if last is None:
-            return self._choose(self._detect.find_all(rgb))
+            return self._choose(rgb)
         around = replace(last.square, side=SEARCH_SIDE * last.square.side, angle=0.0)
         for area in (None, around):
             detections = self._detect(rgb, area)
@@ -155,11 +155,18 @@ class BlazePoseTracker:
                 return sorted(likely, key=lambda each: last.strangeness(each.square))
         return []
 
-    def _choose(self, detections: list[PersonDetection]) -> list[PersonDetection]:
-        """The person to follow, of those in a frame; none if it is not there yet."""
+    def _choose(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
+        """The person to follow, of those in the first frame; none if it is not there yet."""
         if self._person is None:
-            return sorted(detections, key=lambda each: -each.square.side)
-        from_left = sorted(detections, key=lambda each: each.square.x)
+            return sorted(self._detect.find_all(rgb), key=lambda each: -each.square.side)
+        persons: list[PersonDetection] = []
+        for each in self._detect.find_all(rgb, in_parts=True):
+            found = self._find_landmarks(rgb, each.square)
+            if found.keypoints.presence >= MIN_PRESENCE and not any(
+                distance_in_sides(other.square, found.square) < OVERLAPPING for other in persons
+            ):
+                persons.append(replace(each, square=found.square))
+        from_left = sorted(persons, key=lambda each: each.square.x)
         return from_left[self._person - 1 : self._person]
 
     def _watch(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> None:

@@ -107,7 +107,7 @@ class TrackingGrade:
             found.append(f"the person was found in only {self.found_share:.0%} of the frames")
         count = round(self.found_share * self.frames)
         if count < MIN_FRAMES:
-            found.append(f"{count} frames with the person are too few (expected {MIN_FRAMES})")
+            found.append(f"too few frames show the person: {count} (expected {MIN_FRAMES})")
         if self.iou_mean < MIN_IOU:
             found.append(
                 f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"

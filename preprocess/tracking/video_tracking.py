@@ -165,5 +165,6 @@ def _too_few_message(source: FrameSource, found: int, total: int) -> str:
         f"A person was found in {where} of {total} frames of {source.path}. Tracking needs one "
         "person, from head to feet in the picture, upright, in good light, at least a quarter of "
         "its height. Is the video rotated, or does it start before the person comes in "
-        "(--frames)? Poses of another tracker can be given with --poses."
+        "(--frames), or is --person more than there are? Poses of another tracker can be given "
+        "with --poses."
     )

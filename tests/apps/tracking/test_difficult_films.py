@@ -87,7 +87,7 @@ def test_a_picture_that_stands_still_shows_one_side_only(track_film, frames):
 def test_three_frames_are_too_few(track_film, frames):
     code, _, told = track_film(frames[:3])
     assert code == 1
-    assert "3 frames with the person are too few" in told
+    assert "too few frames show the person: 3" in told
     assert "nan" not in told
 
 

@@ -1,6 +1,6 @@
 """Tests of `preprocess/blazepose/*.py`: the real networks on the studio's actors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from preprocess.blazepose.person_square import PersonSquare
 from preprocess.tracking.tracking_problems import ProblemFinder, TrackingProblem
 from studio import actor_motions
 from studio.actor import Actor
+from studio.room import painted_backdrop
 from studio.studio_cameras import portrait_camera
 
 SIZE = (270, 480)
@@ -190,6 +191,19 @@ def test_a_small_person_is_not_another_one(striped):
     picture[200:320, 200:267] = cv2.resize(scene((striped, 0)), size, interpolation=cv2.INTER_AREA)
     found = [tracker(picture) for _ in range(12)]
     assert not any(each is None or each.crowded for each in found)
+
+
+@pytest.mark.parametrize("person", [1, 2])
+def test_each_of_two_persons_in_a_wide_picture_can_be_followed(striped, plain, person):
+    """In this room the detector sees only the one on the right, of the whole picture."""
+    camera = portrait_camera(Actor.of(1), SIZE[0])
+    camera = replace(camera, size_px=(700, 480), center_px=(350.0, camera.center_px[1]))
+    picture = painted_backdrop.paint_backdrop("clutter", camera, np.random.default_rng([0, 4]))
+    striped.paste(picture, 0)
+    plain.paste(picture, 430)
+    found = BlazePoseTracker(person=person)(picture)
+    assert found is not None
+    assert abs(hips(found) - middle(430 * (person - 1))) < 30
 
 
 def test_a_person_who_leaves_and_returns_is_found_again(plain):

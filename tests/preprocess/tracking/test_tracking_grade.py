@@ -90,7 +90,7 @@ def test_sides_that_were_never_seen_are_named(shaped):
 def test_three_frames_are_too_few(shaped):
     found = replace(grade(shaped), frames=3, jitter_mm=float("nan"))
     assert not found.is_good_enough
-    assert "3 frames with the person are too few" in found.describe()
+    assert "too few frames show the person: 3" in found.describe()
     assert "nan" not in found.describe()
 
 
