@@ -47,6 +47,7 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_given_poses_replace_tracked_ones(ingest_video, filmed):
     done, out = ingest_video("--frames", ":10")
