@@ -132,6 +132,9 @@ def track_person(
     own_masks = not source.has_alpha and _given_masks(inputs) is None
     with atomic_folder(folder) if own_masks else nullcontext() as part:
         tracked = _run_networks(source, inputs, part, console, stop)
+        if tracked.interrupted:  # the frames after it have no masks
+            inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
+            source = open_source(inputs.video, frames=inputs.frames)
         with console.status("fitting body and poses to key points and masks"):
             capture = fit_tracked_video(source, tracked, inputs, part)
             grade = _grade(capture, tracked.frame_times_s)
@@ -145,6 +148,11 @@ def track_person(
     return PersonTracking(
         capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
     )
+
+
+def _frames_up_to(source: FrameSource, last: int) -> slice:
+    """The wanted frames up to one of them."""
+    return slice(source.selection.start, last + 1, source.selection.step)
 
 
 def _given_masks(inputs: CaptureInputs) -> Path | None:

@@ -57,12 +57,6 @@ class TrackedVideo:
     frame_times_s: dict[int, float]
     interrupted: bool
 
-    @property
-    def lost_frames(self) -> list[int]:
-        """Frames in which the person was not found."""
-        found = set(self.keypoints.frames.tolist())
-        return [number for number in self.frame_times_s if number not in found]
-
 
 def track_video(
     source: FrameSource,

@@ -1,14 +1,17 @@
 """ia-track: from a video to poses, masks, a film and grades."""
 
 import json
+import threading
 
 import cv2
 import numpy as np
 import pytest
 
 from apps import check, track
+from apps.cli.console import Console
 from apps.tracking import person_tracking
 from capture.source_opening import open_source
+from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.body.body_file import load_body_model
 from preprocess.body.motion_shape import shape_for_motion
 from preprocess.capture_session import CaptureInputs
@@ -121,3 +124,29 @@ def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch):
     assert limited.frames == slice(None, None, 3)
     chosen = CaptureInputs(video=video, frames=slice(0, 15, 1))
     assert person_tracking.limit_frames(chosen, open_source(video)) == chosen
+
+
+def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
+    stop = threading.Event()
+
+    class StoppingTracker(BlazePoseTracker):
+        """Is stopped in the ninth of twenty frames."""
+
+        calls = 0
+
+        def __call__(self, rgb):
+            self.calls += 1
+            if self.calls == 9:
+                stop.set()
+            return super().__call__(rgb)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(person_tracking, "make_tracker", lambda name, person: StoppingTracker())
+        found = person_tracking.track_person(
+            CaptureInputs(video=video), tmp_path / "out" / "poses.npz", Console(), stop=stop
+        )
+    assert found.interrupted
+    assert found.grade.frames == 9
+    assert len(read_motion(tmp_path / "out" / "poses.npz")) == 9
+    assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
+    assert open_capture(found.inputs).source.frame_count == 9

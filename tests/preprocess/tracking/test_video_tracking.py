@@ -54,7 +54,7 @@ def test_each_frame_has_a_mask_and_found_ones_have_key_points(pictures, tmp_path
     masks.mkdir()
     found = track_video(pictures, FakeTracker(darkest=25), plain, masks)
     assert found.keypoints.frames.tolist() == list(range(3, COUNT))
-    assert found.lost_frames == [0, 1, 2]
+    assert list(found.frame_times_s) == list(range(COUNT))
     assert found.keypoints.image_px[0, 0, 0] == 30.0
     files = sorted(masks.iterdir())
     assert [file.stem for file in files] == [f"{number:06d}" for number in range(COUNT)]
