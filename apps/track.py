@@ -9,7 +9,7 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.capture_options import mask_inversion, parse_frame_range
+from apps.cli.capture_options import parse_frame_range
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
@@ -104,7 +104,6 @@ class TrackArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parse_frame_range(self.frames),
-            invert_masks=mask_inversion(person_dark=False, person_bright=False),
             person=None if self.person is None else str(self.person),
             tracker=self.tracker,
         )

@@ -212,7 +212,7 @@ class LiveTracking:
         segment: Segmenter | None = None,
         fit: LiveAlignment | None = None,
     ) -> Callable[[Frame], Observation | DroppedFrame]:
-        """What makes an observation of a frame: tracks it, unless it is one of the first.
+        """What makes an observation of a frame, which was tracked when it was taken.
 
         Args:
             source: The frames.
