@@ -1,6 +1,5 @@
 """Corrected copy of a capture."""
 
-import os
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -49,8 +48,9 @@ def check_new_or_empty(out: Path) -> None:
 def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     """Write a native capture folder with all corrections applied.
 
-    Unchanged files become hard links where possible. Images that must be rotated or mirrored are
-    written as images; for a crop or an offset, masks, poses and cameras are changed instead.
+    Unchanged files are copied: who edits the copy does not change the original. Images that must be
+    rotated or mirrored are written as images; for a crop or an offset, masks, poses and cameras are
+    changed instead.
 
     Raises:
         InputError: If no correctable mistake was found.
@@ -78,9 +78,9 @@ def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[
     """Write the video, reoriented if necessary; return the frames without an image."""
     if not film.reorients:
         if source.path.is_dir():
-            _link_all(list_images(source.path), folder / "images")
+            _copy_all(list_images(source.path), folder / "images")
         else:
-            _link(source.path, folder / f"video{source.path.suffix}")
+            shutil.copyfile(source.path, folder / f"video{source.path.suffix}")
         return set()
     png = source.path.is_dir() and list_images(source.path)[0].suffix.lower() == ".png"
     (folder / "images").mkdir()
@@ -191,11 +191,11 @@ def _write_masks(check: CaptureValidation, corrected: CaptureGeometry, folder: P
         return
     stored = not masks.inverted and not corrected.masks_inverted
     if stored and masks.path.is_dir():
-        _link_all(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
+        _copy_all(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
         return
     suffix = masks.path.suffix.lower()
     if stored and suffix in (".npz", ".npy"):
-        _link(masks.path, folder / f"masks{suffix}")
+        shutil.copyfile(masks.path, folder / f"masks{suffix}")
         return
     _write_mask_images(_stored_masks(masks, corrected), folder / "masks")
 
@@ -259,15 +259,7 @@ def _write_cameras(hypothesis: CaptureGeometry, path: Path) -> None:
     )
 
 
-def _link_all(files: Iterable[Path], folder: Path) -> None:
+def _copy_all(files: Iterable[Path], folder: Path) -> None:
     folder.mkdir()
     for file in files:
-        _link(file, folder / file.name)
-
-
-def _link(file: Path, target: Path) -> None:
-    """Create a hard link where the file system supports them, else a copy."""
-    try:
-        os.link(file.resolve(), target)
-    except OSError:
-        shutil.copyfile(file, target)
+        shutil.copyfile(file, folder / file.name)

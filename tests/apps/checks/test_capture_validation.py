@@ -104,6 +104,8 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
     assert found["tried"][0]["cause"] == cause
     assert code == 0
     assert passes_quick_check(open_capture(CaptureInputs(video=out)))
+    copied = [path for path in out.rglob("*") if path.is_file()]
+    assert all(path.stat().st_nlink == 1 for path in copied)  # no second name of the user's file
     if cause in ("frame_offset", "frame_rate"):
         mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
         assert mended.frames is not None
