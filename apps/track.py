@@ -1,25 +1,32 @@
 """ia-track: find poses, masks and camera of the person in a video."""
 
 import json
+import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.capture_options import parse_frame_range
+from apps.cli.capture_options import format_frame_range, parse_frame_range
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
 from apps.cli.interrupt import stop_on_interrupt
-from apps.cli.output_paths import check_output_file, check_output_folder
-from apps.tracking.person_tracking import print_grade, track_person
+from apps.cli.output_paths import check_output_file, check_output_folder, unused_path
+from apps.run.run_folder import RunFolder
+from apps.run.run_lock import claim_folder
+from apps.tracking.person_tracking import masks_to_use, print_grade, track_person
 from apps.tracking.skeleton_film import write_skeleton_film
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
+from capture.output_file_list import OutputFileList
 from preprocess.capture_session import CaptureInputs
 
 PROGRAM = "ia-track"
@@ -75,7 +82,7 @@ class TrackArguments:
     film: Annotated[bool, arg(help_behavior_hint="")] = True
     """Draw skeleton.webm."""
     overwrite: Flag = False
-    """Replace files that exist."""
+    """Replace what ia-track wrote there before. Files that it did not write are kept."""
 
     def poses_path(self) -> Path:
         """Return the path of the poses."""
@@ -114,13 +121,33 @@ class TrackArguments:
         Raises:
             InputError: If one cannot.
         """
-        poses, inputs = self.poses_path(), self.capture_inputs().input_paths()
+        poses, inputs = self.poses_path(), self.capture_inputs()
+        folder, masks = poses.parent, poses.parent / "masks"
         if poses.suffix.lower() != ".npz":
             raise InputError(f"--out is {poses}, but must end in .npz.")
-        for path in (poses, self.grade_path(), self.film_path()):
-            check_output_file(path, "--out", inputs, overwrite=self.overwrite)
-        if self.masks is None:
-            check_output_folder(poses.parent / "masks", "--out")
+        free = unused_path(Path(os.path.abspath(folder)).with_name("tracked")) / "poses.npz"
+        free = free if folder.is_absolute() else Path(os.path.relpath(free))
+        advice = f"choose another folder: --out {shlex.quote(str(free))}"
+        if RunFolder(path=folder).has_checkpoint():
+            raise InputError(f"{folder} holds a run of ia-ingest; {advice}")
+        written = [poses, self.grade_path(), *([self.film_path()] if self.film else [])]
+        for path in filter(os.path.lexists, written):
+            if path.is_file() and not _is_written_by_track(path):
+                raise InputError(
+                    f"{path} was not written by ia-track and would be replaced. Move it, or "
+                    f"{advice}"
+                )
+            if not self.overwrite:
+                raise InputError(
+                    f"{path} already exists. Pass --overwrite to replace what ia-track wrote "
+                    f"there, or {advice}"
+                )
+        own = {os.path.realpath(each) for each in (*written, masks)}
+        read = [each for each in inputs.input_paths() if os.path.realpath(each) not in own]
+        for path in written:
+            check_output_file(path, "--out", read, overwrite=True, below=False)
+        if masks_to_use(inputs, masks) is None:
+            check_output_folder(masks, "--out")
 
     def grade_path(self) -> Path:
         """Return the path of the grades."""
@@ -137,6 +164,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(PROGRAM, lambda: track(given, Console()))
 
 
+def _is_written_by_track(path: Path) -> bool:
+    """Whether a file is ia-track's own; other commands write poses, too, but no key points."""
+    if not OutputFileList(path.parent).owns(path.name):
+        return False
+    return path.suffix.lower() != ".npz" or "keypoint_frames" in np.load(path).files
+
+
+def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
+    """Return the command that trains on what was tracked in some frames."""
+    named = {"--masks": arguments.masks, "--cameras": arguments.cameras, "--body": arguments.body}
+    words = ["ia-ingest", str(arguments.video), "--poses", str(arguments.poses_path())]
+    words += [str(each) for pair in named.items() if pair[1] is not None for each in pair]
+    return words if frames is None else [*words, "--frames", format_frame_range(frames)]
+
+
+@contextmanager
+def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
+    """Make and lock a folder during a block, in which the files of ia-track are listed.
+
+    Raises:
+        CommandExit: If another command is writing here.
+    """
+    with claim_folder(folder, console):
+        listing = OutputFileList(folder)
+        listing.create()
+        listing.remove_temporaries()
+        try:
+            yield
+        finally:
+            listing.remove_if_empty()
+
+
 def track(arguments: TrackArguments, console: Console) -> int:
     """Track the person, and write poses, masks, film and grades.
 
@@ -146,21 +205,20 @@ def track(arguments: TrackArguments, console: Console) -> int:
     """
     inputs, poses = arguments.capture_inputs(), arguments.poses_path()
     arguments.check_outputs()
-    with stop_on_interrupt(console, "writing what was found so far") as stop:
-        tracking = track_person(inputs, poses, console, stop=stop, may_replace=arguments.overwrite)
+    saving = "writing what was found so far"
+    with claim_outputs(poses.parent, console), stop_on_interrupt(console, saving) as stop:
+        tracking = track_person(inputs, poses, console, stop=stop)
         text = json.dumps(tracking.grade.as_json(), indent=1) + "\n"
-        write_text_atomically(arguments.grade_path(), text, replace=arguments.overwrite)
+        write_text_atomically(arguments.grade_path(), text)
         console.print_artifact("poses", poses)
         if arguments.film and not stop.is_set():
             with console.status("drawing the film"):
-                write_skeleton_film(
-                    arguments.film_path(),
-                    tracking.capture,
-                    tracking.grade.doubts,
-                    replace=arguments.overwrite,
-                )
+                write_skeleton_film(arguments.film_path(), tracking.capture, tracking.grade.doubts)
             console.print_artifact("look at it", arguments.film_path())
     print_grade(tracking.grade, console)
+    if tracking.grade.is_good_enough:
+        console.info("Next:")
+        console.info(f"  {shlex.join(next_command(arguments, tracking.inputs.frames))}")
     if tracking.interrupted:
         return INTERRUPTED
     return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH

@@ -143,6 +143,8 @@ def atomic_folder(path: Path, *, listed: bool = True) -> Iterator[Path]:
     real.parent.mkdir(parents=True, exist_ok=True)
     part = real.with_name(_temporary_name(real.name, "part"))
     old = real.with_name(_temporary_name(real.name, "old"))
+    if OutputFileList(real.parent).exists():
+        OutputFileList(real.parent).add_temporary(part.name)
     part.mkdir()
     try:
         yield part

@@ -8,6 +8,7 @@ import functools
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -83,7 +84,7 @@ class OutputFileList:
         self._append([{"name": name, "sha256": file_sha256(file)} for name, file in files.items()])
 
     def add_temporary(self, name: str) -> None:
-        """Lists the random name of a file that is still being written, by this process."""
+        """Lists the random name of a file or folder that this process is still writing."""
         self._append([{"unfinished": name, "pid": os.getpid()}])
 
     def owns(self, name: str) -> bool:
@@ -140,7 +141,12 @@ class OutputFileList:
         for record in self._records():
             name, pid = record.get("unfinished"), record.get("pid")
             if isinstance(name, str) and isinstance(pid, int) and not _process_exists(pid):
-                (self.folder / Path(name).name).unlink(missing_ok=True)
+                unfinished = self.folder / Path(name).name
+                if unfinished.is_dir() and not unfinished.is_symlink():
+                    if unfinished.suffix == ".part":  # never a user's, whatever a list says
+                        shutil.rmtree(unfinished, ignore_errors=True)
+                else:
+                    unfinished.unlink(missing_ok=True)
 
     def _beginning(self) -> bytes | None:
         """As many bytes as the header has; None if there is no file to be read."""

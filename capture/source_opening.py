@@ -16,7 +16,7 @@ HEIC_SUFFIXES = frozenset({".heic", ".heif"})
 NON_VIDEO_SUFFIXES = HEIC_SUFFIXES | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
 """Endings of files that are named as a video by mistake."""
 
-SIDE_VIDEO_PREFIXES = ("mask", "preview")
+SIDE_VIDEO_PREFIXES = ("mask", "preview", "skeleton")
 """Starts of the names of videos that lie beside the one that is meant."""
 
 
@@ -51,7 +51,7 @@ def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
 
 
 def _list_videos(folder: Path) -> list[Path]:
-    """List the videos in a folder; masks and a preview do not count where there is another."""
+    """List the videos in a folder; masks and previews do not count where there is another."""
     files = (file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
     seen = sorted(file for file in files if not file.name.startswith("."))
     return [file for file in seen if not file.stem.lower().startswith(SIDE_VIDEO_PREFIXES)] or seen

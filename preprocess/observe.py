@@ -11,6 +11,7 @@ from capture.camera import Camera, same_aspect_ratio
 from capture.frame import Frame
 from capture.image_folder import has_cutout_alpha
 from capture.input_error import InputError
+from capture.output_file_list import OutputFileList
 from capture.source import FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
@@ -188,6 +189,10 @@ def associate_masks(masks: Masks | None, source: FrameSource) -> Callable[[int],
             f"{source.size_px[0]}x{source.size_px[1]}; expected the same shape. Was the video "
             "cropped or rotated?"
         )
+    if masks.names is not None and OutputFileList(masks.path).exists():  # ia-track's own
+        rows = {int(name): row for row, name in enumerate(masks.names) if name.isdecimal()}
+        if len(rows) == masks.count and max(rows) < source.frames_in_file:
+            return _row_by_name(rows, masks)
     if masks.names is not None and masks.count not in (source.frames_in_file, source.frame_count):
         named = associate_by_name(masks.names, source)
         if named is not None:

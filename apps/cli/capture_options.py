@@ -20,6 +20,12 @@ def parse_frame_range(text: str) -> slice | None:
     return None if not any(part is not None for part in parts) else slice(*parts)
 
 
+def format_frame_range(frames: slice | None) -> str:
+    """Return the text that `parse_frame_range` parses."""
+    parts = (None, None) if frames is None else (frames.start, frames.stop, frames.step)
+    return ":".join("" if part is None else str(part) for part in parts)
+
+
 def mask_inversion(*, person_dark: bool, person_bright: bool) -> bool | None:
     """Return whether to invert masks; None to detect it.
 

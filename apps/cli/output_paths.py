@@ -37,7 +37,12 @@ def check_writable(path: Path, flag: str) -> None:
 
 
 def check_output_file(
-    path: Path, flag: str, inputs: Iterable[Path] = (), *, overwrite: bool | None = None
+    path: Path,
+    flag: str,
+    inputs: Iterable[Path] = (),
+    *,
+    overwrite: bool | None = None,
+    below: bool = True,
 ) -> None:
     """Check that an output file may be written.
 
@@ -47,6 +52,7 @@ def check_output_file(
         inputs: Files and folders that the command reads; an output may not lie in one of them.
         overwrite: Whether an existing file may be replaced; None: unless the folder's list of
             written files forbids it.
+        below: Whether the file may lie in a folder within an input.
 
     Raises:
         InputError: If the file may not be written.
@@ -61,7 +67,8 @@ def check_output_file(
                 f"{flag} is {path}, which is an input of this command ({given}); inputs are never "
                 f"written to. Choose another file: {flag} {shlex.quote(str(unused_path(path)))}"
             )
-        if _is_same_file(path.parent, given):
+        lies_in = not below and _describe_overlap(path, given) == "lies in"
+        if lies_in or _is_same_file(path.parent, given):
             other = (
                 Path(os.path.relpath(given.resolve().parent))
                 / f"{_resolved_name(given)}-{path.name}"

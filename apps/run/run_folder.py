@@ -12,7 +12,7 @@ from pathlib import Path
 from apps.cli.console import Console
 from apps.cli.output_paths import check_disjoint_from_inputs, check_writable, unused_path
 from apps.run.run_lock import LOCK_FILE_NAME as LOCK
-from apps.run.run_lock import lock_folder
+from apps.run.run_lock import claim_folder
 from capture.input_error import InputError
 from capture.output_file_list import OutputFileList
 
@@ -120,6 +120,11 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
         check_disjoint_from_inputs(self.path, "--out", inputs)
+        if OutputFileList(self.path).owns("grade.json"):
+            free = shlex.quote(str(unused_path(self.path)))
+            raise InputError(
+                f"{self.path} holds poses that ia-track wrote. Choose another folder: --out {free}"
+            )
         foreign = self._foreign_file()
         if foreign is not None:
             free = shlex.quote(str(unused_path(self.path)))
@@ -144,23 +149,16 @@ class RunFolder:
             InputError: If a run exists and neither flag is given.
             CommandExit: If another run is writing here.
         """
-        made = [p for p in (self.path, *self.path.parents) if not p.exists()]
-        self.path.mkdir(parents=True, exist_ok=True)
-        try:
-            with lock_folder(self.path, console):
-                if self.has_run() and not (resume or overwrite):
-                    raise InputError(
-                        f"{self.path} already holds a run. Continue it (--resume), replace it "
-                        "(--overwrite), or choose another folder (--out)."
-                    )
-                try:
-                    yield
-                finally:
-                    self.remove_empty_folders()
-        finally:
-            for folder in made:
-                with suppress(OSError):  # not empty
-                    folder.rmdir()
+        with claim_folder(self.path, console):
+            if self.has_run() and not (resume or overwrite):
+                raise InputError(
+                    f"{self.path} already holds a run. Continue it (--resume), replace it "
+                    "(--overwrite), or choose another folder (--out)."
+                )
+            try:
+                yield
+            finally:
+                self.remove_empty_folders()
 
     def start_run(self, *, resume: bool) -> None:
         """Start the lists of written files; remove an older run unless it is resumed.
@@ -219,7 +217,7 @@ class RunFolder:
 
     def _foreign_file(self) -> Path | None:
         """Return a foreign file where a run would write; None if there is none."""
-        for path in self.files:
+        for path in (*self.files, self.tracked_poses, self.tracking_grade):
             if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
         for folder in (self.checkpoint, self.path / "cameras", self.tracking):

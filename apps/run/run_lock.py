@@ -1,4 +1,4 @@
-"""Lock of a run's folder, which the kernel releases however the process ends."""
+"""Lock of an output folder, which the kernel releases however the process ends."""
 
 import errno
 import os
@@ -19,11 +19,29 @@ except ImportError:  # Windows
     fcntl = None
 
 LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
-"""Name of the locked file in a run's folder."""
+"""Name of the locked file in the folder."""
 LOCK_LABEL_PATTERN = re.compile(r"instant-avatar-stream run, process (\d+), since (.+)\n?")
 """Content of a lock file: process and time."""
 LOCKED_ERRNOS = frozenset({errno.EWOULDBLOCK, errno.EACCES})
 """Errors of `flock` where another process holds the lock."""
+
+
+@contextmanager
+def claim_folder(folder: Path, console: Console) -> Iterator[None]:
+    """Create and lock a folder during a block; remove the folders it made if they stayed empty.
+
+    Raises:
+        CommandExit, InputError: As `lock_folder`.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with lock_folder(folder, console):
+            yield
+    finally:
+        for each in made:
+            with suppress(OSError):  # not empty
+                each.rmdir()
 
 
 @contextmanager
@@ -58,7 +76,8 @@ def _acquire(path: Path, console: Console) -> int | None:
             label = os.read(descriptor, 1000).decode(errors="replace")
             if label and LOCK_LABEL_PATTERN.fullmatch(label) is None:
                 raise InputError(
-                    f"{path} is not a lock of ia-ingest. Move it, or choose another folder (--out)."
+                    f"{path} is not a lock of this program. Move it, or choose another folder "
+                    "(--out)."
                 )
             if not _try_lock(descriptor, path.parent, label, console):
                 path.unlink(missing_ok=True)
@@ -90,7 +109,7 @@ def _try_lock(descriptor: int, folder: Path, label: str, console: Console) -> bo
             raise CommandExit(_busy_message(folder, label), RESOURCE_UNAVAILABLE) from None
         console.warning(
             f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "
-            "ia-ingest writes into this folder at the same time."
+            "command writes into this folder at the same time."
         )
         return False
 
@@ -99,6 +118,6 @@ def _busy_message(folder: Path, label: str) -> str:
     found = LOCK_LABEL_PATTERN.fullmatch(label)
     who = f" (process {found[1]}, since {found[2]})" if found else ""
     return (
-        f"Another ia-ingest is writing into {folder}{who}. Wait until it ends, or choose another "
+        f"Another command is writing into {folder}{who}. Wait until it ends, or choose another "
         "folder (--out)."
     )

@@ -1,5 +1,6 @@
 """Tracks the person of a recording, fits poses, body and camera, and writes them as files."""
 
+import os
 import threading
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -11,6 +12,7 @@ from apps.cli.console import Console
 from capture.atomic_files import atomic_file, atomic_folder
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
+from capture.output_file_list import OutputFileList
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
@@ -108,19 +110,17 @@ def track_person(
     console: Console,
     *,
     stop: threading.Event | None = None,
-    may_replace: bool | None = None,
 ) -> PersonTracking:
     """Track the person, and write poses and masks.
 
-    Masks that were given, or lie beside the video, are used instead of tracked ones; so are
-    cameras.
+    Masks that were given, or lie beside the video, are used instead of tracked ones (see
+    `masks_to_use`); so are cameras.
 
     Args:
         inputs: A recording without poses.
         poses: File to write; masks are written to the folder masks/ beside it.
         console: Shows progress.
         stop: Ends tracking early once it is set; what was found until then is written.
-        may_replace: Whether an existing file of poses may be replaced, as in `atomic_file`.
 
     Raises:
         InputError: If the recording cannot be read, or no person is found in it.
@@ -129,7 +129,10 @@ def track_person(
     inputs = limit_frames(inputs, open_source(inputs.video, frames=inputs.frames))
     source = open_source(inputs.video, frames=inputs.frames)
     folder = poses.parent / "masks"
-    own_masks = not source.has_alpha and _given_masks(inputs) is None
+    given = masks_to_use(inputs, folder)
+    own_masks = not source.has_alpha and given is None
+    if given is not None and inputs.masks is None:
+        console.info(f"Using the masks in {given}, which lie beside the video.")
     with atomic_folder(folder) if own_masks else nullcontext() as part:
         tracked = _run_networks(source, inputs, part, console, stop)
         if tracked.interrupted:  # the frames after it have no masks
@@ -138,7 +141,7 @@ def track_person(
         with console.status("fitting body and poses to key points and masks"):
             capture = fit_tracked_video(source, tracked, inputs, part)
             grade = _grade(capture, tracked.frame_times_s)
-        with atomic_file(poses, replace=may_replace) as unfinished:
+        with atomic_file(poses) as unfinished:
             write_motion(unfinished, capture.motion)
     inputs = replace(inputs, poses=poses, person=None)
     if own_masks:
@@ -155,11 +158,20 @@ def _frames_up_to(source: FrameSource, last: int) -> slice:
     return slice(source.selection.start, last + 1, source.selection.step)
 
 
-def _given_masks(inputs: CaptureInputs) -> Path | None:
-    """Masks that the user named, or that lie beside the video."""
+def masks_to_use(inputs: CaptureInputs, written: Path) -> Path | None:
+    """Masks that the user named, or that lie beside the video; None if they are to be tracked.
+
+    Args:
+        inputs: A recording without poses.
+        written: Folder of tracked masks; older ones in it are replaced, not used.
+    """
     if segmenter_name(inputs.masks) is not None:
         return None
-    return inputs.masks or find_own_masks(inputs.video)
+    found = inputs.masks or find_own_masks(inputs.video)
+    if inputs.masks is not None or found is None:
+        return found
+    is_own = next(OutputFileList(found).foreign_files(), None) is None
+    return None if is_own and os.path.realpath(found) == os.path.realpath(written) else found
 
 
 def _run_networks(

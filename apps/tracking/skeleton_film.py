@@ -35,16 +35,13 @@ RIGHT_JOINTS = frozenset({2, 5, 8, 11, 14, 17, 19, 21, 23})
 Rgb = UInt8[np.ndarray, "height width 3"]
 
 
-def write_skeleton_film(
-    path: Path, capture: Capture, doubts: Mapping[int, str], *, replace: bool | None = None
-) -> int:
+def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
     """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
 
     Args:
         path: Video to write, .webm or .mp4.
         capture: The video with its tracked poses and masks.
         doubts: Why frames are doubtful, by their numbers.
-        replace: Whether an existing file may be replaced, as in `atomic_file`.
 
     Returns:
         Number of frames drawn.
@@ -56,7 +53,7 @@ def write_skeleton_film(
     source = capture.source
     count, duration = source.frame_count or 1, source.duration_s
     fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
-    with atomic_file(path, replace=replace) as part:
+    with atomic_file(path) as part:
         encoder = video_encoder(path.suffix, transparent=False)
         return encoder.write(part, _draw_frames(capture, doubts), fps)
 

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
+from apps.cli.capture_options import format_frame_range
 from apps.cli.console import Console
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
@@ -71,7 +72,7 @@ def _with_stored(
 ) -> IngestArguments:
     frames, text = stored["frames"], arguments.frames
     if frames is not None:
-        text = ":".join("" if each is None else str(each) for each in frames)
+        text = format_frame_range(slice(*frames))
     masks = run.tracking / "masks" if stored["masks"] else arguments.masks
     return replace(arguments, poses=run.tracked_poses, masks=masks, frames=text, person=None)
 
@@ -92,6 +93,7 @@ def _track(inputs: CaptureInputs, run: RunFolder, console: Console) -> PersonTra
     """Track the person into the run's folder; leave no empty folder if that fails."""
     run.tracking.mkdir(parents=True, exist_ok=True)
     OutputFileList(run.tracking).create()
+    OutputFileList(run.tracking).remove_temporaries()
     try:
         return track_person(inputs, run.tracked_poses, console)
     finally:

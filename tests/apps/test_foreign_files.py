@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from apps import check, evaluate, export, ingest, play, sample
+from apps import check, evaluate, export, ingest, play, sample, track
 
 COMMANDS = {
     "ia-check": check.main, "ia-evaluate": evaluate.main, "ia-export": export.main,
     "ia-ingest": ingest.main, "ia-play": play.main, "ia-sample": sample.main,
+    "ia-track": track.main,
 }  # fmt: skip
 
 OTHERS = (
@@ -22,6 +23,8 @@ OTHERS = (
     "cameras/01/intri.yml", "0000.png", "0001.png", "dance.npz", "truth/poses.npz", "index.html",
     "avatar.json", "mesh.glb", "mesh.ply", "clip.webm", "letter.txt", "table.md", "runs/a.png",
     ".avatar.iavatar.swp", ".report.1234.part.json", ".capture.99.old/letter.txt", "job.json",
+    "grade.json", "skeleton.webm", "sub/grade.json", "film/skeleton.webm",
+    ".masks.1234.part/letter.txt",
 )  # fmt: skip
 """Names of our own, and of others, that other people's files have."""
 
@@ -97,6 +100,13 @@ def called(line, **places):
         "ia-export {package} --to ply --out {hoard}/mesh.ply",
         "ia-evaluate {run} --json {hoard}/report.json",
         "ia-evaluate {run} --markdown {hoard}/table.md",
+        "ia-track {film} --out {hoard}/poses.npz",
+        "ia-track {film} --out {hoard}/poses.npz --overwrite",
+        "ia-track {film} --out {hoard}/new.npz --overwrite",
+        "ia-track {film} --out {hoard}/sub/new.npz --overwrite",
+        "ia-track {film} --out {hoard}/film/new.npz --overwrite",
+        "ia-track {film} --out {hoard}/images/0000.png",
+        "ia-track {film} --out {hoard}",
     ],
 )
 def test_a_place_with_other_peoples_files_is_refused(
@@ -140,6 +150,15 @@ def test_a_place_with_other_peoples_files_is_refused(
         "ia-evaluate {run} --on {capture} --json {capture}/poses.npz --overwrite",
         "ia-evaluate {run} --on {capture} --markdown {capture}/masks/0000.png --overwrite",
         "ia-evaluate {package} --on {capture} --json {package} --overwrite",
+        "ia-track {capture} --out {capture}/new.npz --overwrite",
+        "ia-track {capture} --out {capture}/sub/new.npz",
+        "ia-track . --out sub/new.npz",
+        "ia-track .",
+        "ia-track {capture}/video.mp4 --out {capture}/poses.npz --overwrite",
+        "ia-track {capture}/video.mp4 --out {capture}/masks/new.npz",
+        "ia-track {above}/film.mp4 --masks {capture}/masks --out {capture}/masks/sub/new.npz",
+        "ia-track {above}/film.mp4 --body {above}/body.npz --out {above}/body.npz --overwrite",
+        "ia-track {above}/film.mp4 --out {run}/poses.npz",
     ],
 )
 def test_no_command_writes_over_what_it_reads(
@@ -148,6 +167,7 @@ def test_no_command_writes_over_what_it_reads(
     monkeypatch.chdir(capture)
     (tmp_path / "link").symlink_to(capture)
     os.link(capture / "video.mp4", tmp_path / "film.mp4")
+    (tmp_path / "body.npz").write_text("mine")
     before = contents(tmp_path)
     assert called(line, capture=capture, above=tmp_path, run=run, package=package) == 2
     assert contents(tmp_path) == before
@@ -184,8 +204,10 @@ KILLED = """
 import os, shutil, signal, sys
 from pathlib import Path
 
+from apps.cli.console import Console
 from apps.run.run_folder import RunFolder
-from capture.atomic_files import AtomicFile, atomic_folder, write_text_atomically
+from apps.track import claim_outputs
+from capture.atomic_files import AtomicFile, atomic_file, atomic_folder, write_text_atomically
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
 folder, left = Path(sys.argv[1]), -1
@@ -197,7 +219,7 @@ def count(event, arguments):
         if left < 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
-def work():
+def train():
     run = RunFolder(path=folder)
     run.check_usable([], resume=False, overwrite=True)
     run.start_run(resume=False)
@@ -207,14 +229,32 @@ def work():
     package.temporary_path.write_bytes(b"avatar")
     package.commit()
     write_text_atomically(run.report_json, "{}")
-    with atomic_folder(folder / "frames") as part:
-        (part / "0000.png").write_bytes(b"new")
 
+def recover_run():
+    run = RunFolder(path=folder)
+    run.check_usable([], resume=False, overwrite=True)
+    run.start_run(resume=False)
+
+def track():
+    with claim_outputs(folder, Console()):
+        with atomic_folder(folder / "masks") as part:
+            (part / "000000.png").write_bytes(b"new")
+        with atomic_file(folder / "poses.npz") as part:
+            part.write_bytes(b"found")
+        write_text_atomically(folder / "grade.json", "{}")
+
+def recover_tracking():
+    track()
+    for name in ("poses.npz", "grade.json", "masks/000000.png", "masks/.instant-avatar-files"):
+        (folder / name).unlink()
+
+work, recover = {"run": (train, recover_run), "track": (track, recover_tracking)}[sys.argv[2]]
 sys.addaudithook(count)
 work()
-ours = {str(path.relative_to(folder)) for path in folder.rglob("*")}
 others = ["letter.txt", "checkpoint/step_100.ckpt", ".avatar.iavatar.swp", "0000.png"]
+others += [".masks.1234.part/letter.txt"]
 for name in others:
+    (folder / name).parent.mkdir(exist_ok=True)
     (folder / name).write_bytes(b"mine")
 before = shutil.copytree(folder, folder.with_name("before"))
 events = 0
@@ -226,11 +266,10 @@ while True:
         os._exit(0)
     killed = os.waitpid(child, 0)[1] != 0
     assert all((folder / name).read_bytes() == b"mine" for name in others), events
-    run = RunFolder(path=folder)
-    run.check_usable([], resume=False, overwrite=True)
-    run.start_run(resume=False)
+    recover()
     rest = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    rest -= {name for name in rest if "frames" in name or name.endswith(".instant-avatar-files")}
+    rest -= {name for name in rest if name.endswith((".instant-avatar-files", "-lock"))}
+    rest -= {name for name in rest if name.startswith(".masks.") and ".old/" in name}
     assert rest == set(others), (events, rest)
     if not killed:
         break
@@ -239,12 +278,13 @@ while True:
     events += 1
 print(events)
 """
-"""What a run writes, by a process that is killed at each of its operations on files in turn."""
+"""What commands write, by a process that is killed at each of its operations on files in turn."""
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
-def test_wherever_a_run_is_killed_other_peoples_files_stay_and_ours_are_known(tmp_path):
-    command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]
+@pytest.mark.parametrize("what", ["run", "track"])
+def test_wherever_a_command_is_killed_other_peoples_files_stay_and_ours_are_known(what, tmp_path):
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "run"), what]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 60
+    assert int(done.stdout) > 40

@@ -54,6 +54,20 @@ def test_a_folder_where_a_file_should_be_is_named_before_any_work(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_tracked_poses_that_lie_in_the_way_are_found_before_any_work(tmp_path):
+    run = RunFolder(path=tmp_path / "run")
+    write_text_atomically(run.tracked_poses, "mine")
+    with pytest.raises(InputError, match=r"tracking/poses\.npz was not written by ia-ingest"):
+        run.check_usable([], resume=False, overwrite=True)
+    apart = tmp_path / "tracked"
+    apart.mkdir()
+    OutputFileList(apart).create()
+    for name in ("poses.npz", "grade.json"):
+        write_text_atomically(apart / name, "tracked")
+    with pytest.raises(InputError, match="poses that ia-track wrote"):
+        RunFolder(path=apart).check_usable([], resume=False, overwrite=True)
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_for_reading_alone_is_named_before_any_work(tmp_path):
     tmp_path.chmod(0o500)

@@ -15,6 +15,7 @@ from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.body.body_file import load_body_model
 from preprocess.body.motion_shape import shape_for_motion
 from preprocess.capture_session import CaptureInputs
+from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 
@@ -74,6 +75,16 @@ def test_a_capture_opens_from_what_was_written(tracked):
     assert capture.motion.proportions is not None
 
 
+def test_poses_and_masks_of_some_frames_are_read_beside_the_whole_video(video, tmp_path, capsys):
+    out = tmp_path / "out" / "poses.npz"
+    assert track.main([str(video), "--out", str(out), "--frames", "::2", "--no-film"]) == 0
+    told = capsys.readouterr().err
+    assert f"ia-ingest {video} --poses {out} --frames ::2" in "".join(told.splitlines())
+    capture = open_capture(CaptureInputs(video=video, poses=out))
+    found = [each for each in capture.observations() if isinstance(each, Observation)]
+    assert [each.frame.index for each in found] == list(range(0, 20, 2))
+
+
 def test_ia_check_grades_tracked_poses(tracked, tmp_path, capsys):
     told = tmp_path / "check.json"
     words = ["--poses", str(tracked / "out" / "poses.npz"), "--json", str(told)]
@@ -87,6 +98,17 @@ def test_files_are_replaced_only_if_asked(tracked, capsys):
     words = [str(tracked / "video.mp4"), "--out", str(tracked / "out" / "poses.npz")]
     assert track.main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_tracking_beside_the_video_reads_and_repeats(video, capsys):
+    words = ["--out", str(video.with_name("poses.npz")), "--frames", ":8", "--overwrite"]
+    assert track.main([str(video), *words]) in (0, 1)
+    stamp = video.with_name("masks") / "000000.png"
+    before = stamp.stat().st_ino
+    assert track.main([str(video), *words]) in (0, 1), capsys.readouterr().err
+    assert stamp.stat().st_ino != before  # not taken for masks that the user has given
+    assert "which lie beside the video" not in capsys.readouterr().err
+    assert open_capture(CaptureInputs(video=video.parent)).paths.video == video.parent
 
 
 def test_a_video_without_a_person_is_bad_input(tmp_path, capsys):
