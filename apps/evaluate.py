@@ -1,7 +1,6 @@
-"""ia-evaluate: score avatars, by renderer and player, as a table."""
+"""ia-evaluate: score avatars, and pictures of other systems, as a table."""
 
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +15,9 @@ from apps.run.run_folder import RunFolder
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from apps.evaluation.evaluation_frames import EvaluationFrames
+    from apps.evaluation.evaluation_session import EvaluationSession
     from apps.evaluation.people_snapshot import DatasetSubject
     from apps.evaluation.score_table import AvatarEvaluation
-    from avatar.training.trainer import Trainer
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,14 +36,16 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     arguments.validate()
     with console.status("loading torch"):
         from apps.cli.interrupt import stop_on_interrupt
+        from apps.evaluation.evaluation_session import EvaluationSession
         from apps.evaluation.score_table import evaluations_to_json, markdown_table
         from capture.atomic_files import write_text_atomically
 
     found: list[AvatarEvaluation] = []
     with stop_on_interrupt(console, "the table shows the frames scored by now") as stop:
+        session = EvaluationSession.begin(arguments, console, stop)
         found += (
             evaluation
-            for evaluation in _evaluate_all(arguments, console, stop)
+            for evaluation in _evaluate_all(session)
             if any(row.scores for row in evaluation.rows)
         )
     if not found:
@@ -63,26 +63,25 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     return INTERRUPTED if stop.is_set() else DONE
 
 
-def _evaluate_all(
-    arguments: EvaluateArguments, console: Console, stop: threading.Event
-) -> "Iterator[AvatarEvaluation]":
+def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
     from apps.evaluation.people_snapshot import find_subjects
 
+    arguments, stop = session.arguments, session.stop
     for path in arguments.targets:
         if stop.is_set():
             return
         run = RunFolder(path=path)
         if path.is_file():
-            yield _evaluate_package(path, arguments, console, stop)
+            yield _evaluate_package(path, session)
         elif run.has_checkpoint():
-            yield _evaluate_run(run, arguments, console, stop)
+            yield _evaluate_run(run, session)
         elif subjects := find_subjects(path):
             if arguments.on is not None:
                 raise InputError(f"{path} is a dataset with its own test frames; omit --on.")
             for subject, place in subjects:
                 run = _run_folder_of(subject, path, arguments)
-                if not stop.is_set() and _train_subject(subject, place, run, arguments, console):
-                    yield _evaluate_subject(subject, place, run, arguments, console, stop)
+                if not stop.is_set() and _train_subject(subject, place, run, session):
+                    yield _evaluate_subject(subject, place, run, session)
                 else:
                     stop.set()
         else:
@@ -90,46 +89,30 @@ def _evaluate_all(
                 f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
                 "folder with subjects of PeopleSnapshot (such as male-3-casual)."
             )
+    for folder in arguments.pictures:
+        if not stop.is_set():
+            yield session.evaluate_pictures(folder)
 
 
-def _evaluate_package(
-    path: Path, arguments: EvaluateArguments, console: Console, stop: threading.Event
-) -> "AvatarEvaluation":
+def _evaluate_package(path: Path, session: "EvaluationSession") -> "AvatarEvaluation":
     """Score the player alone, on the capture of --on."""
-    from apps.evaluation.avatar_scorer import evaluate_avatar
-    from apps.evaluation.evaluation_frames import capture_frames
-
-    if arguments.on is None:
+    if session.arguments.on is None:
         raise InputError(
             f"{path} is a package, which holds no frames: pass a capture of the same person with "
             "--on, or the run's folder."
         )
-    beside = RunFolder(path=path.parent).body_file
-    person = beside if beside.is_file() else None
-    frames = capture_frames(arguments.capture_inputs(arguments.on), person, arguments.size)
-    return evaluate_avatar(str(path), frames, None, path, console, stop, fit_poses=False)
+    return session.evaluate_package(path, session.frames_of_capture(RunFolder(path=path.parent)))
 
 
-def _evaluate_run(
-    run: RunFolder, arguments: EvaluateArguments, console: Console, stop: threading.Event
-) -> "AvatarEvaluation":
+def _evaluate_run(run: RunFolder, session: "EvaluationSession") -> "AvatarEvaluation":
     """Score renderer and player on the run's held-out frames, or on the capture of --on."""
-    from apps.evaluation.evaluation_frames import (
-        capture_frames,
-        held_out_frames,
-        trained_longer_side_px,
-    )
+    from apps.evaluation.evaluation_frames import held_out_frames, trained_longer_side_px
 
-    if arguments.on is None:
-        frames = held_out_frames(run, arguments.size)
+    if session.arguments.on is None:
+        frames = held_out_frames(run, session.arguments.size)
     else:
-        person = run.body_file if run.body_file.is_file() else None
-        frames = capture_frames(
-            arguments.capture_inputs(arguments.on),
-            person,
-            arguments.size or trained_longer_side_px(run),
-        )
-    return _evaluate_renderer_and_player(str(run.path), run, frames, arguments, console, stop)
+        frames = session.frames_of_capture(run, trained_longer_side_px(run))
+    return session.evaluate_run(str(run.path), run, frames)
 
 
 def _run_folder_of(
@@ -141,35 +124,26 @@ def _run_folder_of(
 
 
 def _evaluate_subject(
-    subject: "DatasetSubject",
-    folder: Path,
-    run: RunFolder,
-    arguments: EvaluateArguments,
-    console: Console,
-    stop: threading.Event,
+    subject: "DatasetSubject", folder: Path, run: RunFolder, session: "EvaluationSession"
 ) -> "AvatarEvaluation":
     """Score a trained subject on the paper's test frames."""
     from apps.evaluation.evaluation_frames import capture_frames
+    from apps.evaluation.frame_scoring import BACKGROUNDS
     from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TEST_POSES, subject_poses
 
+    arguments = session.arguments
     inputs = replace(
         arguments.capture_inputs(folder),
         poses=subject_poses(folder, TEST_POSES),
         frames=parse_frame_range(subject.test),
     )
     frames = capture_frames(inputs, run.body_file, arguments.size or LONGER_SIDE_PX)
-    return replace(
-        _evaluate_renderer_and_player(subject.name, run, frames, arguments, console, stop),
-        paper=subject.paper,
-    )
+    scored = session.evaluate_run(subject.name, run, frames, tuple(BACKGROUNDS))
+    return replace(scored, paper=subject.paper)
 
 
 def _train_subject(
-    subject: "DatasetSubject",
-    folder: Path,
-    run: RunFolder,
-    arguments: EvaluateArguments,
-    console: Console,
+    subject: "DatasetSubject", folder: Path, run: RunFolder, session: "EvaluationSession"
 ) -> bool:
     """Train a subject like ia-ingest, on all of the paper's training frames.
 
@@ -181,6 +155,7 @@ def _train_subject(
     from apps.ingest import ingest
     from apps.run.ingest_arguments import IngestArguments
 
+    arguments, console = session.arguments, session.console
     if is_trained(run, seconds=arguments.seconds, steps=arguments.steps):
         console.info(f"{subject.name} was trained before, in {run.path}.")
         return True
@@ -205,32 +180,6 @@ def _train_subject(
             raise
         console.warning(str(end))  # a failed avatar is scored, too
         return end.code == NO_AVATAR
-
-
-def _evaluate_renderer_and_player(
-    name: str,
-    run: RunFolder,
-    frames: "EvaluationFrames",
-    arguments: EvaluateArguments,
-    console: Console,
-    stop: threading.Event,
-) -> "AvatarEvaluation":
-    from apps.evaluation.avatar_scorer import evaluate_avatar
-
-    package = run.package if arguments.player and run.package.is_file() else None
-    trainer = _load_trainer(run, arguments, console)
-    return evaluate_avatar(
-        name, frames, trainer, package, console, stop, fit_poses=arguments.fitted
-    )
-
-
-def _load_trainer(run: RunFolder, arguments: EvaluateArguments, console: Console) -> "Trainer":
-    with console.status(f"loading {run.checkpoint}"):
-        from apps.cli.device import resolve_device
-        from avatar.training import checkpoint
-
-        trainer, _ = checkpoint.load(run.checkpoint, resolve_device(arguments.device))
-    return trainer
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ class EvaluateArguments:
         ia-evaluate run other/run --json table.json  several, with their mean
         ia-evaluate run --on another/capture         the same person in another video
         ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
+        ia-evaluate --pictures theirs --on capture   what another system rendered of its frames
         ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
 
     The last one trains each subject of PeopleSnapshot in the folder (InstantAvatar's layout:
@@ -29,18 +30,36 @@ class EvaluateArguments:
     and lists the paper's scores next to them (docs/evaluation.md). Subjects that were trained
     before are not trained again.
 
-    Whole images are compared on white, in the capture's poses ("given") and in poses fitted to each
-    frame with the avatar frozen ("fitted", as in the paper).
+    Images are compared on white, in the capture's poses ("given") and in poses fitted to each frame
+    with the avatar frozen ("fitted", as in the paper).
+
+    LPIPS needs torchmetrics (pip install 'instant-avatar-stream[lpips]') and torchvision's weights
+    of AlexNet and VGG-16, which are not downloaded here; without them the table says n/a.
 
     Exit codes: 0 done; 2 bad input; 3 disk full; 130 Ctrl-C, after a table of the scored frames.
     """
 
     targets: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="RUN|AVATAR|DATASET", help_behavior_hint="")
-    ]
+    ] = ()
     """Folders written by ia-ingest, .iavatar packages, or a folder of PeopleSnapshot subjects."""
     on: Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint="")] = None
     """Score all frames of this video or capture folder instead of the run's held-out frames."""
+    pictures: Annotated[tuple[Path, ...], arg(metavar="DIR", help_behavior_hint="")] = ()
+    """Score these folders of pictures, too, which other systems rendered of the frames of --on.
+    A picture's name is that of the frame's file, or ends with the frame's number, from 0."""
+    background: Annotated[tuple[Literal["white", "black"], ...], arg(help_behavior_hint="")] = ()
+    """Backgrounds behind the person, one or both (default: white; both for a dataset). Pictures
+    without an alpha channel have one already: name it."""
+    lpips: Annotated[tuple[Literal["alex01", "alex", "vgg"], ...], arg(help_behavior_hint="")] = (
+        "alex01",
+        "alex",
+        "vgg",
+    )
+    """LPIPS as published tables compute it: AlexNet fed [0, 1] (PeopleSnapshot), AlexNet fed
+    [-1, 1] (NeuMan), VGG fed [-1, 1] (ZJU-MoCap; five seconds of CPU per image of 540 px)."""
+    lpips_weights: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder with alexnet-owt-7be5be79.pth and vgg16-397923af.pth (default: torch's cache)."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Poses of --on, as in ia-ingest (default: those in the capture folder)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
@@ -78,8 +97,10 @@ class EvaluateArguments:
         Raises:
             InputError: Naming the option.
         """
-        if not self.targets:
+        if not self.targets and not self.pictures:
             raise InputError("Pass a run, a package or a dataset: ia-evaluate run (see --help).")
+        if self.lpips_weights is not None and not self.lpips_weights.is_dir():
+            raise InputError(f"--lpips-weights is {self.lpips_weights}, which is no folder.")
         if self.size is not None and self.size < 16:
             raise InputError(f"--size is {self.size}, but must be at least 16 pixels.")
         if not 0.0 < self.seconds < float("inf"):
@@ -89,7 +110,7 @@ class EvaluateArguments:
         parse_frame_range(self.frames)
         given = [
             f"--{name}" for name in ("poses", "masks", "cameras") if getattr(self, name) is not None
-        ]
+        ] + ["--pictures"] * bool(self.pictures)
         if self.frames != "::":
             given.append("--frames")
         if given and self.on is None:
@@ -106,6 +127,7 @@ class EvaluateArguments:
     def _inputs(self) -> list[Path]:
         """Return files that are read and must not be written to."""
         packages = [path for path in self.targets if path.is_file()]
+        packages += self.pictures
         if self.on is not None:
             return [*packages, *self.capture_inputs(self.on).input_paths()]
         return packages if self.body is None else [*packages, self.body]

@@ -1,84 +1,56 @@
-"""Scores of an avatar by renderer and poses, as an aligned Markdown table and as JSON."""
+"""Scores of an avatar by renderer, poses and background: a Markdown table, CSV and JSON."""
 
+import csv
+import io
 import json
-import time
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
-from jaxtyping import Bool, Float32
-
-from apps.report.report_schema import finite_mean
-from avatar.evaluation.held_out import MASK_THRESHOLD, HeldOutFrame, score_rendering
-from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr
+from apps.evaluation.frame_scoring import METRICS, FrameScore
+from apps.evaluation.shown_frames import ShownFrame
+from apps.report.report_schema import finite_mean, to_json_value
+from avatar.evaluation.perceptual import LPIPS_CONVENTIONS
 from avatar.evaluation.sharpness import SharpnessVerdict, overall_verdict
-from preprocess.observation import Observation
-
-PremultipliedImage = Float32[np.ndarray, "height width 4"]
-"""RGBA with premultiplied alpha."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameScore:
-    """Scores of one rendering against its frame, both on white.
-
-    Attributes:
-        frame: Frame number in the video.
-        psnr: PSNR of the whole image, dB.
-        psnr_mask: PSNR where alpha > 0.5, dB.
-        psnr_box: PSNR in the bounding box of the mask, dB.
-        ssim: SSIM of the whole image (Wang et al. 2004), in [-1, 1].
-        blur: Equivalent blur, as a fraction of body height (`avatar.evaluation.sharpness`).
-        overlap: Soft IoU of rendered alpha and mask, in [0, 1].
-        cpu_ms: CPU time of rendering, over all threads.
-    """
-
-    frame: int
-    psnr: float
-    psnr_mask: float
-    psnr_box: float
-    ssim: float
-    blur: float
-    overlap: float
-    cpu_ms: float
-
-
-METRICS = ("psnr", "psnr_box", "psnr_mask", "ssim", "cpu_ms")
-"""Fields of `FrameScore` that are averaged."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreRow:
-    """Scores of one renderer with one kind of poses.
+    """Scores of one renderer with one kind of poses, on one background.
 
     Attributes:
-        renderer: "renderer", "player hq" or "player lite".
-        poses: "given" or "fitted".
+        renderer: "renderer", "player hq", "player lite", or "pictures" of another system.
+        poses: "given", "fitted", or "theirs" of pictures.
+        background: "white" or "black".
         scores: Scores of each frame.
     """
 
     renderer: str
     poses: str
+    background: str = "white"
     scores: list[FrameScore] = field(default_factory=list)
 
     def mean_of(self, name: str) -> float | None:
         """Return the mean of one of `METRICS` over the frames; None without finite values."""
-        return finite_mean([getattr(score, name) for score in self.scores])
+        return finite_mean([score.value(name) for score in self.scores])
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
         """Verdict on the frames; None without a silhouette."""
         return overall_verdict(self.scores)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> dict[str, Any]:
         """Return means, then the scores of every frame."""
         return {
             "renderer": self.renderer,
             "poses": self.poses,
-            **{name: _json_number(self.mean_of(name)) for name in METRICS},
+            "background": self.background,
+            **{name: self.mean_of(name) for name in METRICS},
             "verdict": self.verdict,
             "frames": [
-                {key: _json_number(value) for key, value in vars(score).items()}
+                {key: value for key, value in vars(score).items() if key != "others"}
+                | dict(score.others)
                 for score in self.scores
             ],
         }
@@ -94,6 +66,9 @@ class AvatarEvaluation:
         size: Width and height of the images; None without any.
         rows: Scores by renderer and poses, at least one.
         paper: Scores in the paper, if the subject is in it.
+        shown: Frames with their renderings, for the card.
+        report: Content of the run's report.json, if there is one.
+        dances: Animations of novel poses as data URIs, by name.
     """
 
     name: str
@@ -101,128 +76,140 @@ class AvatarEvaluation:
     size: tuple[int, int] | None
     rows: Sequence[ScoreRow]
     paper: dict[str, float] | None = None
+    shown: Sequence[ShownFrame] = ()
+    report: dict[str, Any] | None = None
+    dances: dict[str, str] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> dict[str, Any]:
         """Return the scores as JSON."""
         return {
             "avatar": self.name,
             "capture": self.capture,
             "size": self.size,
-            "background": "white",
             "rows": [row.as_json() for row in self.rows],
             "paper": self.paper,
         }
 
 
-def score_frame(
-    observation: Observation, render_image: Callable[[], PremultipliedImage]
-) -> FrameScore:
-    """Render a frame's pose and compare the image with the frame.
-
-    Args:
-        observation: The frame.
-        render_image: Renders with premultiplied alpha.
-    """
-    started = time.process_time()
-    picture = render_image()
-    cpu_ms = 1000.0 * (time.process_time() - started)
-    shown, truth = (
-        np.clip(composite_on_white(picture), 0.0, 1.0),
-        ground_truth_on_white(observation),
-    )
-    rows, columns = _bounding_box(observation.alpha > MASK_THRESHOLD)
-    score = score_rendering(picture, HeldOutFrame(observation=observation))
-    return FrameScore(
-        **vars(score),
-        psnr_box=psnr(shown[rows, columns], truth[rows, columns]),
-        cpu_ms=cpu_ms,
-    )
-
-
-def evaluations_to_json(evaluations: Iterable[AvatarEvaluation]) -> str:
+def evaluations_to_json(
+    evaluations: Iterable[AvatarEvaluation], conditions: dict[str, str] | None = None
+) -> str:
     """Return the content of the file for --json."""
-    content = {"format": 1, "avatars": [each.as_json() for each in evaluations]}
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+    avatars = [each.as_json() for each in evaluations]
+    content = {"format": 2, "conditions": conditions or {}, "avatars": avatars}
+    return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 
-def _bounding_box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """Return rows and columns of the bounding box; empty for an empty silhouette."""
-    spans = []
-    for axis in (1, 0):
-        where = np.flatnonzero(silhouette.any(axis=axis))
-        spans.append(slice(where[0], where[-1] + 1) if where.size else slice(0, 0))
-    return spans[0], spans[1]
+def evaluations_to_csv(evaluations: Iterable[AvatarEvaluation]) -> str:
+    """Return one line per row with the mean of every metric; empty where it was not measured."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    ways = ("avatar", "capture", "width", "height", "renderer", "poses", "background", "frames")
+    writer.writerow([*ways, *METRICS, "verdict"])
+    for each in evaluations:
+        for row in each.rows:
+            means = [row.mean_of(metric) for metric in METRICS]
+            writer.writerow(
+                [
+                    each.name, each.capture, *(each.size or ("", "")), row.renderer, row.poses,
+                    row.background, len(row.scores),
+                    *("" if mean is None else f"{mean:.6g}" for mean in means), row.verdict or "",
+                ]
+            )  # fmt: skip
+    return text.getvalue()
 
 
-def _json_number(value: float | int | None) -> float | int | None:
-    return None if value is None or not np.isfinite(value) else round(value, 4)
-
-
-HEADER = (
-    "avatar", "frames", "drawn by", "poses", "PSNR", "in the box", "in the mask", "SSIM", "ms",
-    "looks",
-)  # fmt: skip
-LEFT_ALIGNED_COLUMNS = (0, 2, 3, 9)
+TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks")
 """Columns of the table that are left-aligned."""
-FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f", "cpu_ms": ".0f"}
-"""Format of each metric in the table."""
+FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f"}
+"""Format of each metric in the table, but those of LPIPS and time."""
+HEADINGS = {"psnr": "PSNR", "psnr_box": "in the box", "psnr_mask": "in the mask", "ssim": "SSIM"}
+"""Heading of each of them."""
 PAPER_ROW_NAME = "InstantAvatar (paper)"
 """Renderer of the rows with the paper's scores."""
+NOT_MEASURED = "n/a"
 
 
-def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
-    """Return all rows of all avatars, and their means over several avatars, as Markdown."""
-    lines = [HEADER]
+def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
+    """Return the header, all rows of all avatars, and their means over several avatars."""
+    lpips = [
+        f"lpips_{name}"
+        for name in LPIPS_CONVENTIONS
+        if any(row.mean_of(f"lpips_{name}") is not None for e in evaluations for row in e.rows)
+    ]
+    formats = FORMATS | dict.fromkeys(lpips or ["lpips"], ".4f") | {"cpu_ms": ".0f"}
+    labels = [LPIPS_CONVENTIONS[name.removeprefix("lpips_")].label for name in lpips] or ["LPIPS"]
+    ways = ["avatar", "frames", "drawn by", "poses", "on"]
+    lines = [[*ways, *HEADINGS.values(), *labels, "ms", "looks"]]
     for each in evaluations:
-        lines += [_row_cells(each.name, row) for row in each.rows]
+        for row in each.rows:
+            way = [each.name, str(len(row.scores)), row.renderer, row.poses, row.background]
+            figures = {metric: row.mean_of(metric) for metric in formats}
+            lines.append([*way, *_format_cells(figures, formats), row.verdict or ""])
         if each.paper is not None:
-            lines.append(_paper_cells(each))
+            figures = {metric: each.paper.get(metric) for metric in formats}
+            way = [each.name, "", PAPER_ROW_NAME, "fitted", "white"]
+            lines.append([*way, *_format_cells(figures, formats), ""])
     if len(evaluations) > 1:
-        lines += _mean_rows(evaluations)
-    widths = [max(len(line[column]) for line in lines) for column in range(len(HEADER))]
-    rule = [
-        "-" * width if i in LEFT_ALIGNED_COLUMNS else "-" * (width - 1) + ":"
-        for i, width in enumerate(widths)
-    ]
-    drawn = [_pad_cells(lines[0], widths), rule, *(_pad_cells(line, widths) for line in lines[1:])]
-    return "\n".join(f"| {' | '.join(line)} |" for line in drawn) + "\n"
-
-
-def _pad_cells(line: Sequence[str], widths: Sequence[int]) -> list[str]:
-    return [
-        text.ljust(width) if column in LEFT_ALIGNED_COLUMNS else text.rjust(width)
-        for column, (text, width) in enumerate(zip(line, widths, strict=True))
-    ]
-
-
-def _row_cells(name: str, row: ScoreRow) -> tuple[str, ...]:
-    figures = (_format_cell(row.mean_of(figure), form) for figure, form in FORMATS.items())
-    looks = row.verdict or ""
-    return (name, str(len(row.scores)), row.renderer, row.poses, *figures, looks)
-
-
-def _paper_cells(each: AvatarEvaluation) -> tuple[str, ...]:
-    """Return the cells of the paper's scores."""
-    assert each.paper is not None
-    figures = (_format_cell(each.paper.get(figure), form) for figure, form in FORMATS.items())
-    return (each.name, "", PAPER_ROW_NAME, "fitted", *figures, "")
-
-
-def _mean_rows(evaluations: Sequence[AvatarEvaluation]) -> list[tuple[str, ...]]:
-    """Return the mean over avatars for each renderer and kind of poses that all of them have."""
-    ways = [(row.renderer, row.poses) for row in evaluations[0].rows]
-    lines = []
-    for way in ways:
-        alike = [r for each in evaluations for r in each.rows if (r.renderer, r.poses) == way]
-        if len(alike) != len(evaluations):
-            continue
-        figures = []
-        for figure, form in FORMATS.items():
-            values = [value for row in alike if (value := row.mean_of(figure)) is not None]
-            figures.append(_format_cell(sum(values) / len(values) if values else None, form))
-        lines.append(("mean", str(sum(len(row.scores) for row in alike)), *way, *figures, ""))
+        lines += _mean_rows(evaluations, formats)
     return lines
 
 
-def _format_cell(value: float | None, form: str) -> str:
-    return "" if value is None else format(value, form)
+def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
+    """Return `table_cells` as aligned Markdown."""
+    return align_markdown(table_cells(evaluations))
+
+
+def align_markdown(lines: Sequence[Sequence[str]]) -> str:
+    """Return lines of cells, the first of which is the header, as aligned Markdown."""
+    header = lines[0]
+    widths = [max(3, *(len(line[column]) for line in lines)) for column in range(len(header))]
+    is_text = [name in TEXT_COLUMNS for name in header]
+    rule = [
+        "-" * width if text else "-" * (width - 1) + ":"
+        for width, text in zip(widths, is_text, strict=True)
+    ]
+    padded = [
+        [
+            cell.ljust(width) if text else cell.rjust(width)
+            for cell, width, text in zip(line, widths, is_text, strict=True)
+        ]
+        for line in lines
+    ]
+    drawn = [padded[0], rule, *padded[1:]]
+    return "\n".join(f"| {' | '.join(line)} |" for line in drawn) + "\n"
+
+
+def _mean_rows(evaluations: Sequence[AvatarEvaluation], formats: dict[str, str]) -> list[list[str]]:
+    """Return the mean over avatars for each kind of row that all of them have."""
+    lines = []
+    for first in evaluations[0].rows:
+        way = (first.renderer, first.poses, first.background)
+        alike = [
+            row
+            for each in evaluations
+            for row in each.rows
+            if (row.renderer, row.poses, row.background) == way
+        ]
+        if len(alike) != len(evaluations):
+            continue
+        figures = {
+            metric: finite_mean(
+                [math.nan if (mean := row.mean_of(metric)) is None else mean for row in alike]
+            )
+            for metric in formats
+        }
+        frames = str(sum(len(row.scores) for row in alike))
+        lines.append(["mean", frames, *way, *_format_cells(figures, formats), ""])
+    return lines
+
+
+def _format_cells(figures: dict[str, float | None], formats: dict[str, str]) -> list[str]:
+    return [
+        format(value, form) if (value := figures[metric]) is not None else _blank(metric)
+        for metric, form in formats.items()
+    ]
+
+
+def _blank(metric: str) -> str:
+    return NOT_MEASURED if metric.startswith("lpips") else ""

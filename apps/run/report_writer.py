@@ -1,16 +1,10 @@
 """Report of a run: report.json, report.html with its images, and the verdict on the console."""
 
-import base64
-import io
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from jaxtyping import Float, UInt8
-from PIL import Image
 
 from apps.animation.driving_motion import demo_motion
 from apps.animation.following_camera import FollowingCamera
@@ -28,6 +22,7 @@ from apps.report.report_schema import (
     TrainingStats,
     format_psnr,
 )
+from apps.report.webp import animated_webp_data_uri, to_uint8, webp_data_uri
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
@@ -37,34 +32,6 @@ from capture.live.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
 from preprocess.capture_session import Capture
-
-
-def to_uint8(
-    picture: Float[np.ndarray, "height width channels"],
-) -> UInt8[np.ndarray, "height width channels"]:
-    """Round an image in [0, 1] to 8 bits."""
-    return (np.clip(picture, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
-def webp_data_uri(picture: UInt8[np.ndarray, "height width channels"]) -> str:
-    """Encode an RGB or RGBA image as a data URI."""
-    return _encode_webp([picture], frame_ms=0)
-
-
-def animated_webp_data_uri(
-    pictures: Sequence[UInt8[np.ndarray, "height width channels"]], *, fps: float
-) -> str:
-    """Encode RGB or RGBA images as a looping animation in a data URI."""
-    return _encode_webp(pictures, frame_ms=max(1, round(1000.0 / fps)))
-
-
-def _encode_webp(pictures: Sequence[UInt8[np.ndarray, "..."]], *, frame_ms: int) -> str:
-    first, *others = [Image.fromarray(picture) for picture in pictures]
-    buffer = io.BytesIO()
-    moving = {"save_all": True, "append_images": others, "duration": frame_ms, "loop": 0}
-    first.save(buffer, format="WEBP", quality=82, method=3, **(moving if others else {}))
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
 
 MIN_STEPS_TO_JUDGE = 60
 """Training steps below which a failed avatar is undertrained: fog clears in about 50."""

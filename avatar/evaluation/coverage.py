@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches
 from preprocess.body.body_surface import visible_points
@@ -81,20 +81,11 @@ class Coverage:
         A patch is seen if it faces the camera (cosine above 0.3), lands inside the picture, has
         no other patch before it, and the mask says that a person is there.
         """
-        camera, body = observation.camera, self._shaped.with_pose(observation.pose)
-        points, normals = pose_patches(self.patches, body.world_from_rest())
-        to_camera = camera.center_world - points
-        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        cosines = np.einsum("pa,pa->p", to_camera, normals)
-        in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
-        depths = in_camera[:, 2]
-        if depths.min() <= 0.0:  # a person behind the camera is not in the image either
+        view = view_patches(self.patches, self._shaped, observation)
+        if view is None:  # a person behind the camera is not in the image either
             return
-        plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-        free = visible_points(
-            plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
-        )
-        column, row = np.floor(camera.project(points)).astype(np.int64).T
+        column, row = np.floor(view.pixels).astype(np.int64).T
+        camera, cosines, free = observation.camera, view.cosines, view.unoccluded
         width, height = camera.size_px
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
@@ -147,6 +138,41 @@ class Coverage:
         if len(stages) == len(self.stages) == len(cosines):
             np.maximum(self.cosines, cosines.astype(np.float32) / 255.0, out=self.cosines)
             np.maximum(self.stages, stages, out=self.stages)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PatchView:
+    """The patches of a posed body, as a camera sees them.
+
+    Attributes:
+        cosines: Of the angle between each normal and the direction to the camera.
+        unoccluded: Whether a patch faces the camera with no other before it.
+        pixels: Place in the image, px.
+    """
+
+    cosines: Float[np.ndarray, "patches"]
+    unoccluded: Bool[np.ndarray, "patches"]
+    pixels: Float[np.ndarray, "patches 2"]
+
+
+def view_patches(
+    patches: SkinPatches, shaped: ShapedBody, observation: Observation
+) -> PatchView | None:
+    """Project the patches in a frame's pose; None if some are behind the camera."""
+    camera, body = observation.camera, shaped.with_pose(observation.pose)
+    points, normals = pose_patches(patches, body.world_from_rest())
+    to_camera = camera.center_world - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    cosines = np.einsum("pa,pa->p", to_camera, normals)
+    in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    depths = in_camera[:, 2]
+    if depths.min() <= 0.0:
+        return None
+    plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+    free = visible_points(
+        plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
+    )
+    return PatchView(cosines=cosines, unoccluded=free, pixels=camera.project(points))
 
 
 def pose_patches(

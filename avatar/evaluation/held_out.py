@@ -11,8 +11,9 @@ from jaxtyping import Float32
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.evaluation.image_metrics import (
-    composite_on_white,
+    composite_over,
     ground_truth_on_white,
+    ground_truth_over,
     psnr_of_errors,
     soft_iou,
     ssim,
@@ -79,11 +80,15 @@ def score_frame(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
 
 
 def score_rendering(
-    rendering: Float32[np.ndarray, "height width 4"], frame: HeldOutFrame
+    rendering: Float32[np.ndarray, "height width 4"], frame: HeldOutFrame, background: float = 1.0
 ) -> HeldOutScore:
-    """Compares a premultiplied rendering of a frame's pose, in its exposure, with the frame."""
-    observation, truth = frame.observation, ground_truth_on_white(frame.observation)
-    image = np.clip(composite_on_white(frame.expose(rendering)), 0.0, 1.0)
+    """Compares a premultiplied rendering of a frame's pose, in its exposure, with the frame.
+
+    Both are put on a gray background from 0 (black) to 1 (white); blur is measured against the
+    frame on white in any case.
+    """
+    observation, truth = frame.observation, ground_truth_over(frame.observation, background)
+    image = np.clip(composite_over(frame.expose(rendering), background), 0.0, 1.0)
     errors = (image.astype(np.float64) - truth) ** 2
     psnr_mask = psnr_of_errors(errors[observation.alpha > MASK_THRESHOLD])
     return HeldOutScore(

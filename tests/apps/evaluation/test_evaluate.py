@@ -11,14 +11,14 @@ from apps import evaluate, ingest
 from apps.cli.console import Console
 from apps.cli.exit_codes import INTERRUPTED
 from apps.evaluation import avatar_scorer, people_snapshot
+from apps.evaluation.frame_scoring import FrameJudge, FrameScore
 from apps.evaluation.score_table import (
     AvatarEvaluation,
-    FrameScore,
     ScoreRow,
     markdown_table,
-    score_frame,
 )
-from avatar.evaluation.image_metrics import ground_truth_on_white
+from avatar.evaluation.image_metrics import ground_truth_on_white, ground_truth_over
+from avatar.evaluation.perceptual import Lpips
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.apps.conftest import Outcome
@@ -38,7 +38,11 @@ def call_evaluate(capsys):
 
 def rows_of(path):
     (avatar,) = json.loads(path.read_text())["avatars"]
-    return {(row["renderer"], row["poses"]): row for row in avatar["rows"]}
+    return {
+        (row["renderer"], row["poses"]): row
+        for row in avatar["rows"]
+        if row["background"] == "white"
+    }
 
 
 def test_a_runs_own_table_says_what_its_report_says(run, call_evaluate, tmp_path):
@@ -98,7 +102,7 @@ def dataset(film, call_ingest, tmp_path, monkeypatch):
 
 
 def psnrs(ended):
-    return [line.split("|")[5] for line in ended.out.splitlines()]
+    return [line.split("|")[6] for line in ended.out.splitlines()]
 
 
 def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
@@ -118,6 +122,11 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     assert [frame["frame"] for frame in row["frames"]] == [16, 19, 22]
     assert "InstantAvatar (paper)" in ended.out
     assert "29.65" in ended.out
+    (avatar,) = json.loads((tmp_path / "t").read_text())["avatars"]
+    ways = [(row["poses"], row["background"]) for row in avatar["rows"]]
+    assert ways == [(p, on) for p in ("given", "fitted") for on in ("white", "black")]
+    assert "LPIPS (alex, vgg) was not measured" in ended.err
+    assert "n/a" in ended.out
     again = call(10)
     assert "was trained before" in again.err
     assert psnrs(again) == psnrs(ended)
@@ -156,14 +165,52 @@ def test_a_box_is_scored_without_the_white_around_it(film):
     (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
     truth = ground_truth_on_white(seen)
     wrong = np.dstack([np.clip(truth - 0.1, 0.0, 1.0), np.ones(truth.shape[:2])]).astype(np.float32)
-    score = score_frame(seen, lambda: wrong)
+    (score,) = FrameJudge().score(seen, wrong)
     rows, columns = np.nonzero(seen.alpha > 0.5)
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     error = ((wrong[..., :3] - truth)[box].astype(float) ** 2).mean()
     assert score.psnr_box == pytest.approx(-10.0 * np.log10(error), abs=1e-4)
-    perfect = score_frame(seen, lambda: np.dstack([truth, np.ones(truth.shape[:2], np.float32)]))
-    assert perfect.psnr_box == np.inf
-    assert perfect.ssim == pytest.approx(1.0)
+    perfect = np.dstack([truth, np.ones(truth.shape[:2], np.float32)])
+    (score,) = FrameJudge().score(seen, perfect)
+    assert score.psnr_box == np.inf
+    assert [score.value(name) for name in ("ssim", "ssim_box", "ssim_mask")] == pytest.approx(
+        [1.0] * 3
+    )
+    assert np.isnan(score.overlap)  # an opaque picture says nothing about the person's outline
+
+
+def test_each_background_has_its_own_scores_of_one_rendering(film):
+    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
+    alpha = 0.5 * seen.alpha[..., None]
+    picture = np.concatenate([alpha * (seen.frame.rgb / np.float32(255.0)), alpha], axis=-1)
+    white, black = FrameJudge(("white", "black")).score(seen, picture)
+    for score, gray in ((white, 1.0), (black, 0.0)):
+        shown = picture[..., :3] + np.float32(gray) * (1.0 - picture[..., 3:])
+        error = ((shown - ground_truth_over(seen, gray)).astype(float) ** 2).mean()
+        assert score.psnr == pytest.approx(-10.0 * np.log10(error), abs=1e-3)
+    assert white.psnr != black.psnr
+    assert white.overlap == black.overlap
+
+
+def test_perceptual_distances_are_measured_over_image_box_and_mask(film, monkeypatch):
+    def mean_error(self, image, truth, convention):
+        return float(np.abs(image - truth).mean())
+
+    def mean_error_within(self, image, truth, silhouette, convention):
+        return float(np.abs(image - truth)[silhouette].mean())
+
+    monkeypatch.setattr(Lpips, "compare", mean_error)
+    monkeypatch.setattr(Lpips, "compare_within", mean_error_within)
+    lpips = Lpips(())
+    lpips.conventions = ("alex",)
+    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
+    truth = ground_truth_on_white(seen)
+    inside = seen.alpha[..., None] > 0.5
+    wrong = np.dstack([np.where(inside, truth + 0.25, truth), np.ones(truth.shape[:2])])
+    (score,) = FrameJudge(lpips=lpips).score(seen, wrong.astype(np.float32))
+    whole, box, mask = (score.value(f"lpips_alex{where}") for where in ("", "_box", "_mask"))
+    assert whole < box < mask <= 0.2501
+    assert np.isnan(score.value("lpips_vgg"))
 
 
 def test_a_table_is_markdown_and_its_means_are_means():
@@ -179,11 +226,11 @@ def test_a_table_is_markdown_and_its_means_are_means():
     assert len({line.count("|") for line in lines}) == 1
     assert len(set(map(len, lines))) == 1
     cells = [cell.strip() for cell in lines[-1].split("|")]
-    assert cells[1:6] == ["mean", "2", "renderer", "given", "31.50"]
+    assert cells[1:7] == ["mean", "2", "renderer", "given", "white", "31.50"]
     assert lines[2].endswith("| soft  |")
 
 
-def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):
+def test_what_was_scored_before_it_was_stopped_is_in_the_table(film):
     seen = list(open_capture(CaptureInputs(video=film)).observations())[:3]
     stop, console = threading.Event(), Console()
 
@@ -192,8 +239,8 @@ def test_what_was_scored_before_it_was_stopped_is_in_the_table(film, run):
         stop.set()
         yield from seen[1:]
 
-    players = {"hq": avatar_scorer.Player.load(run / "avatar.iavatar")}
-    found = avatar_scorer.AvatarScorer(None, players, fit_poses=True)
+    players = {"hq": lambda seen: np.zeros((*seen.alpha.shape, 4), np.float32)}
+    found = avatar_scorer.AvatarScorer(None, players, FrameJudge(), fit_poses=True)
     with console.progress("scoring", 3.0) as bar:
         found.score_frames(stopped_in_the_second(), bar, stop)
     assert [len(row.scores) for row in found.rows] == [0]
@@ -217,6 +264,9 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
     ("words", "told"),
     [
         (["{run}", "--frames", "0:5"], "--on"),
+        (["--pictures", "{film}"], "--on"),
+        (["--pictures", "{tmp}", "--on", "{film}"], "no pictures"),
+        (["{run}", "--lpips-weights", "{tmp}/nothing"], "--lpips-weights"),
         (["{run}/avatar.iavatar"], "--on"),
         (["{tmp}"], "neither a run"),
         (["{tmp}/nothing"], "does not exist"),
