@@ -1,6 +1,5 @@
 """Scores of a run against the truth of a phone-like capture: poses, proportions, novel poses."""
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from avatar.training import checkpoint
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
 from avatar.training.trainer import Trainer
+from baselines.systems.compared_capture import novel_observations
 from capture.camera import Camera
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import BodyPose
@@ -21,11 +21,7 @@ from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.capture_session import CaptureInputs
-from preprocess.observation import Observation
-from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from preprocess.poses.root_placement import place_by_pixels
 
 TRACKED_JOINTS = 22
 """Joints that are compared, the root included: without the hands' inner joints."""
@@ -105,11 +101,7 @@ def score_novel_poses(run: Path, capture: Path) -> NovelPoseFit:
     """How well the avatar shows the true pictures of poses that were never filmed."""
     trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
     person = read_shaped_body(run / "checkpoint" / "person.npz", load_body_model())
-    novel = _novel_observations(capture)
-    placed = [
-        HeldOutFrame(observation=place_in_true_view(seen, person, _true_body(capture)))
-        for seen in novel
-    ]
+    placed = [HeldOutFrame(observation=seen) for seen in novel_observations(capture, person)]
     before = [score_frame(trainer.avatar, frame) for frame in placed]
     fitted = [score_frame(trainer.avatar, frame) for frame in fit_test_poses(trainer, placed)]
     return NovelPoseFit(
@@ -118,28 +110,6 @@ def score_novel_poses(run: Path, capture: Path) -> NovelPoseFit:
         fitted_mask=float(np.mean([score.psnr_mask for score in fitted])),
         fitted_ssim=float(np.mean([score.ssim for score in fitted])),
     )
-
-
-def place_in_true_view(seen: Observation, person: ShapedBody, true_body: ShapedBody) -> Observation:
-    """The observation with its pose's root moved for a person of other proportions.
-
-    Args:
-        seen: With the true pose and camera.
-        person: Whom the avatar was learnt on: its joints are to appear where the truth's do.
-        true_body: Whose pose it is.
-    """
-    camera = seen.camera
-    view = camera.camera_from_world
-    pixels = camera.project(true_body.with_pose(seen.pose).joints())
-    joints = person.with_pose(seen.pose).joints() @ view[:3, :3].T + view[:3, 3]
-    shift = view[:3, :3].T @ place_by_pixels(joints, pixels, camera)
-    moved = dataclasses.replace(seen.pose, root_translation=seen.pose.root_translation + shift)
-    return dataclasses.replace(seen, pose=moved)
-
-
-def _novel_observations(capture: Path) -> list[Observation]:
-    inputs = CaptureInputs(video=capture / "truth" / "novel", body=capture / "truth" / "body.npz")
-    return [seen for seen in open_capture(inputs).observations() if isinstance(seen, Observation)]
 
 
 def _true_body(capture: Path) -> ShapedBody:

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real import RealJob, ingest_command, table_lines
-from benchmarks.real_scores import place_in_true_view, pose_error_deg, rest_joint_distance_cm
+from baselines.systems.compared_capture import place_in_true_view
+from benchmarks.real_scores import pose_error_deg, rest_joint_distance_cm
 from capture.camera import Camera
 from capture.frame import Frame
 from preprocess.body.body_pose import BodyPose

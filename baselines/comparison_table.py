@@ -1,0 +1,92 @@
+"""Results of a comparison as Markdown: scores at the end, over time, and what time is missing."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+SCORES = (("psnr", 2), ("psnr_mask", 2), ("ssim", 4))
+"""Scores of each kind of frames, with their digits."""
+MIN_SLOPE_DB = 0.1
+"""Gain for each doubling of the time below which nothing is extrapolated, dB."""
+
+
+def comparison_table(results: Sequence[dict[str, Any]]) -> str:
+    """Both tables of one capture: at the end of training, and over time."""
+    head = [
+        "", "core-s", "steps", "novel poses, PSNR", "in the mask", "SSIM",
+        "held-out PSNR", "in the mask", "SSIM",
+    ]  # fmt: skip
+    rows = [
+        [
+            each["method"], f"{each['core_seconds']:.0f}", f"{each['steps']:,}",
+            *(
+                number(each[kind][key], digits)
+                for kind in ("novel", "held_out")
+                for key, digits in SCORES
+            ),
+        ]
+        for each in results
+    ]  # fmt: skip
+    kind = "held_out" if results[0]["novel"]["psnr"] is None else "novel"
+    return "\n".join([*markdown(head, rows), "", *markdown(*_by_time(results, kind)), ""])
+
+
+def _by_time(results: Sequence[dict[str, Any]], kind: str) -> tuple[list[str], list[list[str]]]:
+    """PSNR over time on a few frames, and the time that each needs for the product's last value."""
+    ours = next((each["curve"] for each in results if each["method"] == "ours"), [])
+    longest = max((each["curve"] for each in results), key=len)
+    counted = results[0]["conditions"]["steps"] is not None
+    times = [point["steps" if counted else "core_seconds"] for point in longest]
+    unit = "steps" if counted else "core-s"
+    what = "novel poses" if kind == "novel" else "held-out frames"
+    head = [f"{what}, PSNR after", *(f"{round(time):,} {unit}" for time in times)]
+    rows = []
+    if ours:
+        head.append("as good as ours at the end")
+    for each in results:
+        row = [each["method"], *(number(point[kind], 2) for point in each["curve"])]
+        row += ["-"] * (len(times) + 1 - len(row))
+        if ours:
+            row.append(
+                ""
+                if each["method"] == "ours"
+                else time_to_reach(each["curve"], kind, ours[-1][kind])
+            )
+        rows.append(row)
+    return head, rows
+
+
+def time_to_reach(curve: Sequence[dict[str, Any]], kind: str, wanted: float) -> str:
+    """Core time in which a curve reaches a PSNR; beyond its end on its last doublings of time."""
+    points = [(point["core_seconds"], point[kind]) for point in curve]
+    reached = next((time for time, value in points if value >= wanted), None)
+    if reached is not None:
+        return duration(reached)
+    if len(points) < 2:
+        return "not reached"
+    (before, low), (end, high) = points[-2:]
+    slope = (high - low) / max(math.log2(end / before), 1e-6)
+    if slope < MIN_SLOPE_DB:
+        return "not reached, and the curve is flat"
+    doublings = (wanted - high) / slope
+    if doublings > 20.0:
+        return "not reached"
+    return f"{duration(end * 2.0**doublings)} (extrapolated)"
+
+
+def duration(seconds: float) -> str:
+    """Core time for people."""
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:,.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:,.0f} h"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A score, or a dash."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table whose columns but the first are numbers."""
+    rule = ["---", *["--:"] * (len(head) - 1)]
+    return ["| " + " | ".join(cells) + " |" for cells in (head, rule, *rows)]

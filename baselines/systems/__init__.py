@@ -1,0 +1,1 @@
+"""Other systems' avatars in one frame: data, rays, compositor, scores and clock are shared."""

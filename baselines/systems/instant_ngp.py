@@ -1,0 +1,121 @@
+"""Instant-NGP (Müller et al. 2022) without articulation: a hash grid in the body frame.
+
+The person is taken for a rigid thing that only turns and moves as a whole. The grid, its compiled
+kernels and the network are the product's own, so that nothing but the articulation is missing.
+"""
+
+from typing import Any, final
+
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor, nn
+
+from avatar.backends import backend_for
+from avatar.config import COARSEST_M, TrainConfig
+from avatar.field.radiance_field import RadianceField
+from avatar.kernels.hash_levels import HashLevels
+from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.training.trainer import NETWORK_RATE_FACTOR
+from baselines.systems.method_settings import MethodSettings
+from baselines.systems.posed_person import CELL_M, OccupiedCells, PosedBodies
+
+MARGIN_M = 0.17
+"""Margin of the box about all skins that were filmed, metres; the product's own."""
+PROBE_INTERVAL = 16
+"""Steps between updates of the occupied cells."""
+PROBE_DECAY = 0.8
+"""Decay of a cell's density between them."""
+MIN_DENSITY = 0.5
+"""Density above which a cell is occupied, 1/m; the fog of an untrained field is."""
+
+PRESETS = {
+    "paper": MethodSettings(frames=64, rays=4096, samples=128, learning_rate=2.5e-2),
+    "small": MethodSettings(frames=16, rays=1024, samples=48, learning_rate=2.5e-2),
+}
+
+
+class _HashGridGradient(torch.autograd.Function):
+    """The product's field, whose gradient is written by hand, as one operation of autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, anchor: Tensor, field: RadianceField) -> Tensor:
+        """The raw outputs; `anchor` only makes autograd come back here."""
+        ctx.field, ctx.seen = field, field.forward(points)
+        return ctx.seen.raw
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
+        """Writes the parameters' gradients."""
+        ctx.field.backward(ctx.seen, gradients[0].contiguous())
+        return None, torch.zeros(()), None
+
+
+@final
+class InstantNgp(nn.Module):
+    """The method: no warp at all, and cells that density has been found in."""
+
+    def __init__(
+        self,
+        skins: Float32[Tensor, "bodies vertices 3"],
+        settings: MethodSettings,
+        config: TrainConfig,
+    ) -> None:
+        """An untrained grid with the product's levels, in the box of all skins that were filmed."""
+        super().__init__()
+        low, high = skins.amin(dim=(0, 1)) - MARGIN_M, skins.amax(dim=(0, 1)) + MARGIN_M
+        levels = HashLevels.spanning(
+            low.numpy(), high.numpy(), coarsest_m=COARSEST_M, finest_m=config.finest_m,
+            levels=config.levels, table_size=config.table_size,
+        )  # fmt: skip
+        device = torch.device("cpu")
+        start = torch.Generator().manual_seed(config.seed)
+        self.field = RadianceField(levels, backend_for(device), device, start)
+        self._anchor = torch.zeros((), requires_grad=True)
+        self._low, self._shape = low, ((high - low) / CELL_M).ceil().long()
+        self._density = torch.full((int(self._shape.prod()),), MIN_DENSITY)
+        self._rate, self._poses = settings.learning_rate, 0
+
+    def pose(self, bodies: PosedBodies) -> OccupiedCells:
+        """Every body has the same cells."""
+        count = len(bodies.frames)
+        if self.training:
+            if self._poses % PROBE_INTERVAL == 0:
+                self._probe_cells()
+            self._poses += 1
+        grid = self._density.view(self._shape.tolist())
+        occupied = nn.functional.max_pool3d(grid[None, None], 3, 1, 1)[0, 0] >= MIN_DENSITY
+        return OccupiedCells(
+            self._low.expand(count, 3), self._shape.expand(count, 3),
+            torch.zeros(count, dtype=torch.int64), _never_empty(occupied.flatten()), CELL_M,
+        )  # fmt: skip
+
+    def _probe_cells(self) -> None:
+        """Raises the cells' decayed densities to those at one random point of each."""
+        x, y, z = (torch.arange(size) for size in self._shape.tolist())
+        corner = torch.cartesian_prod(x, y, z)
+        raw = self.field.raw_outputs_at(self._low + (corner + torch.rand(corner.shape)) * CELL_M)
+        found = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY))
+        self._density = torch.maximum(PROBE_DECAY * self._density, found)
+
+    def radiance(
+        self, points: Float32[Tensor, "points 3"], directions: Float32[Tensor, "points 3"],
+        bodies: Int64[Tensor, "points"], *, fine: bool,
+    ) -> Float32[Tensor, "points 4"]:  # fmt: skip
+        """The field at points of the body frame."""
+        return _HashGridGradient.apply(points.contiguous(), self._anchor, self.field)
+
+    def prior_loss(self) -> Tensor:
+        """None."""
+        return torch.zeros(())
+
+    def parameter_groups(self) -> list[dict[str, object]]:
+        """The table's rate, and the network's share of it, as in the product."""
+        return [
+            {"params": [self.field.table], "lr": self._rate, "eps": 1e-15},
+            {"params": self.field.layers, "lr": self._rate * NETWORK_RATE_FACTOR},
+        ]
+
+
+def _never_empty(occupied: Bool[Tensor, "cells"]) -> Bool[Tensor, "cells"]:
+    """All cells where a field has died, so that it can come back."""
+    return occupied if occupied.any() else torch.ones_like(occupied)

@@ -1,0 +1,98 @@
+"""python -m baselines.compare: a small comparison from the command line, and its table."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from baselines import compare
+from baselines.comparison_table import comparison_table, time_to_reach
+from studio.shoot import ShootConfig, film_capture
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A tiny sample, and what two methods make of it in a few steps."""
+    folder = tmp_path_factory.mktemp("compared")
+    film_capture(folder / "sample", ShootConfig(size=32, frames=11))
+    words = [str(folder / "sample"), "--steps", "6", "--out", str(folder / "out")]
+    assert compare.main([*words, "--methods", "anim-nerf", "ours"]) == 0
+    return folder, words
+
+
+def test_it_writes_scores_table_and_pictures(compared):
+    out = compared[0] / "out"
+    results = json.loads((out / "comparison.json").read_text())
+    assert [each["method"] for each in results] == ["anim-nerf", "ours"]
+    for each in results:
+        assert each["steps"] == 6
+        assert [point["steps"] for point in each["curve"]] == [1, 3, 6]
+        assert len(each["novel"]["frames"]) == 12
+        assert math.isfinite(each["held_out"]["psnr"])
+        pictures = {path.name for path in (out / each["method"] / "novel").glob("*.png")}
+        assert pictures == {f"{index:04d}.png" for index in range(12)}
+    assert (out / "pictures.png").stat().st_size > 0
+    assert "| ours |" in (out / "table.md").read_text()
+
+
+def test_what_is_done_is_not_trained_again(compared, monkeypatch):
+    def fail(*_):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(compare, "_train_method", fail)
+    assert compare.main([*compared[1], "--methods", "ours"]) == 0
+
+
+def test_other_conditions_are_refused(compared, capsys):
+    _, words = compared
+    words = [*words, "--methods", "ours", "--seed", "1"]
+    assert compare.main(words) == 2
+    assert "seed 0, now 1" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "does not exist"),
+        ([".", "--seconds", "0"], "must be positive"),
+        ([".", "--steps", "0"], "at least 1"),
+        ([".", "--out", "."], "holds files of others"),
+    ],
+)
+def test_bad_input_is_one_sentence(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.txt").write_text("kept")
+    assert compare.main(words) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert (tmp_path / "mine.txt").read_text() == "kept"
+
+
+def curve(*values):
+    return [{"core_seconds": 10.0 * 2**i, "novel": value} for i, value in enumerate(values)]
+
+
+@pytest.mark.parametrize(
+    ("values", "wanted", "text"),
+    [
+        ((20.0, 22.0, 24.0), 22.0, "20 s"),
+        ((20.0, 22.0, 24.0), 28.0, "3 min (extrapolated)"),
+        ((20.0, 22.0, 22.0), 28.0, "not reached, and the curve is flat"),
+        ((20.0, 22.0, 22.2), 34.0, "not reached"),
+    ],
+)
+def test_missing_time_is_extrapolated_by_the_last_doubling(values, wanted, text):
+    assert time_to_reach(curve(*values), "novel", wanted) == text
+
+
+def test_a_capture_without_novel_poses_has_a_table():
+    scores = {"psnr": 30.0, "psnr_mask": 22.0, "ssim": 0.98}
+    none = dict.fromkeys(scores)
+    result = {
+        "method": "ours", "core_seconds": 60.0, "steps": 100, "conditions": {"steps": None},
+        "held_out": scores, "novel": none,
+        "curve": [{"core_seconds": 60.0, "steps": 100, "held_out": np.nan, "novel": None}],
+    }  # fmt: skip
+    table = comparison_table([result])
+    assert "| ours | 60 | 100 | - | - | - | 30.00 | 22.00 | 0.9800 |" in table
+    assert "held-out frames, PSNR after" in table
