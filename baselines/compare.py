@@ -48,7 +48,7 @@ class CompareArguments:
     All systems get the same capture (poses and body fitted to its masks as by ia-ingest), the same
     frames, rays, backgrounds and decay of learning rates, and one thread. Time is that of the
     processor, so that other programs hardly count; scoring is not charged, and neither is compiling
-    kernels. Baselines are written anew from their papers in plain torch.
+    kernels. Baselines are our own implementations of their papers, in plain torch.
 
         anim-nerf     inverse skinning by the nearest vertices, a NeRF, poses optimized
         neural-body   a code for every vertex, diffused by a sparse 3-D network
@@ -266,7 +266,7 @@ def _score_all(
 
     from avatar.evaluation.held_out import score_rendering
     from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
-    from studio.capture_files import to_uint8, write_png
+    from studio.capture_files import write_png
 
     scores = []
     if folder is not None:
@@ -281,7 +281,7 @@ def _score_all(
                 (folder, composite_on_white(rendering)),
                 (folder / "truth", ground_truth_on_white(seen)),
             ):
-                pixels = to_uint8(np.clip(image, 0.0, 1.0))
+                pixels = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
                 write_png(place / name, np.ascontiguousarray(pixels[..., ::-1]))
     means = {
         key: float(np.mean([getattr(score, key) for score in scores])) if scores else None

@@ -22,7 +22,7 @@ VIEW_OCTAVES = 4
 PRESETS = {
     "paper": MethodSettings(frames=1, rays=1024, samples=64, alpha_weight=0.0, voxel_m=0.005),
     "small": MethodSettings(
-        frames=1, rays=256, samples=32, width=128, octaves=6, learning_rate=4e-3, voxel_m=0.02,
+        frames=1, rays=128, samples=24, width=96, octaves=6, learning_rate=4e-3, voxel_m=0.02,
         channels=8,
     ),
 }  # fmt: skip

@@ -10,7 +10,7 @@ from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 from baselines.systems.posed_person import OccupiedCells, PosedBodies
 
 PROBES_PER_RAY = 64
-"""Points at which a ray is asked for occupied cells, between the sides of a body's box."""
+"""Points at which a ray looks for occupied cells, between the sides of a body's box."""
 
 
 class BodyRays(NamedTuple):
@@ -29,7 +29,7 @@ class BodyRays(NamedTuple):
 
 @runtime_checkable
 class PosedRadiance(Protocol):
-    """A method: what warps posed points, and the field that is asked there."""
+    """A method: what warps posed points, and the field behind it."""
 
     def pose(self, bodies: PosedBodies) -> OccupiedCells:
         """Prepares the bodies that the next points belong to; where there may be density."""

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.real import RealJob, ingest_command, table_lines
 from baselines.systems.compared_capture import place_in_true_view
+from benchmarks.real import RealJob, ingest_command, table_lines
 from benchmarks.real_scores import pose_error_deg, rest_joint_distance_cm
 from capture.camera import Camera
 from capture.frame import Frame
