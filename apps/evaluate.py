@@ -60,6 +60,11 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
         )
     if arguments.markdown is not None:
         write_text_atomically(arguments.markdown, table, replace=arguments.overwrite)
+    if arguments.card is not None:
+        from apps.evaluation.evaluation_card import write_card
+
+        write_card(arguments.card, found, session.lpips)
+        console.print_artifact("card", arguments.card / "card.html")
     return INTERRUPTED if stop.is_set() else DONE
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.cli.capture_options import parse_frame_range
-from apps.cli.output_paths import check_output_file
+from apps.cli.output_paths import check_output_file, check_output_folder
 from capture.input_error import InputError
 from preprocess.capture_session import CaptureInputs
 
@@ -22,6 +22,7 @@ class EvaluateArguments:
         ia-evaluate run other/run --json table.json  several, with their mean
         ia-evaluate run --on another/capture         the same person in another video
         ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
+        ia-evaluate run --card card                  a page with conditions, tables and pictures
         ia-evaluate --pictures theirs --on capture   what another system rendered of its frames
         ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
 
@@ -88,6 +89,10 @@ class EvaluateArguments:
     """Write the scores of every frame to this file."""
     markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the table to this file as well."""
+    card: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Write an evaluation card into this folder: card.html, card.md, card.csv and card.json."""
+    dance: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="")] = ()
+    """Motions that the card shows the packages in, 6 s of each at most."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the files that --json and --markdown name, if they exist."""
 
@@ -118,6 +123,13 @@ class EvaluateArguments:
         for flag, place in (("--json", self.json), ("--markdown", self.markdown)):
             if place is not None:
                 check_output_file(place, flag, self._inputs(), overwrite=self.overwrite)
+        if self.card is not None:
+            check_output_folder(self.card, "--card", self._inputs())
+        elif self.dance:
+            raise InputError("--dance needs a card to be shown on: pass --card DIR.")
+        for path in self.dance:
+            if not path.exists():
+                raise InputError(f"--dance {path} does not exist; expected a file of poses.")
         for path in self.targets:
             if not path.exists():
                 raise InputError(

@@ -1,22 +1,25 @@
 """What all evaluations of one command share: arguments, console, metrics, and the stop signal."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from apps.animation.driving_motion import load_driving_motion
 from apps.cli.console import Console
 from apps.cli.device import resolve_device
 from apps.evaluation.avatar_scorer import PICTURES, AvatarScorer, load_players, score_avatar
 from apps.evaluation.evaluate_arguments import EvaluateArguments
-from apps.evaluation.evaluation_frames import EvaluationFrames, capture_frames
+from apps.evaluation.evaluation_frames import EvaluationFrames, capture_frames, read_report
 from apps.evaluation.frame_scoring import FrameJudge, FrameRenderer
 from apps.evaluation.picture_folder import PictureFolder
 from apps.evaluation.score_table import AvatarEvaluation
+from apps.run.report_writer import motion_animation
 from apps.run.run_folder import RunFolder
 from avatar.evaluation.perceptual import Lpips
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
+from export.player import Player
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,7 +51,8 @@ class EvaluationSession:
     def evaluate_package(self, package: Path, frames: EvaluationFrames) -> AvatarEvaluation:
         """Score the player alone."""
         players = load_players(package, frames, self.console)
-        return self._evaluate(str(package), frames, None, players)
+        scored = self._evaluate(str(package), frames, None, players)
+        return replace(scored, dances=self._dances(package))
 
     def evaluate_run(
         self,
@@ -60,7 +64,9 @@ class EvaluationSession:
         """Score renderer and player of a run, by default on white."""
         package = run.package if self.arguments.player and run.package.is_file() else None
         players = load_players(package, frames, self.console)
-        return self._evaluate(name, frames, self._load_trainer(run), players, backgrounds)
+        scored = self._evaluate(name, frames, self._load_trainer(run), players, backgrounds)
+        report = read_report(run) if run.report_json.is_file() else None
+        return replace(scored, report=report, dances=self._dances(run.package))
 
     def evaluate_pictures(self, folder: Path) -> AvatarEvaluation:
         """Score pictures that another system rendered of the frames of --on.
@@ -99,8 +105,25 @@ class EvaluationSession:
         backgrounds: tuple[str, ...] = ("white",),
     ) -> AvatarEvaluation:
         judge = FrameJudge(self._backgrounds(backgrounds), self.lpips, frames.recording.shaped)
-        scorer = AvatarScorer(trainer, renderers, judge, fit_poses=self.arguments.fitted)
+        scorer = AvatarScorer(
+            trainer,
+            renderers,
+            judge,
+            fit_poses=self.arguments.fitted,
+            keeps_images=self.arguments.card is not None,
+        )
         return score_avatar(name, frames, scorer, self.console, self.stop)
+
+    def _dances(self, package: Path) -> dict[str, str]:
+        """Draw the motions of --dance; nothing without a package."""
+        if not package.is_file() or not self.arguments.dance or self.stop.is_set():
+            return {}
+        player, drawn = Player.load(package), dict[str, str]()
+        for path in self.arguments.dance:
+            with self.console.status(f"drawing {path}"):
+                motion = load_driving_motion(path, player.manifest.rest_joints, self.console)
+                drawn[path.stem] = motion_animation(player, motion)
+        return drawn
 
     def _backgrounds(self, usual: tuple[str, ...]) -> tuple[str, ...]:
         return self.arguments.background or usual

@@ -119,8 +119,8 @@ def evaluations_to_csv(evaluations: Iterable[AvatarEvaluation]) -> str:
     return text.getvalue()
 
 
-TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks")
-"""Columns of the table that are left-aligned."""
+TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks", "clock", "region")
+"""Columns of tables that are left-aligned."""
 FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f"}
 """Format of each metric in the table, but those of LPIPS and time."""
 HEADINGS = {"psnr": "PSNR", "psnr_box": "in the box", "psnr_mask": "in the mask", "ssim": "SSIM"}

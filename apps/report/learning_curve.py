@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 
 @dataclass(frozen=True, kw_only=True)
 class CurvePoint:
@@ -60,6 +62,27 @@ def largest_drops(curve: Sequence[CurvePoint]) -> dict[tuple[int, int], float]:
 def largest_drop(curve: Sequence[CurvePoint]) -> float | None:
     """Return the largest of `largest_drops`, dB; None if no frame was scored twice."""
     return max(largest_drops(curve).values(), default=None)
+
+
+def psnr_at(curve: Sequence[CurvePoint], seconds: float, *, clock: str, score: str) -> float | None:
+    """Interpolate a score at a training time, dB; None before the first and after the last point.
+
+    Args:
+        curve: The curve; of several videos the last one counts.
+        seconds: Training time.
+        clock: "wall_seconds" or "cpu_seconds".
+        score: "psnr" or "psnr_mask".
+    """
+    last = max((point.video for point in curve), default=1)
+    scored = [
+        (getattr(point, clock), value)
+        for point in curve
+        if point.video == last and (value := getattr(point, score)) is not None
+    ]
+    if not scored or not scored[0][0] <= seconds <= scored[-1][0]:
+        return None
+    times, values = zip(*scored, strict=True)
+    return float(np.interp(seconds, times, values))
 
 
 SVG_WIDTH, SVG_HEIGHT = 720, 320

@@ -3,9 +3,9 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
-from importlib.resources import files
 from typing import Any
 
+from apps.report.html_page import html_page, html_section
 from apps.report.learning_curve import CurvePoint, curve_svg, largest_drops
 from apps.report.report_schema import Report, format_percent, format_psnr
 
@@ -57,32 +57,26 @@ def report_page(
     playing = (
         "" if play_command is None else f" Play the avatar: <code>{escape(play_command)}</code>"
     )
-    style = (files("apps") / "report" / "page.css").read_text(encoding="utf-8")
     body = "\n".join(
         [
             f"<h1>{escape(name)}</h1>",
             f'<p class="lead">{escape(_summary(report))}</p>',
             f'<p class="failure">{escape(failure)}</p>' if failure else "",
             _tiles(report),
-            _section("Learning curve", _curve(report)),
-            _section("Earlier videos", _earlier_videos(report)),
-            _section("Body coverage", _coverage(report, body_map)),
-            _section("Cameras", _cameras(report, present_files)),
-            _section("Tracking", _tracking(report)),
-            _section("Held-out frames", _pairs(pairs)),
-            _section("Novel poses", _animation(animation)),
-            _section("Warnings", _warnings(report, warnings)),
-            _section("All values", _all_values(report)),
+            html_section("Learning curve", _curve(report)),
+            html_section("Earlier videos", _earlier_videos(report)),
+            html_section("Body coverage", _coverage(report, body_map)),
+            html_section("Cameras", _cameras(report, present_files)),
+            html_section("Tracking", _tracking(report)),
+            html_section("Held-out frames", _pairs(pairs)),
+            html_section("Novel poses", _animation(animation)),
+            html_section("Warnings", _warnings(report, warnings)),
+            html_section("All values", _all_values(report)),
             "<footer>Written by ia-ingest of instant-avatar-stream. Machine-readable: report.json."
             f"{playing}</footer>",
         ]
     )
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(name)}: avatar</title>\n<style>\n{style}</style>\n</head>\n"
-        f"<body>\n{body}\n</body>\n</html>\n"
-    )
+    return html_page(f"{name}: avatar", body)
 
 
 def _summary(report: Report) -> str:
@@ -143,10 +137,6 @@ def _with_verdict(label: str, verdict: str | None) -> str:
 
 def _format_value(value: float | None, unit: str, *, digits: int = 2) -> str:
     return "n/a" if value is None else f"{value:.{digits}f} {unit}".strip()
-
-
-def _section(heading: str, content: str) -> str:
-    return f"<h2>{heading}</h2>\n{content}" if content else ""
 
 
 def _curve(report: Report) -> str:

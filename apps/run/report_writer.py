@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from apps.animation.driving_motion import demo_motion
+from apps.animation.driving_motion import ResampledMotion, demo_motion
 from apps.animation.following_camera import FollowingCamera
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit
@@ -31,6 +31,7 @@ from capture.atomic_files import write_text_atomically
 from capture.live.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
+from preprocess.body.body_pose import Motion
 from preprocess.capture_session import Capture
 
 MIN_STEPS_TO_JUDGE = 60
@@ -83,6 +84,8 @@ ANIMATION_PX = 320
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""
+ANIMATION_FRAMES = 96
+"""Largest number of images of an animation."""
 
 
 def write_report(
@@ -195,9 +198,14 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
 
 def demo_animation(player: Player) -> str:
     """The avatar in a motion of our own, drawn by the player, as a moving picture."""
-    motion = demo_motion(fps=ANIMATION_FPS)
+    return motion_animation(player, demo_motion(fps=ANIMATION_FPS))
+
+
+def motion_animation(player: Player, motion: Motion) -> str:
+    """Draw the first seconds of a motion by the player, as a moving picture."""
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
-    poses = [motion[row] for row in range(len(motion))]
+    frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
+    poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
     return animated_webp_data_uri(
         [player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS
     )

@@ -124,7 +124,8 @@ class Lpips:
                 )
                 break
             checksum = hashlib.sha256(files[0].read_bytes()).hexdigest()[:8]
-            self.versions[f"LPIPS {network}"] = f"{files[0].name}, SHA-256 {checksum}…"
+            known = "" if checksum in files[0].name else ", which is not torchvision's file"
+            self.versions[f"LPIPS {network}"] = f"{files[0].name}, SHA-256 {checksum}…{known}"
         if self._networks:
             self.versions = {"LPIPS": f"torchmetrics {version('torchmetrics')}"} | self.versions
         if lacking and self.unavailable is None:
