@@ -27,8 +27,13 @@ LOCKED_ERRNOS = frozenset({errno.EWOULDBLOCK, errno.EACCES})
 
 
 @contextmanager
-def claim_folder(folder: Path, console: Console) -> Iterator[None]:
+def claim_folder(folder: Path, console: Console, *, shared: bool = False) -> Iterator[None]:
     """Create and lock a folder during a block; remove the folders it made if they stayed empty.
+
+    Args:
+        folder: The folder.
+        console: Shows warnings.
+        shared: As of `lock_folder`.
 
     Raises:
         CommandExit, InputError: As `lock_folder`.
@@ -36,7 +41,7 @@ def claim_folder(folder: Path, console: Console) -> Iterator[None]:
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with lock_folder(folder, console):
+        with lock_folder(folder, console, shared=shared):
             yield
     finally:
         for each in made:
@@ -45,7 +50,7 @@ def claim_folder(folder: Path, console: Console) -> Iterator[None]:
 
 
 @contextmanager
-def lock_folder(folder: Path, console: Console) -> Iterator[None]:
+def lock_folder(folder: Path, console: Console, *, shared: bool = False) -> Iterator[None]:
     """Lock a folder for this process; remove the lock file at the end.
 
     After `kill -9` the file remains, but not the lock. File systems without locks cause a warning.
@@ -53,22 +58,24 @@ def lock_folder(folder: Path, console: Console) -> Iterator[None]:
     Args:
         folder: An existing folder.
         console: Shows warnings.
+        shared: Whether others may share the lock; its file is then left for them.
 
     Raises:
         CommandExit: If another process holds the lock.
         InputError: If a foreign file has the lock's name.
     """
     path = folder / LOCK_FILE_NAME
-    descriptor = _acquire(path, console)
+    descriptor = _acquire(path, console, shared=shared)
     try:
         yield
     finally:
         if descriptor is not None:
-            path.unlink(missing_ok=True)
+            if not shared:
+                path.unlink(missing_ok=True)
             os.close(descriptor)
 
 
-def _acquire(path: Path, console: Console) -> int | None:
+def _acquire(path: Path, console: Console, *, shared: bool) -> int | None:
     """Return the locked file's descriptor; None where files cannot be locked."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -79,7 +86,7 @@ def _acquire(path: Path, console: Console) -> int | None:
                     f"{path} is not a lock of this program. Move it, or choose another folder "
                     "(--out)."
                 )
-            if not _try_lock(descriptor, path.parent, label, console):
+            if not _try_lock(descriptor, path.parent, label, console, shared=shared):
                 path.unlink(missing_ok=True)
                 os.close(descriptor)
                 return None
@@ -97,12 +104,12 @@ def _acquire(path: Path, console: Console) -> int | None:
     return descriptor
 
 
-def _try_lock(descriptor: int, folder: Path, label: str, console: Console) -> bool:
+def _try_lock(descriptor: int, folder: Path, label: str, console: Console, *, shared: bool) -> bool:
     """Lock a file; return False where the file system has no locks."""
     try:
         if fcntl is None:
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         return True
     except OSError as error:
         if error.errno in LOCKED_ERRNOS:

@@ -1,0 +1,158 @@
+"""Files behind URLs (s3://, gs://, http://, …), through fsspec; credentials are the environment's.
+
+Local folders are listed in the same form, so that captures are found in both alike.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from capture.input_error import InputError
+
+URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
+"""Start of a URL."""
+VERSION_KEYS = ("ETag", "etag", "md5Hash", "LastModified", "updated", "mtime", "created")
+"""What tells that a remote file has changed, best first."""
+
+
+class ListedFile(NamedTuple):
+    """A file of a listing: its size in bytes, and what changes when its content does."""
+
+    size: int
+    version: str
+
+
+def is_url(path: object) -> bool:
+    """Whether a path is a URL."""
+    return URL.match(str(path)) is not None
+
+
+def list_files(place: str) -> dict[str, ListedFile]:
+    """List a file, or all files below a folder, by path or URL; hidden ones are left out.
+
+    Args:
+        place: Path or URL. Nothing is found if it does not exist.
+
+    Raises:
+        InputError: If the URL cannot be listed.
+    """
+    return _list_remote(place) if is_url(place) else dict(_list_local(Path(place)))
+
+
+def _list_local(place: Path) -> Iterator[tuple[str, ListedFile]]:
+    if place.is_file():
+        state = place.stat()
+        yield place.as_posix(), ListedFile(state.st_size, str(state.st_mtime_ns))
+        return
+    for folder, folders, names in os.walk(place, followlinks=True):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            path = Path(folder, name)
+            if not name.startswith(".") and path.is_file():
+                state = path.stat()
+                yield path.as_posix(), ListedFile(state.st_size, str(state.st_mtime_ns))
+
+
+def _list_remote(url: str) -> dict[str, ListedFile]:
+    with _explained(url, "list"):
+        system, path = open_remote(url)
+        found = system.find(path, detail=True)
+    files = {}
+    for name, entry in sorted(found.items()):
+        if "/." not in name and entry.get("size") is not None:
+            version = next((str(entry[key]) for key in VERSION_KEYS if entry.get(key)), "")
+            files[system.unstrip_protocol(name)] = ListedFile(int(entry["size"]), version)
+    return files
+
+
+def open_remote(url: str) -> tuple[Any, str]:
+    """Return the file system of a URL, and the path in it.
+
+    Raises:
+        InputError: If a package is missing, or the kind of URL is unknown.
+    """
+    try:
+        from fsspec.core import url_to_fs
+
+        return url_to_fs(url, use_listings_cache=False)
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{url} cannot be read: {error}. Most are covered by: pip install "
+            "'instant-avatar-stream[cluster]' (gs:// needs gcsfs)."
+        ) from error
+
+
+def read_text(place: str) -> str:
+    """Read a text file by path or URL.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:
+        if not is_url(place):
+            return Path(place).read_text(encoding="utf-8-sig")
+        with _explained(place, "read"):
+            system, path = open_remote(place)
+            return system.cat_file(path).decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{place} cannot be read: {error}.") from error
+
+
+def fetch_inputs(
+    sources: tuple[tuple[str, int], ...], video: str, options: Mapping[str, Any], folder: Path
+) -> tuple[str, dict[str, Any]]:
+    """Fetch the files of a capture into a folder; return its local video and options.
+
+    Args:
+        sources: URL and size of each file; all lie at or below the URLs in `video` and `options`.
+        video: Path or URL.
+        options: Of ia-ingest; values may be URLs.
+        folder: Where to write.
+
+    Raises:
+        OSError: If a file cannot be fetched, or has another size than listed.
+    """
+    local = {}
+    for root in filter(is_url, [video, *map(str, options.values())]):
+        local[root] = folder / str(len(local)) / root.rstrip("/").rsplit("/", 1)[1]
+    for url, size in sources:
+        root = next(root for root in local if (url + "/").startswith(root.rstrip("/") + "/"))
+        path = local[root].joinpath(*url[len(root.rstrip("/")) :].strip("/").split("/"))
+        path = Path(str(path).rstrip("/"))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _explained(url, "fetch"):
+            system, name = open_remote(url)
+            system.get_file(name, str(path))
+        if path.stat().st_size != size:
+            raise OSError(f"{url} has {path.stat().st_size} bytes; {size} were listed.")
+    moved = {name: str(local.get(str(value), value)) for name, value in options.items()}
+    kept = {name: value for name, value in options.items() if moved[name] == str(value)}
+    return str(local.get(video, video)), {**moved, **kept}
+
+
+def send_files(url: str, files: Mapping[str, bytes], *, last: str = "") -> None:
+    """Write files below a URL; each appears whole, and `last` after all others.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    with _explained(url, "write to"):
+        system, base = open_remote(url)
+        for name in sorted(files, key=lambda name: name == last):
+            path = f"{base.rstrip('/')}/{name}"
+            system.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+            system.pipe_file(path, files[name])
+
+
+@contextmanager
+def _explained(url: str, verb: str) -> Iterator[None]:
+    """Turn whatever a remote file system raises into an OSError that names the URL."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # each file system has errors of its own
+        raise OSError(f"cannot {verb} {url}: {type(error).__name__}: {error}") from error
