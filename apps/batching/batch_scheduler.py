@@ -15,10 +15,10 @@ from apps.batching.live_table import CaptureState, LiveTable
 from apps.batching.local_executor import AttemptExecutor
 
 FIRST_NEED_MB = 2000.0
-"""Memory that is asked for until a capture has been measured, MB: 540 px and 300 frames take 1,650
+"""Memory to ask for until a capture has been measured, MB: 540 px and 300 frames take 1,650
 (docs/benchmarks.md)."""
 NEED_MARGIN = 1.15
-"""Factor from the most memory measured to what is asked for."""
+"""Factor from the most memory measured to what captures ask for."""
 POLL_S = 0.5
 """Interval at which the table is drawn, seconds."""
 

@@ -61,9 +61,9 @@ class IngestJob:
         video: Path or URL of the capture.
         options: Options of ia-ingest by field name.
         sources: Files to fetch first: URL, then size in bytes; empty for local captures.
-        cores: Cores that are asked for, and the threads of numerical libraries.
-        gpus: GPUs that are asked for.
-        memory_mb: Memory that is asked for, MB.
+        cores: Cores to ask for, and the threads of numerical libraries.
+        gpus: GPUs to ask for.
+        memory_mb: Memory to ask for, MB.
         limit_mb: Memory that may be taken, MB; None for half of the machine's.
         limit_s: Time that an attempt may take, seconds; None for any.
         scratch: Folder on the node's own disk.

@@ -43,7 +43,7 @@ def start(captures: Path, out: Path, *words: str) -> subprocess.Popen:
         (["films", "--out", "o", "--", "--steps", "0"], "--steps is 0"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_anything_starts(
+def test_what_cannot_be_done_is_refused_before_anything_starts(
     tmp_path, monkeypatch, capsys, words, message
 ):
     (tmp_path / "films").mkdir()

@@ -139,7 +139,7 @@ def test_nothing_is_started_once_stopped(learn, named):
     assert (states, executor.started) == ({"a": "waiting"}, [])
 
 
-def test_memory_is_asked_for_as_measured(learn, named):
+def test_captures_ask_for_memory_as_measured(learn, named):
     _, _, first = learn([named("a"), named("b")], ScriptedExecutor(room=1))
     assert [job.memory_mb for job in first.started] == [FIRST_NEED_MB, pytest.approx(1150.0)]
     _, _, second = learn([named("c")])
