@@ -1,5 +1,6 @@
 """A video file as frames: upright, with the container's timestamps, and honest about damage."""
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,9 @@ VIDEO_SUFFIXES = frozenset(
 
 CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
+
+MAX_PIXEL_STRETCH = 0.02
+"""Relative difference of a pixel's width and height from which it is worth a word."""
 
 
 class VideoFile:
@@ -67,6 +71,7 @@ class VideoFile:
                 f"for, which start at {selection.start}."
             )
         self._warn_of_hdr()
+        self._warn_of_wide_pixels()
 
     def frames(self) -> Iterator[Frame]:
         """The wanted frames in order; every call starts from the first."""
@@ -132,6 +137,17 @@ class VideoFile:
             f"{self.path.name} is {kind}: it is decoded slowly, and highlights are cut off. Film "
             "with HDR off, or install PyAV: pip install 'instant-avatar-stream[video]'."
         )
+
+    def _warn_of_wide_pixels(self) -> None:
+        """Images are taken as they are stored; players stretch them."""
+        aspect = self._decoder.pixel_aspect
+        if abs(aspect - 1.0) > MAX_PIXEL_STRETCH:
+            kind = "narrow" if aspect > 1.0 else "broad"
+            self._warn(
+                f"{self.path.name} has pixels that are not square ({aspect:.2f}:1): the person is "
+                f"too {kind} in them, and so is the avatar. Convert the video first: ffmpeg -i "
+                f"{shlex.quote(self.path.name)} -vf scale=iw*sar:ih,setsar=1 square.mp4"
+            )
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:

@@ -49,6 +49,7 @@ class VideoDecoder(Protocol):
         supports_hdr: Whether HDR's highlights are kept.
         has_unread_alpha: Whether its images have an alpha channel (known not to be opaque, by
             PyAV); it is not read.
+        pixel_aspect: Width of a pixel by its height, as the container claims; 1 if it does not.
     """
 
     fps: float
@@ -57,6 +58,7 @@ class VideoDecoder(Protocol):
     is_high_bit_depth: bool
     supports_hdr: bool
     has_unread_alpha: bool
+    pixel_aspect: float
 
     def decode(self) -> Iterator[DecoderFrame]:
         """The pictures in order; every call starts from the first."""
@@ -97,6 +99,7 @@ class PyAvDecoder:
                 self.fps = float(stream.average_rate or 0.0)
                 lasts_s = (container.duration or 0) / import_pyav().time_base
                 self.claimed_frames = int(stream.frames) or round(lasts_s * self.fps)
+                self.pixel_aspect = float(stream.sample_aspect_ratio or 1.0)
                 self.is_high_bit_depth = stream.codec_context.pix_fmt in HIGH_BIT_DEPTH_FORMATS
                 first = next(self._frames(container, stream), None)
                 self.has_unread_alpha = first is not None and _has_transparency(first[0])
@@ -206,6 +209,8 @@ class OpenCvDecoder:
             b"Y3", "little"
         ) and kind >> 24 in (10, 12)
         self.has_unread_alpha = has_alpha_plane(kind)
+        wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+        self.pixel_aspect = wide / high if wide > 0.0 and high > 0.0 else 1.0
         capture.release()
 
     def decode(self) -> Iterator[DecoderFrame]:

@@ -2,11 +2,13 @@
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from apps.cli.console import Console
 from capture.atomic_files import atomic_file, atomic_folder
@@ -18,6 +20,7 @@ from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import sample_masks
 from preprocess.body.body_file import load_body_model
+from preprocess.body.body_pose import Motion
 from preprocess.body.silhouette import SkinPoints
 from preprocess.cameras.assumed_camera import assume_camera
 from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
@@ -135,12 +138,15 @@ def track_person(
         console.info(f"Using the masks in {given}, which lie beside the video.")
     with atomic_folder(folder) if own_masks else nullcontext() as part:
         tracked = _run_networks(source, inputs, part, console, stop)
+        for warning in source.warnings:
+            console.warning(warning)
         if tracked.interrupted:  # the frames after it have no masks
             inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
             source = open_source(inputs.video, frames=inputs.frames)
         with console.status("fitting body and poses to key points and masks"):
             capture = fit_tracked_video(source, tracked, inputs, part)
             grade = _grade(capture, tracked.frame_times_s)
+            capture = replace(capture, motion=_without(capture.motion, grade.left_out))
         with atomic_file(poses) as unfinished:
             write_motion(unfinished, capture.motion)
     inputs = replace(inputs, poses=poses, person=None)
@@ -229,6 +235,13 @@ def fit_tracked_video(
         cameras=fit.scale_focal_lengths(capture.cameras),
         shaped=fit.shape(capture.shaped),
     )
+
+
+def _without(motion: Motion, frames: Sequence[int]) -> Motion:
+    """The motion with the poses of some frames marked as not valid."""
+    if motion.frames is None:
+        return motion
+    return replace(motion, valid=motion.valid & ~np.isin(motion.frames, list(frames)))
 
 
 def person_number(person: str | None) -> int | None:

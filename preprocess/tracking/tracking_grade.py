@@ -15,7 +15,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.tracking_problems import PROBLEM_BITS
+from preprocess.tracking.tracking_problems import PROBLEM_BITS, TrackingProblem
 
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
@@ -43,6 +43,15 @@ FEW_DIRECTIONS = 0.5
 """Share of the directions below which the verdict says that the avatar will be one-sided."""
 DIRECTIONS = 12
 """Directions, 30 degrees each, from which the camera may see the person."""
+BREADTHS = (0.78, 1.17)
+"""Least and largest breadth of shoulders and hips to the height, relative to the mean body's: in 40
+films 0.82 to 1.10, in films stretched by a third 1.3."""
+JUMP_HEIGHTS = 0.1
+"""Way of the hips from one frame to the next that may be a cut of the film, body heights."""
+JUMP_STEPS = 8.0
+"""The same, in medians of that way."""
+JUMPED = "the person jumps to another place; was the film cut here?"
+"""Reason of the frames before and after a cut."""
 LIMBS = {
     "left arm": (13, 15), "right arm": (14, 16), "left leg": (25, 27), "right leg": (26, 28),
 }  # fmt: skip
@@ -84,6 +93,8 @@ class TrackingGrade:
         jitter_mm: Median second difference of joints relative to the root, mm per frame squared.
         person_px: Median height of the person in the frames, px.
         directions_seen: Share of the horizontal directions from which the person was seen.
+        breadth: Breadth of shoulders and hips to the height, relative to the mean body's.
+        left_out: Numbers of the frames that had better not be learnt from.
         stretches: Doubtful stretches, in order.
         doubts: Why frames are doubtful, by their numbers.
     """
@@ -96,6 +107,8 @@ class TrackingGrade:
     jitter_mm: float
     person_px: float
     directions_seen: float
+    breadth: float
+    left_out: tuple[int, ...]
     stretches: tuple[DoubtfulStretch, ...]
     doubts: Mapping[int, str]
 
@@ -117,6 +130,12 @@ class TrackingGrade:
         if self.person_px < MIN_PERSON_PX:
             found.append(
                 f"the person is only {self.person_px:.0f} px tall (expected {MIN_PERSON_PX:.0f})"
+            )
+        if not BREADTHS[0] <= self.breadth <= BREADTHS[1]:
+            which = "broad" if self.breadth > 1.0 else "narrow"
+            found.append(
+                f"the body is too {which}, {self.breadth:.2f} times the usual (the pictures may be "
+                "stretched: convert the video to its right width and height)"
             )
         return tuple(found)
 
@@ -143,6 +162,11 @@ class TrackingGrade:
         told = f"Good enough for an avatar: yes, because the person was {scores}."
         if self.directions_seen < FEW_DIRECTIONS:
             told += " The sides that the camera never saw will be guesses: let the person turn."
+        if self.left_out:
+            told += (
+                f" {len(self.left_out)} frames in which another person is near, or body and mask "
+                "disagree, are left out."
+            )
         return told
 
     def as_json(self) -> dict[str, Any]:
@@ -198,6 +222,8 @@ def grade_tracking(
         jitter_mm=_jitter_mm(motion, shaped),
         person_px=float(np.median(heights)) if len(heights) else 0.0,
         directions_seen=_directions_seen(motion, camera),
+        breadth=_breadth(shaped) / _breadth(shaped.body.with_shape()),
+        left_out=_frames_to_leave_out(keypoints, iou_of_frame),
         stretches=tuple(_stretches(numbers.tolist(), frame_times_s, reasons)),
         doubts={number: "; ".join(words) for number, words in reasons.items()},
     )
@@ -225,12 +251,45 @@ def _reasons_by_frame(
     for problem, bit in PROBLEM_BITS.items():
         if keypoints.problems is not None:
             note((keypoints.problems & bit) > 0, problem.value)
+    note(_jumps(keypoints), JUMPED)
     for name, points in LIMBS.items():
         hidden = keypoints.visibility[:, list(points)].mean(axis=1) < MIN_VISIBILITY
         note(hidden, f"the {name} is hidden, its pose is a guess")
     for name, point in ENDS.items() if len(keypoints) >= MIN_SPEED_FRAMES else ():
         note(_speed(keypoints, point, frame_times_s) > FAST_HEIGHTS_PER_S, f"the {name} is fast")
     return reasons
+
+
+def _frames_to_leave_out(
+    keypoints: KeypointTrack, iou_of_frame: Mapping[int, float]
+) -> tuple[int, ...]:
+    """Frames in which another person is near, or body and mask disagree; none if most are such."""
+    numbers = keypoints.frames
+    found = np.array([iou_of_frame.get(int(each), 1.0) < DOUBTFUL_IOU for each in numbers], bool)
+    if keypoints.problems is not None:
+        found |= (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
+    return tuple(numbers[found].tolist()) if found.sum() <= 0.5 * len(found) else ()
+
+
+def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+    """Rows on both sides of a cut in which the person goes on in another place."""
+    jumps = np.zeros(len(keypoints), dtype=bool)
+    if len(keypoints) < MIN_SPEED_FRAMES:
+        return jumps
+    hips = keypoints.image_px[:, [23, 24]].mean(axis=1)
+    tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
+    way = np.linalg.norm(np.diff(hips, axis=0), axis=1) / tall / np.diff(keypoints.frames)
+    cut = way > max(JUMP_HEIGHTS, JUMP_STEPS * float(np.median(way)))
+    jumps[1:] |= cut
+    jumps[:-1] |= cut
+    return jumps
+
+
+def _breadth(shaped: ShapedBody) -> float:
+    """Geometric mean of the breadths of shoulders and hips, by the height of the joints."""
+    joints = shaped.joints
+    shoulders, hips = (np.linalg.norm(joints[a] - joints[b]) for a, b in ((16, 17), (1, 2)))
+    return float(np.sqrt(shoulders * hips) / np.ptp(joints[:, 1]))
 
 
 def _speed(
@@ -292,6 +351,8 @@ def _stretches(
                 reason=reason,
             )
             for group in groups
-            if len(group) >= MIN_STRETCH_FRAMES or len(numbers) < 4 * MIN_STRETCH_FRAMES
+            if len(group) >= MIN_STRETCH_FRAMES
+            or len(numbers) < 4 * MIN_STRETCH_FRAMES
+            or reason == JUMPED
         ]
     return iter(sorted(found, key=lambda each: (each.start_s, each.reason)))

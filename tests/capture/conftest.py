@@ -100,3 +100,21 @@ def with_durations() -> Callable[[bytes, list[int]], bytes]:
         return bytes(out)
 
     return change
+
+
+@pytest.fixture
+def with_pixel_aspect() -> Callable[[bytes, int, int], bytes]:
+    """Writes the shape of a pixel into an mp4 whose index comes last."""
+
+    def change(data: bytes, wide: int, high: int) -> bytes:
+        box = b"".join(n.to_bytes(4, "big") for n in (16, int.from_bytes(b"pasp"), wide, high))
+        out = bytearray(data)
+        entry = out.find(b"stsd") + 12
+        end = entry + int.from_bytes(out[entry : entry + 4], "big")
+        kinds = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd")
+        for place in (entry, *(out.find(kind) - 4 for kind in kinds)):
+            size = int.from_bytes(out[place : place + 4], "big") + len(box)
+            out[place : place + 4] = size.to_bytes(4, "big")
+        return bytes(out[:end]) + box + bytes(out[end:])
+
+    return change

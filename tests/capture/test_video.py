@@ -165,6 +165,16 @@ def test_a_turned_video_says_by_how_much(write_video, turned_clockwise):
     assert open_source(path).quarter_turns == 3
 
 
+def test_pixels_that_are_not_square_are_named_with_a_cure(write_video, with_pixel_aspect):
+    path = write_video(frames=2)
+    assert not open_source(path).warnings
+    path.write_bytes(with_pixel_aspect(path.read_bytes(), 4, 3))
+    (told,) = open_source(path).warnings
+    assert "not square" in told
+    assert "too narrow" in told
+    assert "ffmpeg -i video.mp4 -vf scale=iw*sar:ih,setsar=1" in told
+
+
 @pytest.mark.parametrize(
     ("tag", "expected"),
     [(b"Y4\x00\x0c", True), (b"Y4\x0b\x08", True), (b"ARGB", True), (b"RGBA", True),

@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -172,3 +173,14 @@ def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
     assert len(read_motion(tmp_path / "out" / "poses.npz")) == 9
     assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
     assert open_capture(found.inputs).source.frame_count == 9
+
+
+def test_frames_that_had_better_not_be_learnt_from_have_no_valid_pose(video, tmp_path, monkeypatch):
+    graded = person_tracking._grade
+    monkeypatch.setattr(
+        person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3, 4))
+    )
+    words = ["--out", str(tmp_path / "poses.npz"), "--frames", ":8", "--no-film"]
+    assert track.main([str(video), *words]) in (0, 1)
+    found = read_motion(tmp_path / "poses.npz")
+    assert found.frames[~found.valid].tolist() == [3, 4]

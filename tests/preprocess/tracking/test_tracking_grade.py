@@ -107,6 +107,35 @@ def test_disagreeing_masks_are_an_objection(shaped):
     assert found.stretches[0].reason == "body and mask disagree"
 
 
+def test_a_stretched_film_is_an_objection(shaped):
+    joints = shaped.joints * np.array([4 / 3, 1.0, 1.0])
+    found = grade(replace(shaped, joints=joints))
+    assert "too broad, 1.33 times the usual" in found.objections[0]
+    assert "stretched" in found.describe()
+    assert "too narrow" in grade(replace(shaped, joints=shaped.joints * [0.7, 1, 1])).describe()
+
+
+def test_a_cut_film_is_named_where_it_is_cut(shaped):
+    keypoints = some_keypoints()
+    image = keypoints.image_px + np.linspace(0.0, 30.0, FRAMES)[:, None, None] * [1.0, 0.0]
+    assert grade(shaped, keypoints=replace(keypoints, image_px=image)).stretches == ()
+    image[31:, :, 0] += 90.0
+    (cut,) = grade(shaped, keypoints=replace(keypoints, image_px=image)).stretches
+    assert "was the film cut here" in cut.reason
+    assert (cut.start_s, cut.end_s) == (1.0, round(31 / FPS, 2))
+
+
+def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shaped):
+    problems = np.zeros(FRAMES, dtype=np.int64)
+    problems[10:20] = PROBLEM_BITS[TrackingProblem.CROWDED]
+    keypoints = replace(some_keypoints(), problems=problems)
+    found = grade(shaped, keypoints=keypoints)
+    assert found.left_out == tuple(range(10, 20))
+    assert "10 frames in which another person is near" in found.describe()
+    most = replace(keypoints, problems=np.full(FRAMES, PROBLEM_BITS[TrackingProblem.CROWDED]))
+    assert grade(shaped, keypoints=most).left_out == ()
+
+
 def test_lost_frames_are_reported_by_their_time(shaped):
     keep = np.r_[0:20, 35:FRAMES]
     keypoints = some_keypoints()
