@@ -12,7 +12,6 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.checks.capture_validation import (
     GOOD_EDGE_RATIO,
-    NO_KNOWN_MISTAKE,
     CaptureValidation,
     check_capture,
     json_number,
@@ -277,7 +276,7 @@ def _print_findings(check_result: CaptureValidation, console: Console) -> None:
     elif check_result.verdict != "good" and check_result.stored_iou >= GOOD_IOU:
         console.info("Poses and masks match where both exist; see the warnings above.")
     elif check_result.verdict != "good":
-        console.info(NO_KNOWN_MISTAKE)
+        console.info(check_result.unexplained)
 
 
 def _describe_without_masks(check_result: CaptureValidation) -> str:

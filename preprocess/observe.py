@@ -187,7 +187,8 @@ def associate_masks(masks: Masks | None, source: FrameSource) -> Callable[[int],
         raise InputError(
             f"The masks in {masks.path} have {masks.size_px[0]}x{masks.size_px[1]} px, the frames "
             f"{source.size_px[0]}x{source.size_px[1]}; expected the same shape. Was the video "
-            "cropped or rotated?"
+            "cropped, rotated or stretched (ffmpeg -vf "
+            f"scale={masks.size_px[0]}:{masks.size_px[1]} undoes that)?"
         )
     if masks.names is not None and OutputFileList(masks.path).exists():  # ia-track's own
         rows = {int(name): row for row, name in enumerate(masks.names) if name.isdecimal()}

@@ -49,6 +49,10 @@ NO_KNOWN_MISTAKE = (
     "tracking may have failed. Recompute them from this video."
 )
 """Diagnosis if no correction helps."""
+MIN_EXCESS = 1.3
+"""Area of masks by the body's from which they hold more than the person."""
+MIN_COVERED = 0.85
+"""Share of the body that such masks cover."""
 QUICK_OFFSETS = (1, 2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
 
@@ -93,6 +97,20 @@ class CaptureValidation:
         well = well and (not self.causes or self.is_auto_corrected)
         well |= self.edge_ratio is not None and self.edge_ratio >= GOOD_EDGE_RATIO
         return "good" if well and not self.anomalies else "warn"
+
+    @property
+    def unexplained(self) -> str:
+        """What may be wrong if no correction helps."""
+        if self.sampled_masks is None or self.sampled_masks.are_boxes:
+            return NO_KNOWN_MISTAKE
+        covered, areas = self.sampled_masks.excess(self.hypothesis)
+        if covered < MIN_COVERED or areas < MIN_EXCESS:
+            return NO_KNOWN_MISTAKE
+        return (
+            f"The masks show {areas:.1f} times the body's area, and the body lies within them: "
+            "another person or a thing that touches this person is in the masks, or clothes are "
+            "very wide. Give masks of this person alone (--masks)."
+        )
 
     @property
     def is_auto_corrected(self) -> bool:

@@ -4,7 +4,6 @@ import shlex
 from pathlib import Path
 
 from apps.checks.capture_validation import (
-    NO_KNOWN_MISTAKE,
     CaptureValidation,
     check_capture,
     check_opened_capture,
@@ -78,7 +77,7 @@ def preflight_check(
         if not force:
             raise InputError(f"{message} To train anyway, pass --force.")
         console.warning(message)
-    elif causes:
+    elif causes or (found.mask_iou or 0.0) < GOOD_IOU:
         but = " The masks do not match the images." if found.has_film_errors else ""
         console.warning(
             f"IoU of body and masks: {found.mask_iou:.2f}.{but} {_explain(found)} "
@@ -99,7 +98,7 @@ def correction_hint(inputs: CaptureInputs) -> str:
 
 def _explain(check: CaptureValidation) -> str:
     if check.diagnosis is None or not check.diagnosis.corrections:
-        return NO_KNOWN_MISTAKE
+        return check.unexplained
     words = "; and ".join(each.description for each in check.diagnosis.corrections)
     return f"Probable cause: {words}. {check.expected_improvement}".strip()
 

@@ -3,7 +3,7 @@
 This is what corrections change and what the alignment fits.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -129,8 +129,14 @@ class CaptureGeometry:
         Rows without a stated frame or time are taken in order: of all frames, or of the selection.
         """
         first = cameras.cameras[0]
+        known = motion.valid[:, None]
+        numbers = {  # NaN in what is not valid would spread
+            "root_rotations": np.where(known, motion.root_rotations, 0.0),
+            "root_translations": np.where(known, motion.root_translations, 0.0),
+            "joint_rotations": np.where(known[..., None], motion.joint_rotations, 0.0),
+        }
         return cls(
-            motion=motion,
+            motion=replace(motion, **numbers),
             row_frames=_row_frames(motion, source),
             intrinsics=np.stack([camera.intrinsic for camera in cameras.cameras]),
             extrinsics=np.stack([camera.camera_from_world for camera in cameras.cameras]),

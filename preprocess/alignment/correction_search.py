@@ -17,6 +17,7 @@ from preprocess.alignment.corrections import (  # fmt: skip
     Correction,
     divide_distances,
     scale_focal_length,
+    stretch_width,
     undo_pose_delay,
     undo_video_crop,
     undo_video_offset,
@@ -51,7 +52,7 @@ MIN_FITTED_IOU_GAIN = 0.04
 """Gain in mean IoU that a fitted correction must bring: clothes make every body a little larger."""
 MIN_FITTED_CHANGE = 0.06
 """Relative change of its number that a fitted correction must make."""
-FITTED_CAUSES = ("focal", "body_scale")
+FITTED_CAUSES = ("focal", "body_scale", "aspect")
 """Mistakes between body and masks that have a size."""
 MIN_EDGE_GAIN = 0.03
 """Gain in the mean edge score that a discrete correction of the video must bring."""
@@ -235,6 +236,8 @@ def _correction_factory(
     """Makes corrections of one of `FITTED_CAUSES` from their factor."""
     if cause == "focal":
         return scale_focal_length
+    if cause == "aspect":
+        return stretch_width
     return lambda factor: divide_distances(factor, pelvis)
 
 

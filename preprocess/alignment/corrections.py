@@ -11,7 +11,7 @@ from preprocess.alignment.capture_geometry import CaptureGeometry
 
 CAUSES = (
     "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
-    "frame_rate", "left_right", "root_origin", "focal", "body_scale", "video_rotation",
+    "frame_rate", "left_right", "root_origin", "focal", "body_scale", "aspect", "video_rotation",
     "video_mirrored", "video_offset", "video_crop",
 )  # fmt: skip
 """Names of the mistakes in commands and files; of equal candidates the first cause is named."""
@@ -126,6 +126,18 @@ def scale_focal_length(factor: float) -> Correction:
     )
 
 
+def stretch_width(factor: float) -> Correction:
+    """Images that are stretched in width (factor above 1) or in height, unlike the camera."""
+    wrong = "width" if factor > 1.0 else "height"
+    return Correction(
+        cause="aspect",
+        description=f"the images are stretched in {wrong}, {max(factor, 1.0 / factor):.2f} times; "
+        "was the video converted to another shape?",
+        apply=lambda c: _with_intrinsics(c, focal_scale=np.array([factor, 1.0])),
+        factor=factor,
+    )
+
+
 def shift_principal_point(right_px: float, down_px: float) -> Correction:
     """Principal points too far left and up by these pixels (negative: right and down)."""
     sides = {
@@ -179,7 +191,7 @@ def _with_video(geometry: CaptureGeometry, **changes: Any) -> CaptureGeometry:
 def _with_intrinsics(
     geometry: CaptureGeometry,
     *,
-    focal_scale: float = 1.0,
+    focal_scale: float | Float[np.ndarray, "2"] = 1.0,
     shift_px: tuple[float, float] = (0.0, 0.0),
 ) -> CaptureGeometry:
     """The geometry with all focal lengths multiplied and all principal points shifted."""

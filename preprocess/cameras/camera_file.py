@@ -285,7 +285,8 @@ def _aspect_ratio_error(
     return InputError(
         f"The cameras in {path} belong to pictures of {stored[0]}x{stored[1]} px, the video "
         f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated or "
-        "cropped, change the cameras with it."
+        "cropped, change the cameras with it; if it was stretched, undo that (ffmpeg -vf "
+        f"scale={stored[0]}:{stored[1]})."
     )
 
 

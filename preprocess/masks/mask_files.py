@@ -160,8 +160,8 @@ class Masks:
         if not same_aspect_ratio((width, height), size_px):
             raise InputError(
                 f"Mask {row} in {self.path} has {width}x{height} px, its image "
-                f"{size_px[0]}x{size_px[1]}; expected the same shape. Was one of them cropped "
-                "or rotated?"
+                f"{size_px[0]}x{size_px[1]}; expected the same shape. Was one of them cropped, "
+                "rotated or stretched?"
             )
         if (width, height) != size_px:
             shrinks = width >= size_px[0]

@@ -114,6 +114,57 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
         assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
 
 
+def test_a_stretched_film_is_named_and_its_camera_corrected(spoilt, tmp_path, call_check):
+    folder, out = spoilt(stretched), tmp_path / "mended"
+    _, said, found = call_check(folder, "--fix", out)
+    assert found["cause"] == "aspect"
+    assert "stretched in width, 1.3" in said
+    camera = np.load(out / "cameras.npz")["intrinsic"]
+    assert camera[0, 0] / camera[1, 1] == pytest.approx(4 / 3, rel=0.06)
+    assert passes_quick_check(open_capture(CaptureInputs(video=out)))
+
+
+def stretched(folder: Path) -> None:
+    """Makes film and masks wider by a third; the camera keeps its focal length."""
+    size = (128, 96)
+    capture_corruptions.rewrite_video(
+        folder, lambda pictures: [cv2.resize(picture, size) for picture in pictures]
+    )
+    for path in (folder / "masks").iterdir():
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), 0), size))
+    camera = dict(np.load(folder / "cameras.npz"))
+    camera["intrinsic"][0, 2], camera["width"] = size[0] / 2, size[0]
+    np.savez(folder / "cameras.npz", **camera)
+
+
+def test_two_persons_who_touch_in_the_masks_are_named(spoilt, call_check):
+    _, said, found = call_check(spoilt(with_neighbor))
+    assert found["cause"] is None
+    assert "times the body's area" in said
+    assert "another person" in said
+
+
+def with_neighbor(folder: Path) -> None:
+    """Shows the person twice in each mask, side by side and touching."""
+    for path in (folder / "masks").iterdir():
+        mask = cv2.imread(str(path), 0)
+        moved = np.roll(mask, round(0.25 * mask.shape[1]), axis=1)
+        cv2.imwrite(str(path), np.maximum(mask, moved))
+
+
+def test_poses_that_are_not_numbers_disturb_nothing(spoilt, call_check, recwarn):
+    _, said, found = call_check(spoilt(without_numbers))
+    assert found["cause"] is None
+    assert said.count("not valid") == 1
+    assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]
+
+
+def without_numbers(folder: Path) -> None:
+    poses = dict(np.load(folder / "poses.npz"))
+    poses["body_pose"][3], poses["transl"][5] = np.nan, np.inf
+    np.savez(folder / "poses.npz", **poses)
+
+
 @pytest.mark.slow
 def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
     _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
