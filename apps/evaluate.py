@@ -15,8 +15,8 @@ from apps.run.run_folder import RunFolder
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
+    from apps.evaluation.dataset_subject import DatasetSubject, SplitFrames
     from apps.evaluation.evaluation_session import EvaluationSession
-    from apps.evaluation.people_snapshot import DatasetSubject
     from apps.evaluation.score_table import AvatarEvaluation
 
 
@@ -69,7 +69,8 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
 
 
 def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
-    from apps.evaluation.people_snapshot import find_subjects
+    from apps.evaluation.neuman import find_neuman
+    from apps.evaluation.people_snapshot import find_people_snapshot
 
     arguments, stop = session.arguments, session.stop
     for path in arguments.targets:
@@ -80,19 +81,19 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
             yield _evaluate_package(path, session)
         elif run.has_checkpoint():
             yield _evaluate_run(run, session)
-        elif subjects := find_subjects(path):
+        elif subjects := find_people_snapshot(path) or find_neuman(path):
             if arguments.on is not None:
                 raise InputError(f"{path} is a dataset with its own test frames; omit --on.")
-            for subject, place in subjects:
-                run = _run_folder_of(subject, path, arguments)
-                if not stop.is_set() and _train_subject(subject, place, run, session):
-                    yield _evaluate_subject(subject, place, run, session)
-                else:
-                    stop.set()
+            above = arguments.out or Path("runs") / path.resolve().name
+            for subject in subjects:
+                if stop.is_set():
+                    return
+                yield from _evaluate_subject(subject, above, session)
         else:
             raise InputError(
                 f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
-                "folder with subjects of PeopleSnapshot (such as male-3-casual)."
+                "folder with subjects of PeopleSnapshot (such as male-3-casual) or of NeuMan (such "
+                "as seattle)."
             )
     for folder in arguments.pictures:
         if not stop.is_set():
@@ -120,43 +121,37 @@ def _evaluate_run(run: RunFolder, session: "EvaluationSession") -> "AvatarEvalua
     return session.evaluate_run(str(run.path), run, frames)
 
 
-def _run_folder_of(
-    subject: "DatasetSubject", dataset: Path, arguments: EvaluateArguments
-) -> RunFolder:
-    """Return the folder of a subject's run."""
-    above = arguments.out or Path("runs") / dataset.resolve().name
-    return RunFolder(path=above / subject.name)
-
-
 def _evaluate_subject(
-    subject: "DatasetSubject", folder: Path, run: RunFolder, session: "EvaluationSession"
-) -> "AvatarEvaluation":
-    """Score a trained subject on the paper's test frames."""
+    subject: "DatasetSubject", above: Path, session: "EvaluationSession"
+) -> "Iterator[AvatarEvaluation]":
+    """Train a subject and score its test frames; nothing if training was stopped."""
     from apps.evaluation.evaluation_frames import capture_frames
     from apps.evaluation.frame_scoring import BACKGROUNDS
-    from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TEST_POSES, subject_poses
 
-    arguments = session.arguments
+    arguments, run = session.arguments, RunFolder(path=above / subject.name)
+    train, test = subject.open_splits(above / "captures", session.console)
+    if not _train_subject(subject, train, run, session):
+        session.stop.set()
+        return
     inputs = replace(
-        arguments.capture_inputs(folder),
-        poses=subject_poses(folder, TEST_POSES),
-        frames=parse_frame_range(subject.test),
+        arguments.capture_inputs(test.folder),
+        poses=test.poses,
+        frames=parse_frame_range(test.frames),
     )
-    frames = capture_frames(inputs, run.body_file, arguments.size or LONGER_SIDE_PX)
+    frames = capture_frames(inputs, run.body_file, arguments.size or subject.size_px)
     scored = session.evaluate_run(subject.name, run, frames, tuple(BACKGROUNDS))
-    return replace(scored, paper=subject.paper)
+    yield replace(scored, paper=subject.paper or None)
 
 
 def _train_subject(
-    subject: "DatasetSubject", folder: Path, run: RunFolder, session: "EvaluationSession"
+    subject: "DatasetSubject", train: "SplitFrames", run: RunFolder, session: "EvaluationSession"
 ) -> bool:
-    """Train a subject like ia-ingest, on all of the paper's training frames.
+    """Train a subject like ia-ingest, on all of its training frames.
 
     Returns:
         Whether training is complete; after Ctrl-C the next evaluation continues it.
     """
     from apps.evaluation.evaluation_frames import is_trained
-    from apps.evaluation.people_snapshot import LONGER_SIDE_PX, TRAIN_POSES, subject_poses
     from apps.ingest import ingest
     from apps.run.ingest_arguments import IngestArguments
 
@@ -166,15 +161,15 @@ def _train_subject(
         return True
     console.info(f"Training {subject.name}.")
     words = IngestArguments(
-        video=folder,
-        poses=subject_poses(folder, TRAIN_POSES),
-        frames=subject.train,
+        video=train.folder,
+        poses=train.poses,
+        frames=train.frames,
         body=arguments.body,
         out=run.path,
         resume=run.has_checkpoint(),
         seconds=arguments.seconds if arguments.steps is None else None,
         steps=arguments.steps,
-        size=arguments.size or LONGER_SIDE_PX,
+        size=arguments.size or subject.size_px,
         hold_out=0,
         device=arguments.device,
     )

@@ -25,11 +25,12 @@ class EvaluateArguments:
         ia-evaluate run --card card                  a page with conditions, tables and pictures
         ia-evaluate --pictures theirs --on capture   what another system rendered of its frames
         ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
+        ia-evaluate neuman/dataset --out evaluation --body SMPL_NEUTRAL.pkl    NeuMan's
 
-    The last one trains each subject of PeopleSnapshot in the folder (InstantAvatar's layout:
-    male-3-casual, …) on the paper's training frames for --seconds, scores the paper's test frames,
-    and lists the paper's scores next to them (docs/evaluation.md). Subjects that were trained
-    before are not trained again.
+    A dataset is a folder with subjects of PeopleSnapshot (as distributed, or in InstantAvatar's
+    layout: male-3-casual, …) or of NeuMan (seattle, …). Each subject is trained on the protocol's
+    training frames for --seconds and scored on its test frames, on white and black, next to the
+    paper's scores (docs/evaluation.md). Subjects that were trained before are not trained again.
 
     Images are compared on white, in the capture's poses ("given") and in poses fitted to each frame
     with the avatar frozen ("fitted", as in the paper).
@@ -43,7 +44,7 @@ class EvaluateArguments:
     targets: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="RUN|AVATAR|DATASET", help_behavior_hint="")
     ] = ()
-    """Folders written by ia-ingest, .iavatar packages, or a folder of PeopleSnapshot subjects."""
+    """Folders written by ia-ingest, .iavatar packages, or folders of PeopleSnapshot or NeuMan."""
     on: Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint="")] = None
     """Score all frames of this video or capture folder instead of the run's held-out frames."""
     pictures: Annotated[tuple[Path, ...], arg(metavar="DIR", help_behavior_hint="")] = ()
@@ -82,7 +83,8 @@ class EvaluateArguments:
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Training steps per subject of a dataset, instead of --seconds."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder for the runs of a dataset (default: runs/NAME, named after the dataset)."""
+    """Folder for the runs of a dataset, and for its frames under captures/ (default: runs/NAME,
+    named after the dataset)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device for training and rendering."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None

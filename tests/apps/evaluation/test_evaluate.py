@@ -81,15 +81,10 @@ def test_a_package_alone_is_scored_as_within_its_run(run, film, call_evaluate, t
 def dataset(film, call_ingest, tmp_path, monkeypatch):
     """Two subjects in the paper's layout, with shorter lists."""
     lists = {people_snapshot.TRAIN_POSES: np.s_[0:16:2], people_snapshot.TEST_POSES: np.s_[16:24:3]}
-    subjects = tuple(
-        people_snapshot.DatasetSubject(
-            name=name, train="0:16:2", test="16:24:3", paper={"psnr": 29.65, "ssim": 0.973}
-        )
-        for name in ("female-3-casual", "male-3-casual")
-    )
-    monkeypatch.setattr(people_snapshot, "SUBJECTS", subjects)
-    for subject in subjects:
-        place = tmp_path / "PeopleSnapshot" / subject.name
+    names = ("female-3-casual", "male-3-casual")
+    monkeypatch.setattr(people_snapshot, "SPLITS", dict.fromkeys(names, ("0:16:2", "16:24:3")))
+    for name in names:
+        place = tmp_path / "PeopleSnapshot" / name
         shutil.copytree(film, place)
         poses = dict(np.load(place / "poses.npz"))
         kept = {key: each for key, each in poses.items() if key not in ("frame", "time", "valid")}
@@ -156,9 +151,10 @@ def test_a_stopped_lesson_leaves_the_table_of_those_before(
 def test_the_papers_lists_are_as_long_as_the_paper_says():
     counts = {"female-3-casual": (112, 51), "female-4-casual": (84, 48), "male-3-casual": (114, 55),
               "male-4-casual": (110, 36)}  # fmt: skip
-    for subject in people_snapshot.SUBJECTS:
-        lists = [range(*map(int, text.split(":"))) for text in (subject.train, subject.test)]
-        assert tuple(map(len, lists)) == counts[subject.name]
+    for name, splits in people_snapshot.SPLITS.items():
+        lists = [range(*map(int, text.split(":"))) for text in splits]
+        assert tuple(map(len, lists)) == counts[name]
+    assert people_snapshot.PAPER.keys() == counts.keys()
 
 
 def test_a_box_is_scored_without_the_white_around_it(film):
