@@ -34,7 +34,7 @@ CONVENTIONS = {
 }
 """Conventions that every manifest repeats for its readers."""
 LICENCE_NOTE = (
-    "A difference of a person: use it only as that person allows. It is neither the body model's "
+    "A likeness of a person: use it only as that person allows. It is neither the body model's "
     "data nor code; the rights in it are those of the recording it was learnt from."
 )
 """Default of `Manifest.licence`."""
