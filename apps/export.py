@@ -29,6 +29,8 @@ CHECK_VIEWS = 4
 """Synthetic views that validate a package without frames."""
 VIEW_PX = 256
 """Width and height of a synthetic view."""
+MIN_TRIANGLES = 500
+"""Least --triangles; below it a hand is a lump."""
 DISTANCE_HEIGHTS = 3.5
 """Distance of the camera, in heights of the person."""
 PERSON_HEIGHT_SHARE = 0.8
@@ -66,6 +68,9 @@ class ExportArguments:
     """Motion for --to glb, as in ia-play (default: a turn)."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track)."""
+    triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of triangles of a mesh, for game engines and phones; a .glb then has a texture
+    (default: some 300,000, with vertex colors). 20,000 are enough for most."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the file that --out names, if it exists."""
 
@@ -97,6 +102,12 @@ def export(arguments: ExportArguments, console: Console) -> int:
     check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
     if arguments.poses is not None and arguments.to != "glb":
         raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
+    if arguments.triangles is not None and arguments.to == "iavatar":
+        raise InputError("--triangles requires --to glb, ply or obj; a package has none.")
+    if arguments.triangles is not None and arguments.triangles < MIN_TRIANGLES:
+        raise InputError(
+            f"--triangles is {arguments.triangles}, but must be at least {MIN_TRIANGLES}."
+        )
     if arguments.run.is_file() and arguments.to != "iavatar":
         _export_mesh(arguments, arguments.run, console)
     else:
@@ -117,7 +128,7 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
 
     write_mesh(
         package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem,
-        person=arguments.person, replace=arguments.overwrite,
+        person=arguments.person, triangles=arguments.triangles, replace=arguments.overwrite,
     )  # fmt: skip
 
 

@@ -24,6 +24,7 @@ def write_mesh(
     poses: Path | None,
     name: str,
     person: str | None = None,
+    triangles: int | None = None,
     replace: bool | None = None,
 ) -> None:
     """Write a mesh in the format of its suffix, whole or not at all.
@@ -35,6 +36,7 @@ def write_mesh(
         poses: Motion of the .glb; None for a turn.
         name: Name of the avatar in the .glb.
         person: Person ID in the pose file; None for the longest track.
+        triangles: Number of triangles, with a texture in a .glb; None for all, with vertex colors.
         replace: Whether an existing file may be replaced, as in `atomic_file`.
 
     Raises:
@@ -52,7 +54,8 @@ def write_mesh(
         else _static_mesh_encoder(suffix)
     )
     with console.status("extracting the surface"):
-        mesh = extract_mesh(held.tables["hq"])
+        textured = triangles is not None and suffix == ".glb"
+        mesh = extract_mesh(held.tables["hq"], triangles=triangles, textured=textured)
         content = write(mesh)
     with atomic_file(out, replace=replace) as part:
         part.write_bytes(content)

@@ -13,7 +13,7 @@ from capture.input_error import InputError
 
 LEARN_PACKAGES = frozenset({"torch", "numba", "onnx"})
 """Large packages of the extra [learn], which playing does not need."""
-SMALL_PACKAGES = frozenset({"trimesh", "pycolmap"})
+SMALL_PACKAGES = frozenset({"trimesh", "pycolmap", "fast_simplification"})
 """Small packages of the extra [learn], which can be installed alone."""
 
 

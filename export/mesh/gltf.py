@@ -5,6 +5,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any, final
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt16
 from scipy.spatial.transform import Rotation
@@ -16,12 +17,14 @@ from preprocess.body.kinematics import body_from_rest
 
 COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
 """glTF's codes of the element types."""
-ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+ACCESSOR_TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 """glTF's names of the shapes of elements."""
 ARRAY_BUFFER = 34962
 """glTF's code of a buffer of vertices."""
 ELEMENT_ARRAY_BUFFER = 34963
 """glTF's code of a buffer of indices."""
+LINEAR_FILTER, CLAMP_TO_EDGE = 9729, 33071
+"""OpenGL's codes of how a texture is read; smaller copies would mix the colors of its triangles."""
 FIRST_JOINT = 2
 """Node of the first joint; 0 is the mesh and 1 the floor."""
 
@@ -106,13 +109,7 @@ def encode_glb(
         "scenes": [{"nodes": [0, 1]}],
         "nodes": [{"name": name, "mesh": 0, "skin": 0}, *nodes],
         "meshes": [{"name": name, "primitives": [_primitive(draft, mesh)]}],
-        "materials": [
-            {
-                "name": "as recorded",
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+        **_material(draft, mesh),
         "skins": [skin],
         "animations": [_animation(draft, animation)],
         **draft.describe(),
@@ -150,15 +147,39 @@ def _skeleton(
     return skin, [{"name": "floor", **floor, "children": [FIRST_JOINT]}, *nodes]
 
 
+def _material(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
+    """Return the unlit material, with the texture if the mesh has one."""
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    unlit = {"KHR_materials_unlit": {}}
+    material = {"name": "as recorded", "pbrMetallicRoughness": surface, "extensions": unlit}
+    if mesh.texture is None:
+        return {"materials": [material]}
+    surface["baseColorTexture"] = {"index": 0}
+    code = cv2.imencode(".png", np.ascontiguousarray(mesh.texture.image[..., ::-1]))[1].tobytes()
+    modes = dict.fromkeys(("magFilter", "minFilter"), LINEAR_FILTER)
+    wraps = dict.fromkeys(("wrapS", "wrapT"), CLAMP_TO_EDGE)
+    return {
+        "materials": [material],
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"bufferView": draft.add_bytes(code), "mimeType": "image/png"}],
+        "samplers": [{**modes, **wraps}],
+    }
+
+
 def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     def vertices(array: Shaped[np.ndarray, "vertices _"], **more: Any) -> int:
         return draft.add(array, target=ARRAY_BUFFER, **more)
 
+    colors = (
+        {"COLOR_0": vertices(_srgb_to_linear(mesh.colors), normalized=True)}
+        if mesh.texture is None
+        else {"TEXCOORD_0": vertices(mesh.texture.coordinates)}
+    )
     return {
         "attributes": {
             "POSITION": vertices(mesh.positions, bounds=True),
             "NORMAL": vertices(mesh.normals),
-            "COLOR_0": vertices(_srgb_to_linear(mesh.colors), normalized=True),
+            **colors,
             "JOINTS_0": vertices(mesh.joints),
             "WEIGHTS_0": vertices(mesh.weights, normalized=True),
         },
@@ -211,11 +232,8 @@ class _GltfBuffer:
     ) -> int:
         """Add an array of scalars, vectors or matrices; return its accessor's number."""
         content = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
-        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content)}
-        self._views.append(view if target is None else {**view, "target": target})
-        self.binary += content + bytes(-len(content) % 4)
         accessor: dict[str, Any] = {
-            "bufferView": len(self._views) - 1,
+            "bufferView": self.add_bytes(content, target=target),
             "componentType": COMPONENT_TYPES[array.dtype.name],
             "count": len(array),
             "type": ACCESSOR_TYPES[array.shape[1:]],
@@ -228,6 +246,13 @@ class _GltfBuffer:
             accessor["max"] = rows.max(axis=0).tolist()
         self._accessors.append(accessor)
         return len(self._accessors) - 1
+
+    def add_bytes(self, content: bytes, *, target: int | None = None) -> int:
+        """Add bytes, such as a PNG; return the number of their view."""
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content)}
+        self._views.append(view if target is None else {**view, "target": target})
+        self.binary += content + bytes(-len(content) % 4)
+        return len(self._views) - 1
 
     def describe(self) -> dict[str, Any]:
         """Describe the binary part for the JSON part."""

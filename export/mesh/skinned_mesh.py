@@ -1,6 +1,6 @@
 """A package's avatar as a mesh for other programs: vertices, colors, skinning weights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from export.bake.grid_filters import remove_floaters_and_cavities, resample_grid
 from export.mesh.isosurface import extract_isosurface
+from export.mesh.texture_atlas import Texture, make_texture
 from export.package.player_tables import (
     BRICK_SIZE,
     BrickTable,
@@ -61,6 +62,7 @@ class SkinnedMesh:
         faces: Counter-clockwise seen from outside.
         joints: Joints that move each vertex; 0 where the weight is 0.
         weights: Skinning weights × 255; each row sums to 255.
+        texture: Finer colors than those of the vertices; None of a mesh of many triangles.
     """
 
     positions: Float32[np.ndarray, "vertices 3"]
@@ -69,14 +71,37 @@ class SkinnedMesh:
     faces: Int32[np.ndarray, "faces 3"]
     joints: UInt8[np.ndarray, "vertices 4"]
     weights: UInt8[np.ndarray, "vertices 4"]
+    texture: Texture | None = None
+
+    def split(self) -> "SkinnedMesh":
+        """The same surface, with vertices of its own for each triangle."""
+        corners = self.faces.ravel()
+        each = {
+            name: getattr(self, name)[corners]
+            for name in ("positions", "normals", "colors", "joints", "weights")
+        }
+        faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+        return replace(self, faces=faces, **each)
 
 
-def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -> SkinnedMesh:
+def extract_mesh(
+    tables: PlayerTables,
+    *,
+    spacing_m: float = VERTEX_SPACING_M,
+    triangles: int | None = None,
+    textured: bool = False,
+) -> SkinnedMesh:
     """Extract the surface of baked bricks.
 
     Args:
         tables: The bricks, and the weights that move them.
         spacing_m: Distance between vertices, about, metres.
+        triangles: Number of triangles to simplify the surface to (quadric error metrics, Garland
+            and Heckbert 1997); None keeps all.
+        textured: Whether to draw a texture.
+
+    Raises:
+        ModuleNotFoundError: If triangles are asked for, and fast-simplification is missing.
     """
     codes, low = _dense_grid(tables.bricks)
     voxel_m = tables.bricks.voxel_m
@@ -85,15 +110,42 @@ def extract_mesh(tables: PlayerTables, *, spacing_m: float = VERTEX_SPACING_M) -
     nodes *= np.float32(step)
     positions = (low + nodes * np.float32(voxel_m)).astype(np.float32)
     normals = _smooth_normals(positions, faces)
+    if triangles is not None and triangles < len(faces):
+        positions, normals, faces = _simplify(positions, normals, faces, triangles)
+
+    def color_at(
+        points: Float32[np.ndarray, "points 3"], directions: Float32[np.ndarray, "points 3"]
+    ) -> UInt8[np.ndarray, "points 3"]:
+        return _vertex_colors(codes, (points - low) / np.float32(voxel_m), directions, voxel_m)
+
     joints, weights = _strongest_joints(skinning_weights(tables, positions))
-    return SkinnedMesh(
+    mesh = SkinnedMesh(
         positions=positions,
         normals=normals,
-        colors=_vertex_colors(codes, nodes, normals, voxel_m),
+        colors=color_at(positions, normals),
         faces=faces,
         joints=joints,
         weights=weights,
     )
+    if not textured:
+        return mesh
+    return replace(mesh.split(), texture=make_texture(positions, normals, faces, color_at))
+
+
+def _simplify(
+    positions: Float32[np.ndarray, "vertices 3"],
+    normals: Float32[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    triangles: int,
+) -> tuple[
+    Float32[np.ndarray, "fewer 3"], Float32[np.ndarray, "fewer 3"], Int32[np.ndarray, "some 3"]
+]:
+    """Return a surface of fewer triangles, with the normals of the nearest vertices."""
+    import fast_simplification  # missing in an installation of the player alone
+
+    found = fast_simplification.simplify(positions, faces, target_count=triangles)
+    nearest = KDTree(positions).query(found[0])[1]
+    return found[0].astype(np.float32), normals[nearest], found[1].astype(np.int32)
 
 
 def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, "x y z"]:

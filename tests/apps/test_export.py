@@ -92,6 +92,18 @@ def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_p
     assert "7" in said.err
 
 
+def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
+    pytest.importorskip("fast_simplification")
+    out = tmp_path / "few.glb"
+    words = ("--to", "glb", "--triangles", 2000, "--out", out)
+    code, said = call_export(run / "avatar.iavatar", *words)
+    assert code == 0, said.err
+    assert "2,000 triangles" in said.err
+    (mesh,) = trimesh.load(out).geometry.values()
+    assert mesh.visual.kind == "texture"
+    assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
+
+
 @pytest.mark.parametrize("name", ["A.PLY", "a.OBJ"])
 def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, name):
     out = tmp_path / name
@@ -110,6 +122,8 @@ def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, nam
         (["--to", "glb", "--out", "a.ply"], ".glb"),
         (["--to", "ply", "--out", "a.ply", "--poses", "poses.npz"], "--poses"),
         (["--to", "glb", "--out", "a.glb", "--poses", "nowhere.npz"], "nowhere.npz"),
+        (["--to", "glb", "--out", "a.glb", "--triangles", "10"], "at least 500"),
+        (["--out", "a.iavatar", "--triangles", "1000"], "--to glb, ply or obj"),
     ],
 )
 def test_meshes_that_cannot_be_are_refused(run, call_export, tmp_path, monkeypatch, words, told):

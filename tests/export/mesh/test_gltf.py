@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,7 @@ from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_
 from tests.export.mesh.test_isosurface import is_closed, volume
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
-SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 @pytest.fixture(scope="module")
@@ -206,3 +207,50 @@ def test_a_still_pose_is_a_motion_too(mesh, package, motion):
     one = SkeletonAnimation.of(motion, (1,), 30.0, package.manifest.rest_joints[0])
     read = Read(encode_glb(replace(mesh), package.manifest, one, name="x"))
     assert read.skinned(0).shape == mesh.positions.shape
+
+
+@pytest.fixture(scope="module")
+def simple(package):
+    """The same of three thousand triangles, with a texture."""
+    pytest.importorskip("fast_simplification")
+    return extract_mesh(package.tables["hq"], triangles=3000, textured=True)
+
+
+def texels(texture, shares):
+    """Bilinear samples at a place of every triangle, by its shares of the corners."""
+    height, width = texture.image.shape[:2]
+    x, y = (texture.coordinates.reshape(-1, 3, 2) * [width, height] - 0.5).transpose(2, 0, 1)
+    place = [each @ shares for each in (y, x)]
+    channels = [
+        ndimage.map_coordinates(texture.image[..., channel].astype(float), place, order=1)
+        for channel in range(3)
+    ]
+    return np.stack(channels, axis=1)
+
+
+def test_few_triangles_keep_the_shape_and_its_colors(simple, mesh):
+    assert 2900 <= len(simple.faces) <= 3000
+    assert len(simple.positions) == 3 * len(simple.faces)
+    assert volume(simple.positions, simple.faces) == pytest.approx(
+        volume(mesh.positions, mesh.faces), rel=0.04
+    )
+    assert KDTree(mesh.positions).query(simple.positions)[0].max() < 0.02
+    near = KDTree(mesh.positions)
+    for shares in ([1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.05, 0.9]):
+        points = np.einsum("c,fcx->fx", shares, simple.positions.reshape(-1, 3, 3))
+        away, nearest = near.query(points)
+        expected = mesh.colors[nearest].astype(float)
+        off = np.abs(texels(simple.texture, np.array(shares)) - expected).mean(axis=1)
+        assert np.median(off[away < 0.004]) < 6.0
+
+
+def test_a_texture_is_read_by_another_reader(simple, package, motion):
+    clip = SkeletonAnimation.of(motion, (0, 1), 25.0, package.manifest.rest_joints[0])
+    content = encode_glb(simple, package.manifest, clip, name="x")
+    read = Read(content)
+    assert "COLOR_0" not in read.json["meshes"][0]["primitives"][0]["attributes"]
+    np.testing.assert_array_equal(read.attribute("TEXCOORD_0"), simple.texture.coordinates)
+    assert ((read.attribute("TEXCOORD_0") > 0.0) & (read.attribute("TEXCOORD_0") < 1.0)).all()
+    (found,) = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
+    image = np.asarray(found.visual.material.baseColorTexture.convert("RGB"))
+    np.testing.assert_array_equal(image, simple.texture.image)
