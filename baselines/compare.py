@@ -56,8 +56,8 @@ class CompareArguments:
         instant-ngp   our hash grid without articulation
         ours          the product
 
-    The presets: "small" is the method at the size that learns most in a minute of one core;
-    "paper" has the paper's sizes, and needs hours.
+    The preset "small" is each method at the size that learns most in a minute of one core; "paper"
+    has the paper's sizes, and needs hours.
 
     OUT then holds table.md, comparison.json, pictures.png (truth, then each method), and for each
     method scores.json and its pictures of held-out frames and, for a sample, of novel poses. A

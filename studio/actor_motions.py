@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
 from studio.actor import Actor
 from studio.gestures import FILMED_DANCE, KICK, NOVEL_POSES, UNFILMED_DANCE, Arm, Gesture, Leg
@@ -123,6 +124,31 @@ def _interpolate_gestures(
     ]
 
 
+def tracked_motion(actor: Actor, track: Motion, *, frames: int, fps: float) -> Motion:
+    """A track's poses on the spot, evenly spread; one in a camera's axes (y down) is set upright.
+
+    Raises:
+        InputError: If the track holds no valid pose.
+    """
+    if not track.valid.any():
+        raise InputError("The track holds no valid pose that could be filmed.")
+    rows = np.flatnonzero(track.valid)
+    rows = rows[np.linspace(0, len(rows) - 1, frames).round().astype(int)]
+    turns = Rotation.from_rotvec(track.root_rotations[rows])
+    if turns.as_matrix()[:, 1, 1].mean() < 0.0:
+        turns = Rotation.from_rotvec([np.pi, 0.0, 0.0]) * turns
+    on_the_spot, turned = -actor.shaped.joints[0], turns.as_rotvec()
+    poses = [
+        BodyPose(
+            root_rotation=turned[i],
+            root_translation=on_the_spot,
+            joint_rotations=track.joint_rotations[row],
+        )
+        for i, row in enumerate(rows)
+    ]
+    return _motion_of([_set_on_floor(actor, pose, 0.0) for pose in poses], actor, fps)
+
+
 def _motion_from_gestures(
     actor: Actor, gestures: list[Gesture] | list[tuple[Gesture, Rotation]], fps: float
 ) -> Motion:
@@ -131,6 +157,10 @@ def _motion_from_gestures(
         _pose_on_floor(actor, *(g if isinstance(g, tuple) else (g, g.joint_rotations())))
         for g in gestures
     ]
+    return _motion_of(poses, actor, fps)
+
+
+def _motion_of(poses: list[BodyPose], actor: Actor, fps: float) -> Motion:
     count = len(poses)
     return Motion(
         root_rotations=np.stack([pose.root_rotation for pose in poses]),
@@ -151,7 +181,12 @@ def _pose_on_floor(actor: Actor, gesture: Gesture, rotations: Rotation) -> BodyP
         root_translation=np.array([gesture.shift[0], 0.0, gesture.shift[1]]) - pelvis,
         joint_rotations=rotations.as_rotvec(),
     )
-    lifted = np.array([0.0, gesture.hop - actor.sole_height_m(pose), 0.0])
+    return _set_on_floor(actor, pose, gesture.hop)
+
+
+def _set_on_floor(actor: Actor, pose: BodyPose, hop: float) -> BodyPose:
+    """The pose with its soles `hop` metres above the floor."""
+    lifted = np.array([0.0, hop - actor.sole_height_m(pose), 0.0])
     return replace(pose, root_translation=pose.root_translation + lifted)
 
 

@@ -14,6 +14,7 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from capture.video_encoder import video_encoder
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import write_motion
 from studio import actor_motions, studio_cameras
 from studio.actor import Actor
@@ -130,6 +131,9 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
 
 
 def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    if config.track is not None:
+        track = read_poses(config.track)
+        return actor_motions.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
     acts = {
         "turn": actor_motions.turning_motion,
         "dance": actor_motions.dancing_motion,

@@ -1,6 +1,7 @@
 """What ia-sample films, as a record that is read without loading what films it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from capture.input_error import InputError
@@ -26,6 +27,9 @@ class ShootConfig:
     """What happens: the actor turns with arms held off the body, or dances; or gestures while a
     phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras
     lie in truth/cameras.npz)."""
+    track: Path | None = None
+    """Pose file whose motion is filmed instead of a turn of the studio's own, such as a track of
+    PeopleSnapshot; `frames` of its poses, evenly spread, on the spot."""
     background: Literal["plain", "clutter", "room", "tiles"] | None = None
     """What stands behind the actor: a bare wall, a painted room full of things (if not given), a
     real room with furniture (a walkaround's, if not given), or one where every pattern repeats."""
@@ -71,6 +75,8 @@ class ShootConfig:
             if value is not None and not low <= value <= high:
                 option = "--" + name.replace("_", "-")
                 raise InputError(f"{option} is {value}, but must lie between {low} and {high}.")
+        if self.track is not None and self.motion != "turn":
+            raise InputError("--track replaces the turn: leave out --motion, or leave out --track.")
         if self.like_a_phone:
             self._validate_phone()
         if self.camera_moves and self.effective_background in ("plain", "clutter"):

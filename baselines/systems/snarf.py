@@ -37,6 +37,8 @@ FIRST_STEPS, FIRST_POINTS, FIRST_RATE = 400, 512, 3e-3
 """Steps, points and rate by which the weights are fitted to the body's before training."""
 SKINNING_RATE_FACTOR = 0.1
 """Their learning rate in training, as a share of the field's."""
+SKIN_SPREAD_M = 0.02
+"""Spread of the points about the skin that have the weights of their vertices, metres."""
 BODY_WEIGHT, BODY_POINTS = 0.1, 128
 """Weight of the vertices' own skinning weights during training, and the vertices of a step."""
 
@@ -133,8 +135,9 @@ class Snarf(nn.Module):
             scale = torch.where(scale.abs() < 1e-12, 1e-12, scale)
             inverse[active] = guess + ((step - change) / scale)[..., None] * along[:, None]
             points[active], residual[active] = moved, after
-        points = points.unflatten(0, shape)
-        valid = (residual.norm(dim=1) < CONVERGED_M).unflatten(0, shape)
+        valid = residual.norm(dim=1) < CONVERGED_M
+        valid &= self._near_skin.holds(points, torch.zeros_like(body))
+        points, valid = points.unflatten(0, shape), valid.unflatten(0, shape)
         for bone in range(1, shape[1]):
             near = (points[:, :bone] - points[:, bone : bone + 1]).norm(dim=2) < SAME_ROOT_M
             valid[:, bone] &= ~(near & valid[:, :bone]).any(dim=1)
@@ -163,13 +166,15 @@ class Snarf(nn.Module):
         return raw.index_put((found,), self.network(root))
 
     def prior_loss(self) -> Tensor:
-        """Skinning weights of the skin stay the body's."""
+        """Skinning weights near the skin stay the body's."""
         return BODY_WEIGHT * self._weight_loss(BODY_POINTS)
 
     def _weight_loss(self, count: int) -> Tensor:
         chosen = torch.randint(len(self._person.vertices), (count,))
         wanted = self._person.weights[chosen]
-        return (self.weights_at(self._person.vertices[chosen]) - wanted).square().sum(dim=1).mean()
+        skin = self._person.vertices[chosen]
+        logits = SOFTMAX_SCALE * self.skinning(skin + SKIN_SPREAD_M * torch.randn_like(skin))
+        return nn.functional.cross_entropy(logits, wanted)
 
     def parameter_groups(self) -> list[dict[str, object]]:
         """The field's rate, and a tenth of it for the skinning weights."""

@@ -9,6 +9,7 @@ import numpy as np
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import write_motion
 from studio import actor_motions
 from studio.actor import Actor
@@ -68,6 +69,9 @@ def write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgre
 
 
 def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    if config.track is not None:
+        track = read_poses(config.track)
+        return actor_motions.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
     turns = TURNS if config.turns is None else config.turns
     if config.motion == "dance":
         return actor_motions.dancing_motion(

@@ -1,4 +1,5 @@
 import functools
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from capture.output_file_list import LIST_NAME as LIST
 from capture.source_opening import open_source
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_file import read_motion, write_motion
 from studio import actor_motions
 from studio.actor import A_POSE, Actor
 from studio.clothing_layers import build_layers
@@ -159,6 +160,34 @@ def test_feet_stand_on_the_floor(actor):
     motion = actor_motions.turning_motion(actor, frames=4, fps=30.0, turns=1.0, seed=0)
     for row in range(4):
         assert abs(actor.sole_height_m(motion[row])) < 1e-9
+
+
+def test_a_track_in_a_cameras_axes_is_filmed_upright_on_the_spot(actor, tmp_path):
+    turned = actor_motions.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)
+    flip = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    track = replace(
+        turned,
+        root_rotations=(flip * Rotation.from_rotvec(turned.root_rotations)).as_rotvec(),
+        root_translations=turned.root_translations + np.array([0.0, 0.0, 5.0]),
+    )
+    motion = actor_motions.tracked_motion(actor, track, frames=4, fps=30.0)
+    assert len(motion) == 4
+    np.testing.assert_allclose(motion.joint_rotations, turned.joint_rotations[[0, 2, 5, 7]])
+    for row in range(4):
+        skin = actor.vertices(motion[row])
+        assert skin[:, 1].min() == pytest.approx(0.0, abs=0.02)  # the soles, and hardly anything
+        assert skin[:, 1].max() > 1.4
+        wanted = turned.root_rotations[[0, 2, 5, 7][row]]
+        apart = Rotation.from_rotvec(wanted).inv() * Rotation.from_rotvec(
+            motion.root_rotations[row]
+        )
+        assert apart.magnitude() < 1e-6
+    write_motion(tmp_path / "track.npz", track)
+    config = ShootConfig(frames=2, size=32, track=tmp_path / "track.npz")
+    film_capture(tmp_path / "sample", config)
+    assert len(read_motion(tmp_path / "sample" / "poses.npz")) == 2
+    with pytest.raises(InputError, match="--track replaces the turn"):
+        ShootConfig(track=tmp_path / "track.npz", motion="dance").validate()
 
 
 def test_the_turn_turns_as_often_as_asked(actor):

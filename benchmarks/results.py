@@ -1,0 +1,129 @@
+"""The paper's tables with ours and the baselines, at equal core time: docs/results.md.
+
+    python -m benchmarks.results [--motion TRACK] [--seconds 60 300] [--write docs/results.md]
+
+For each subject an exact and a phone-like sample are filmed and `python -m baselines.compare` is
+run on both, as many at a time as there are --jobs. What is in OUT already is not made again: Ctrl-C
+and the same command continue. `--seconds 60 --subjects 1` takes half an hour of core time.
+"""
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+
+from apps.cli.exit_codes import run_command
+from benchmarks.hardware import ROOT, Hardware
+from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
+from capture.atomic_files import write_text_atomically
+from studio.shoot import ShootConfig, film_capture
+
+PICTURE_HEIGHT_PX = 180
+"""Height of a row of the page's picture."""
+PICTURE_NAME = "results.webp"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultsJob:
+    """Films the samples, compares the systems on each, and writes the page."""
+
+    subjects: tuple[int, ...] = (1, 2, 3)
+    """Actors of the studio: the paper's S1 to S3."""
+    seconds: tuple[float, ...] = (60.0,)
+    """Core seconds of each method; each is a run of its own, with its own learning-rate decay."""
+    methods: tuple[str, ...] = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
+    """What is compared."""
+    motion: Path | None = None
+    """Track whose poses the actors take while they are filmed, such as one of PeopleSnapshot; if
+    not given, the studio's own turn."""
+    size: int = 128
+    """Width and height of the exact samples; the phone-like ones are 9:16 and as high."""
+    frames: int = 60
+    """Frames of each film."""
+    jobs: int = 2
+    """Comparisons at a time; each takes one core."""
+    out: Path = Path("results")
+    """Folder for samples and comparisons."""
+    write: Path | None = None
+    """Markdown file whose tables are replaced; its picture lies beside it."""
+
+
+def main() -> None:
+    """The benchmark."""
+    job = tyro.cli(ResultsJob, prog="python -m benchmarks.results", description=__doc__)
+    sys.exit(run_command("python -m benchmarks.results", lambda: run(job)))
+
+
+def run(job: ResultsJob) -> int:
+    """Films, compares and writes; an interrupted comparison leaves what is done."""
+    hardware = Hardware.here()
+    samples = [
+        ComparedSample(subject=subject, kind=kind, seconds=seconds)
+        for seconds in job.seconds
+        for kind in ("phone", "exact")
+        for subject in job.subjects
+    ]
+    for sample in samples:
+        film(job, sample)
+    with ThreadPoolExecutor(job.jobs) as pool:
+        codes = list(pool.map(lambda sample: compare(job, sample), samples))
+    found = {
+        sample: json.loads(path.read_text())
+        for sample in samples
+        if (path := folder_of(job, sample) / "comparison.json").is_file()
+    }
+    track = "the studio's own turn" if job.motion is None else f"{job.motion.name}, on the spot"
+    lines = results_lines(found, [*hardware.lines(), f"filmed: {job.frames} frames, {track}"])
+    print("\n".join(lines))
+    if job.write is not None and found:
+        write_page(job, lines, next(iter(found)))
+    return max(codes)
+
+
+def film(job: ResultsJob, sample: ComparedSample) -> None:
+    """Films a sample, unless it lies there already."""
+    place = job.out / sample.name
+    if place.exists():
+        return
+    config = ShootConfig(size=job.size, frames=job.frames, subject=sample.actor, track=job.motion)
+    if sample.kind == "phone":
+        config = replace(config, size=round(job.size * 9 / 16), like_a_phone=True)
+    print(f"filming {place}", file=sys.stderr, flush=True)
+    film_capture(place, config)
+
+
+def compare(job: ResultsJob, sample: ComparedSample) -> int:
+    """Compares all methods on a sample; the exit code."""
+    command = [
+        sys.executable, "-m", "baselines.compare", str(job.out / sample.name),
+        "--seconds", f"{sample.seconds:g}", "--out", str(folder_of(job, sample)),
+        "--methods", *job.methods,
+    ]  # fmt: skip
+    return subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
+
+
+def folder_of(job: ResultsJob, sample: ComparedSample) -> Path:
+    """Where the comparison of a sample lies."""
+    return (job.out / f"{sample.name}-{sample.seconds:g}s").resolve()
+
+
+def write_page(job: ResultsJob, lines: list[str], shown: ComparedSample) -> None:
+    """The page with new tables and a new picture; the text around the tables is kept."""
+    assert job.write is not None
+    before, after = "# Results\n\n", "\n"
+    if job.write.exists() and BEGIN in (text := job.write.read_text()):
+        before, after = text.split(BEGIN)[0], text.split(END)[1]
+    write_text_atomically(job.write, before + "\n".join([BEGIN, *lines, END]) + after)
+    sheet = np.asarray(cv2.imread(str(folder_of(job, shown) / "pictures.png")))
+    _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
+    (job.write.parent / PICTURE_NAME).write_bytes(code.tobytes())
+
+
+if __name__ == "__main__":
+    main()
