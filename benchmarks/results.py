@@ -10,12 +10,11 @@ and the same command continue. `--seconds 60 --subjects 1` takes half an hour of
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 import tyro
 
 from apps.cli.exit_codes import run_command
@@ -24,9 +23,10 @@ from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
 from studio.shoot import ShootConfig, film_capture
 
-PICTURE_HEIGHT_PX = 180
-"""Height of a row of the page's picture."""
+ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
+"""Methods, in the order of the tables."""
 PICTURE_NAME = "results.webp"
+"""Beside the page: the truth and each method, of the first sample."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class ResultsJob:
     """Actors of the studio: the paper's S1 to S3."""
     seconds: tuple[float, ...] = (60.0,)
     """Core seconds of each method; each is a run of its own, with its own learning-rate decay."""
-    methods: tuple[str, ...] = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
+    methods: tuple[str, ...] = ORDER
     """What is compared."""
     motion: Path | None = None
     """Track whose poses the actors take while they are filmed, such as one of PeopleSnapshot; if
@@ -71,18 +71,11 @@ def run(job: ResultsJob) -> int:
     ]
     for sample in samples:
         film(job, sample)
+    codes = [0]
     with ThreadPoolExecutor(job.jobs) as pool:
-        codes = list(pool.map(lambda sample: compare(job, sample), samples))
-    found = {
-        sample: json.loads(path.read_text())
-        for sample in samples
-        if (path := folder_of(job, sample) / "comparison.json").is_file()
-    }
-    track = "the studio's own turn" if job.motion is None else f"{job.motion.name}, on the spot"
-    lines = results_lines(found, [*hardware.lines(), f"filmed: {job.frames} frames, {track}"])
-    print("\n".join(lines))
-    if job.write is not None and found:
-        write_page(job, lines, next(iter(found)))
+        for done in as_completed([pool.submit(compare, job, sample) for sample in samples]):
+            codes.append(done.result())
+            write_page(job, samples, hardware.lines())  # so that an interrupted one has a page, too
     return max(codes)
 
 
@@ -113,16 +106,33 @@ def folder_of(job: ResultsJob, sample: ComparedSample) -> Path:
     return (job.out / f"{sample.name}-{sample.seconds:g}s").resolve()
 
 
-def write_page(job: ResultsJob, lines: list[str], shown: ComparedSample) -> None:
+def write_page(job: ResultsJob, samples: list[ComparedSample], conditions: list[str]) -> None:
     """The page with new tables and a new picture; the text around the tables is kept."""
-    assert job.write is not None
+    found = {
+        sample: [json.loads(path.read_text()) for path in scores]
+        for sample in samples
+        if (scores := [path for name in ORDER if (path := scores_of(job, sample, name)).is_file()])
+    }
+    if not found:
+        return
+    track = "the studio's own turn" if job.motion is None else f"{job.motion.name}, on the spot"
+    lines = results_lines(found, [*conditions, f"filmed: {job.frames} frames, {track}"])
+    if job.write is None:
+        print("\n".join(lines))
+        return
     before, after = "# Results\n\n", "\n"
     if job.write.exists() and BEGIN in (text := job.write.read_text()):
         before, after = text.split(BEGIN)[0], text.split(END)[1]
     write_text_atomically(job.write, before + "\n".join([BEGIN, *lines, END]) + after)
-    sheet = np.asarray(cv2.imread(str(folder_of(job, shown) / "pictures.png")))
-    _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
-    (job.write.parent / PICTURE_NAME).write_bytes(code.tobytes())
+    sheet = cv2.imread(str(folder_of(job, next(iter(found))) / "pictures.png"))
+    if sheet is not None:
+        _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
+        (job.write.parent / PICTURE_NAME).write_bytes(code.tobytes())
+
+
+def scores_of(job: ResultsJob, sample: ComparedSample, method: str) -> Path:
+    """Where the scores of a method on a sample lie."""
+    return folder_of(job, sample) / method / "scores.json"
 
 
 if __name__ == "__main__":

@@ -54,14 +54,15 @@ def results_lines(found: Found, conditions: Sequence[str]) -> list[str]:
             "",
             f"## Novel poses after {budget}",
             "",
-            "PSNR in dB / SSIM, whole picture on white.",
+            "PSNR in dB / SSIM, on white.",
         ]
-        lines += ["", *_score_table(part, "novel"), "", *_gain_lines(part)]
+        lines += ["", *_score_table(part, "novel"), *_gain_lines(part)]
         lines += ["", f"## Held-out frames after {budget}", "", *_score_table(part, "held_out")]
         lines += ["", "## Novel poses over time, and the time that is missing", ""]
         lines += [
-            f"PSNR on four of the twelve poses, within a run of {budget}. Last column: core time for ours "
-            "at the end; beyond the run it is extrapolated by the gain of the last doubling.", "",
+            f"PSNR on four of the twelve poses, within a run of {budget}. Last column: core time "
+            "until a method is as good as ours at the end; beyond the run it is extrapolated by "
+            "the gain of its last doubling of time.", "",
             *_time_table(part),
         ]  # fmt: skip
     return [*lines, "", *_paper_lines()]
@@ -71,12 +72,12 @@ def _score_table(found: Found, kind: str) -> list[str]:
     rows = []
     for method in _methods(found):
         cells = [_result(results, method) for results in found.values()]
-        rows.append([
-            method,
-            *("-" if each is None else f"{number(each[kind]['psnr'], 2)} / {number(each[kind]['ssim'], 4)}"
-              for each in cells),
-        ])  # fmt: skip
+        rows.append([method, *(_scores(None if each is None else each[kind]) for each in cells)])
     return markdown(["", *(_title(sample) for sample in found)], rows)
+
+
+def _scores(scores: Mapping[str, float] | None) -> str:
+    return "-" if scores is None else f"{number(scores['psnr'], 2)} / {number(scores['ssim'], 4)}"
 
 
 def _gain_lines(found: Found) -> list[str]:
@@ -86,10 +87,13 @@ def _gain_lines(found: Found) -> list[str]:
         ours, theirs = _result(results, "ours"), _result(results, "anim-nerf")
         if ours is not None and theirs is not None:
             gains[_title(sample)] = ours["novel"]["psnr"] - theirs["novel"]["psnr"]
+    if not gains:
+        return []
     told = ", ".join(f"{title} {gain:+.1f} dB" for title, gain in gains.items())
     met = sum(gain >= REQUIRED_GAIN_DB for gain in gains.values())
     return [
-        f"Ours over Anim-NeRF: {told}. At least +{REQUIRED_GAIN_DB:g} dB on {met} of {len(gains)}."
+        "",
+        f"Ours over Anim-NeRF: {told}. At least +{REQUIRED_GAIN_DB:g} dB on {met} of {len(gains)}.",
     ]
 
 
@@ -115,11 +119,11 @@ def _paper_lines() -> list[str]:
     return [
         "## The paper's own figures",
         "",
-        "On their data and machine (RTX 3090): SURREAL's textured bodies, novel poses, PSNR / SSIM.",
+        "On their data and machine (RTX 3090). SURREAL's bodies, novel poses, PSNR / SSIM:",
         "",
         *markdown(["", "S1", "S2", "S3"], [[name, *row] for name, row in PAPER_SURREAL.items()]),
         "",
-        "PeopleSnapshot's test frames in poses fitted to them, PSNR / SSIM.",
+        "PeopleSnapshot's test frames in poses fitted to them, PSNR / SSIM:",
         "",
         *markdown(
             ["", "male-3", "male-4", "female-3", "female-4"],
