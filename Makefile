@@ -6,7 +6,7 @@ BIN = $(VENV)/bin
 
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: install demo web test test-all check
+.PHONY: install demo web test test-all check results
 
 install: $(VENV)/installed
 
@@ -25,6 +25,9 @@ demo: install
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m apps.fetch_runtime
+
+results: install # docs/results.md: 50 minutes on two cores; MOTION=track.npz films a track of poses
+	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(MOTION),--motion $(MOTION))
 
 test: install
 	$(BIN)/python -m pytest -q -m "not slow"

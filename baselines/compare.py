@@ -32,7 +32,12 @@ MARKS_S = (5.0, 10.0, 30.0, 60.0, 180.0, 300.0)
 STEP_MARKS = (1 / 12, 1 / 6, 1 / 2)
 """The same where steps are counted, as shares of them."""
 CURVE_FRAMES = 4
-"""Frames of each kind that a point of the curve is scored on; the end scores all."""
+"""Frames that a point of the curve is scored on: novel poses where there are any. The end scores
+all frames of both kinds."""
+
+
+MIN_COLUMN_PX = 100
+"""Width of a column of the sheet above which pictures are not enlarged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +131,7 @@ class CurvePsnr:
 
     Attributes:
         core_seconds, steps: Spent so far.
-        held_out, novel: Of a few frames of each kind; None where there are none.
+        held_out, novel: Of a few novel poses, or of held-out frames where there are none.
     """
 
     core_seconds: float
@@ -253,8 +258,9 @@ def _marks(arguments: CompareArguments) -> list[float]:
 def _curve_point(system: "ComparedSystem", data: "ComparedCapture", spent: float) -> CurvePsnr:
     from avatar.evaluation.held_out import coarse_to_fine_order
 
-    few = (coarse_to_fine_order(kind)[:CURVE_FRAMES] for kind in (data.held_out, data.novel))
-    held_out, novel = (_score_all(system, frames, None)["psnr"] for frames in few)
+    frames = coarse_to_fine_order(data.novel or data.held_out)[:CURVE_FRAMES]
+    found = _score_all(system, frames, None)["psnr"]
+    held_out, novel = (None, found) if data.novel else (found, None)
     return CurvePsnr(core_seconds=spent, steps=system.steps, held_out=held_out, novel=novel)
 
 
@@ -306,6 +312,8 @@ def _write_sheet(out: Path, done: list[str]) -> None:
         np.hstack([np.asarray(cv2.imread(str(folder / name))) for folder in columns.values()])
         for name in names
     ]
+    scale = max(1, -(-MIN_COLUMN_PX * len(columns) // rows[0].shape[1]))
+    rows = [cv2.resize(row, None, fx=scale, fy=scale) for row in rows]
     width = rows[0].shape[1] // len(columns)
     head = np.full((24, rows[0].shape[1], 3), 255, dtype=np.uint8)
     for place, title in enumerate(columns):

@@ -48,7 +48,7 @@ PRESETS = {
     ),
     "small": MethodSettings(
         frames=2, rays=128, samples=24, layers=4, width=96, octaves=6, learning_rate=4e-3,
-        pose_rate=2.5e-4,
+        pose_rate=2.5e-5,
     ),
 }  # fmt: skip
 
