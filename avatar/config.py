@@ -101,6 +101,9 @@ class TrainConfig:
     """Steps between updates of the occupancy grid."""
     refine_poses: bool = True
     """Whether the frames' poses are corrected during training."""
+    poses_may_be_exact: bool = True
+    """Whether a pose is corrected only where its rays agree that it is wrong. Poses that are known
+    to be estimates are always corrected."""
     estimate_shading: bool = True
     """Whether the light of the room is separated from the colors of the person who turns in it."""
     estimate_exposures: bool = True

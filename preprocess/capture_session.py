@@ -129,6 +129,12 @@ class Capture:
             return f"{source.path} {source.started_at:.3f}"
         return str(source.path.resolve())
 
+    @property
+    def has_estimated_poses(self) -> bool:
+        """Whether poses are known to be inexact: tracked here, or changed by a fit to the masks."""
+        tracked = isinstance(self.live, LiveTracking) or self.motion.proportions is not None
+        return tracked or (self.fit is not None and self.fit.taken)
+
     def check(self) -> None:
         """Whether the parts fit together; no frame is read.
 

@@ -65,7 +65,11 @@ def new_trainer(
         held_out_stride=hold_every,
         seed=seed,
     )
-    config = replace(config, refine_poses=refine_poses)
+    config = replace(
+        config,
+        refine_poses=refine_poses,
+        poses_may_be_exact=not recording.has_estimated_poses,
+    )
     return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
 
 

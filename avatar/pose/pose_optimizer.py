@@ -35,16 +35,17 @@ EVIDENCE_EMA_DECAY = 0.95
 """Decay of the mean evidence and of the share of corrections that moved a pose."""
 MAX_CORRECTION_INTERVAL = 8
 """Steps between pose gradients where poses are exact."""
+MAX_ESTIMATED_INTERVAL = 4
+"""The same of estimated poses, when steps are short."""
 MAX_JOINT_STEP_M = 0.04
 """Largest motion of a joint in one correction, metres; the roots must be able to follow it."""
 RESOLVE_DISTANCE_M = 0.08
 """Motion of a joint after which the frame's correspondences are solved again, metres."""
 STEP_DAMPING = 0.5
-"""Factor of the Gauss-Newton steps while the avatar is trained. Gradients are up to fifty steps
-old, and a field whose poses overshoot turns to fog, which asks for still larger steps: whole steps
-cost 0.5 dB, steps of 1.6 times their length 0.6 to 0.9 dB."""
+"""Factor of the Gauss-Newton steps of poses that may be exact. Gradients are up to fifty steps old,
+and steps too long turn the field to fog; estimated poses gain more from whole steps, though."""
 MEAN_CORRECTION_DECAY = 0.2
-"""Share of the mean correction that is removed from a frame's at each of its corrections."""
+"""Share of the mean correction that is removed, at each correction of a pose that may be exact."""
 FIRST_CORRECTION_STEPS = 60
 """Training steps on a frame before its pose is first corrected. Earlier the field does not know the
 view, and new content looks like a pose error."""
@@ -86,12 +87,13 @@ class PoseOptimizer:
     its own frame before the tracker's rotation, and the root's shift in the given body frame, m.
 
     Attributes:
+        poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong.
         corrections: Root rotation, joint rotations and root shift of each slot.
         bones: Body-from-canonical transforms of the corrected poses.
     """
 
     def __init__(
-        self, rig: Rig, capacity: int, device: torch.device, *, avatar_frozen: bool = False
+        self, rig: Rig, capacity: int, device: torch.device, *, poses_may_be_exact: bool = True
     ) -> None:
         """Starts without poses.
 
@@ -99,14 +101,12 @@ class PoseOptimizer:
             rig: Rig of the person.
             capacity: Number of slots.
             device: Device that accumulates the gradients.
-            avatar_frozen: Whether only the poses are optimized. A pose cannot blur a fixed avatar,
-                so all poses make whole steps, and a correction that they share is not a change of
-                the canonical body.
+            poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong, and
+                then by half steps. Otherwise, with estimated poses or a fixed avatar, every pose
+                makes whole steps.
         """
         self.rig = rig
-        self._mean_decay, self._damping = (
-            (0.0, 1.0) if avatar_frozen else (MEAN_CORRECTION_DECAY, STEP_DAMPING)
-        )
+        self.poses_may_be_exact = poses_may_be_exact
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
         nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
@@ -125,7 +125,7 @@ class PoseOptimizer:
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
         self._descendants = descendant_matrix(rig.parents)
-        self._moved_share, self._evidence = 1.0, math.inf if avatar_frozen else MIN_EVIDENCE
+        self._moved_share, self._evidence = 1.0, MIN_EVIDENCE
         self._added_at_step = np.zeros(capacity, dtype=np.int64)
         self._can_freeze, self._is_frozen = np.zeros((2, capacity), dtype=bool)
         self._estimate_count, self._evidence_sum = np.zeros((2, capacity))
@@ -183,7 +183,8 @@ class PoseOptimizer:
     def freeze_converged(self, step: int) -> bool:
         """Freezes converged poses, and returns whether any pose may be corrected now.
 
-        Poses of new frames wait; poses that proved exact, or were refined long enough, are frozen.
+        Poses of new frames wait; poses that proved exact, or that may be exact and were refined
+        long enough, are frozen.
         """
         held = np.array([pose is not None for pose in self._tracker_poses])
         age = step - self._added_at_step
@@ -192,7 +193,8 @@ class PoseOptimizer:
         exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
             0.5 * (told + self._evidence) < MAX_EXACT_EVIDENCE
         )
-        self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
+        if self.poses_may_be_exact:
+            self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
         open_now = held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
         self._is_correctable.copy_(torch.from_numpy(open_now))
         self._ray_counts *= self._is_correctable
@@ -229,8 +231,9 @@ class PoseOptimizer:
         if rows < MIN_RAYS_PER_CORRECTION:
             return None
         loss = self._losses[slot, :rows].cpu().numpy()
+        evidence = self._evidence if self.poses_may_be_exact else math.inf
         step = gauss_newton_step(
-            self.pose_gradients(slot), loss, self.corrections[slot], self._evidence,
+            self.pose_gradients(slot), loss, self.corrections[slot], evidence,
             prior=self._temporal_prior.prior_for(slot, self.corrections),
         )  # fmt: skip
         self._ray_counts[slot] = 0
@@ -245,18 +248,24 @@ class PoseOptimizer:
         self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
         if not moves:
             return None
-        held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
-        mean = self.corrections[held].mean(axis=0)
-        moved = (
-            self.corrections[slot] + self._damping * rate * step.change - self._mean_decay * mean
-        )
+        change = rate * step.change
+        if self.poses_may_be_exact:
+            held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
+            mean = self.corrections[held].mean(axis=0)
+            change = STEP_DAMPING * change - MEAN_CORRECTION_DECAY * mean
+        moved = self.corrections[slot] + change
         self._apply_correction(slot, np.clip(moved, -MAX_CORRECTION, MAX_CORRECTION))
         return slot
 
-    @property
-    def correction_interval(self) -> int:
-        """Steps between pose gradients, 1 to 8; more where poses prove to be exact."""
-        return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
+    def correction_interval(self, rate: float) -> int:
+        """Steps between pose gradients: more where poses prove to be exact, or steps are short.
+
+        Args:
+            rate: Factor of the Gauss-Newton steps, in (0, 1].
+        """
+        if self.poses_may_be_exact:
+            return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
+        return min(max(round(0.5 / max(rate, 1e-3)), 1), MAX_ESTIMATED_INTERVAL)
 
     def needs_resolve(self, slot: int) -> bool:
         """Whether the slot's pose is too far from the one its correspondences were solved for.

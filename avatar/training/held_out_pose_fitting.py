@@ -120,7 +120,7 @@ def _with_neighboring_corrections(
     """The frames and their poses, slot by slot, corrected like the frames about them."""
     rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
     replay = ReplayBuffer(len(frames), device)
-    poses = PoseOptimizer(rig, len(frames), device, avatar_frozen=True)
+    poses = PoseOptimizer(rig, len(frames), device, poses_may_be_exact=False)
     for frame in frames:
         prepared = prepare_frame(frame.observation, rig)
         slot = replay.add(prepared)

@@ -84,7 +84,9 @@ class Trainer:
         self.sampler: RaySampler = OccupancySampler(self.backend, self.learner.occupancy, config)
         self.avatar = replace(self.learner, field=self.field.clone())
         self.replay = ReplayBuffer(config.replay_capacity, device)
-        self.poses = PoseOptimizer(rig, config.replay_capacity, device)
+        self.poses = PoseOptimizer(
+            rig, config.replay_capacity, device, poses_may_be_exact=config.poses_may_be_exact
+        )
         self.exposures = FrameExposures(config.replay_capacity, device)
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
@@ -161,7 +163,7 @@ class Trainer:
         config, field = self._config_at(detail_share), self.field
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
-        refines = config.refine_poses and self.steps % self.poses.correction_interval == 0
+        refines = config.refine_poses and self.steps % self.poses.correction_interval(falling) == 0
         refines = refines and self.poses.freeze_converged(self.steps)
         neutral = self.exposures.neutralize(batch)
         result = compute_gradients(

@@ -18,6 +18,7 @@ from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.pose.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
+    MAX_ESTIMATED_INTERVAL,
     MIN_ESTIMATES_BEFORE_FREEZE,
     MIN_STEPS_BEFORE_FREEZE,
     PoseOptimizer,
@@ -293,6 +294,25 @@ def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, gener
         pulled(step, 0, 0.0)
     assert not pulled(later + MIN_ESTIMATES_BEFORE_FREEZE, 0, 3.0)
     assert any(pulled(later + MIN_ESTIMATES_BEFORE_FREEZE + k, 1, 3.0) for k in range(5))
+
+
+def test_estimated_poses_follow_their_rays_even_where_these_hardly_agree(rig, bent_pose, generator):
+    """No gate, no damping, and the mean of all corrections stays: poses are known to be wrong."""
+    loss = torch.full((300,), 0.1)
+    tables = [PoseOptimizer(rig, 1, CPU, poses_may_be_exact=exact) for exact in (True, False)]
+    for table in tables:
+        table.set_pose(0, pose_of(bent_pose))
+        for step in range(FREEZE_AFTER_STEPS - 20, FREEZE_AFTER_STEPS):
+            table.freeze_converged(step)
+            wrenches = torch.randn(300, 24, 6, generator=generator)
+            table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches, loss)
+            table.correct_next(rate=1.0)
+    assert not tables[0].corrections.any()
+    assert np.abs(tables[1].corrections[0]).max() > 1e-3
+    assert not tables[0].freeze_converged(FREEZE_AFTER_STEPS)
+    assert tables[1].freeze_converged(FREEZE_AFTER_STEPS)
+    assert tables[1].correction_interval(1.0) == 1
+    assert tables[1].correction_interval(0.1) == MAX_ESTIMATED_INTERVAL
 
 
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):

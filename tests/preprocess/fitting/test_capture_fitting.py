@@ -44,6 +44,8 @@ def test_proportions_and_focal_length_change_but_not_the_size(capture, fit):
     assert size_of(capture.shaped, fitted.shaped) == pytest.approx(1.0, abs=1e-9)
     assert fitted.cameras[0].focal_px[0] == pytest.approx(1.1 * capture.cameras[0].focal_px[0])
     assert fitted.fit is fit
+    assert fitted.has_estimated_poses
+    assert not capture.has_estimated_poses
 
 
 def test_a_stated_height_stays(capture, fit):
@@ -59,6 +61,7 @@ def test_the_person_of_a_finished_avatar_does_not_change(capture, fit):
 
 def test_a_fit_that_is_not_taken_changes_nothing(capture, fit):
     kept = apply_fit(capture, replace(fit, taken=False))
+    assert not kept.has_estimated_poses
     assert kept.motion is capture.motion
     assert kept.shaped is capture.shaped
 
