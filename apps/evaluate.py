@@ -130,7 +130,7 @@ def _evaluate_subject(
 
     arguments, run = session.arguments, RunFolder(path=above / subject.name)
     train, test = subject.open_splits(above / "captures", session.console)
-    if not _train_subject(subject, train, run, session):
+    if session.stop.is_set() or not _train_subject(subject, train, run, session):
         session.stop.set()
         return
     inputs = replace(

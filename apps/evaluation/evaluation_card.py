@@ -236,7 +236,8 @@ def _pictures(evaluation: AvatarEvaluation) -> str:
     heading = f"Truth, avatar, error: {escape(evaluation.name)}"
     note = (
         '<p class="legend">From the worst to the best frame in the mask, at the resolution of the '
-        f"scores. Error: mean over RGB, brightest from {LARGEST_SHOWN_ERROR:.2f} of 1.</p>"
+        "scores where the page is wide enough. Error: mean over RGB, brightest from "
+        f"{LARGEST_SHOWN_ERROR:.2f} of 1.</p>"
     )
     return html_section(heading, f'<div class="shown">{figures}</div>{note}' if figures else "")
 

@@ -50,9 +50,8 @@ class EvaluationSession:
 
     def evaluate_package(self, package: Path, frames: EvaluationFrames) -> AvatarEvaluation:
         """Score the player alone."""
-        players = load_players(package, frames, self.console)
-        scored = self._evaluate(str(package), frames, None, players)
-        return replace(scored, dances=self._dances(package))
+        players, dances = load_players(package, frames, self.console), self._dances(package)
+        return replace(self._evaluate(str(package), frames, None, players), dances=dances)
 
     def evaluate_run(
         self,
@@ -63,10 +62,10 @@ class EvaluationSession:
     ) -> AvatarEvaluation:
         """Score renderer and player of a run, by default on white."""
         package = run.package if self.arguments.player and run.package.is_file() else None
-        players = load_players(package, frames, self.console)
-        scored = self._evaluate(name, frames, self._load_trainer(run), players, backgrounds)
+        players, dances = load_players(package, frames, self.console), self._dances(run.package)
         report = read_report(run) if run.report_json.is_file() else None
-        return replace(scored, report=report, dances=self._dances(run.package))
+        scored = self._evaluate(name, frames, self._load_trainer(run), players, backgrounds)
+        return replace(scored, report=report, dances=dances)
 
     def evaluate_pictures(self, folder: Path) -> AvatarEvaluation:
         """Score pictures that another system rendered of the frames of --on.

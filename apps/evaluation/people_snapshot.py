@@ -48,6 +48,8 @@ TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_ne
 """Anim-NeRF's poses, one row per listed frame; the capture's own replace missing ones."""
 CAMERA_KEYS = ("camera_f", "camera_c", "camera_k", "width", "height")
 """What is read of camera.pkl: focal lengths, principal point, OpenCV's distortion, size."""
+Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]
+"""Intrinsic matrix and OpenCV's distortion."""
 
 
 def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
@@ -119,16 +121,25 @@ def _write_raw_frames(
         given: Poses of these frames; None for those in reconstructed_poses.hdf5.
     """
     camera, lens = _read_camera(place / "camera.pkl")
-    poses = _open_hdf5(place / "reconstructed_poses.hdf5", ("pose", "trans", "betas"))
-    masks = _open_hdf5(place / "masks.hdf5", ("masks",))["masks"]
-    require_rows(len(masks), numbers, place / "masks.hdf5", "masks")
     np.savez(part / "cameras.npz", **camera)
     if given is None:
-        require_rows(len(poses["pose"]), numbers, place / "reconstructed_poses.hdf5", "poses")
-        rows = {"thetas": poses["pose"][()][numbers], "transl": poses["trans"][()][numbers]}
-        np.savez(part / "poses.npz", **rows, betas=poses["betas"][()].reshape(-1))
+        path = place / "reconstructed_poses.hdf5"
+        with _open_hdf5(path, ("pose", "trans", "betas")) as stored:
+            poses = {key: stored[key][()] for key in ("pose", "trans", "betas")}
+        require_rows(len(poses["pose"]), numbers, path, "poses")
+        rows = {"thetas": poses["pose"][numbers], "transl": poses["trans"][numbers]}
+        np.savez(part / "poses.npz", **rows, betas=poses["betas"].reshape(-1))
     else:
         (part / "poses.npz").write_bytes(given.read_bytes())
+    with _open_hdf5(place / "masks.hdf5", ("masks",)) as file:
+        require_rows(len(file["masks"]), numbers, place / "masks.hdf5", "masks")
+        yield from _write_images(place, part, numbers, file["masks"], lens)
+
+
+def _write_images(
+    place: Path, part: Path, numbers: Sequence[int], masks: Any, lens: Lens
+) -> Iterator[int]:
+    """Write undistorted frames and masks of half the size; yield their numbers."""
     wanted = slice(numbers[0], numbers[-1] + 1, numbers[1] - numbers[0])
     for frame in open_source(place, frames=wanted).frames():
         size = frame.size_px[0] // 2, frame.size_px[1] // 2
@@ -146,9 +157,7 @@ def _write_raw_frames(
         yield frame.index
 
 
-def _read_camera(
-    path: Path,
-) -> tuple[dict[str, Any], tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]]:
+def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
     """Read camera.pkl: contents of cameras.npz, and the matrix and distortion of the lens.
 
     Raises:
