@@ -42,13 +42,11 @@ LPIPS_CONVENTIONS = {
     "vgg": LpipsConvention(network="vgg", label="LPIPS VGG [-1,1]", rescaled=True),
 }
 """Conventions by name: of PeopleSnapshot's tables, of NeuMan's, and of ZJU-MoCap's."""
-WEIGHT_FILES: dict[LpipsNetwork, str] = {"alex": "alexnet-owt-*.pth", "vgg": "vgg16-*.pth"}
-"""torchvision's files of the networks (IMAGENET1K_V1)."""
 WEIGHT_URLS: dict[LpipsNetwork, str] = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
 }
-"""Where they come from."""
+"""torchvision's files of the networks (IMAGENET1K_V1); their names end with their checksums."""
 MIN_SIDE_PX = 32
 """Smaller images leave nothing after the networks' poolings."""
 POOL_SIZE: dict[LpipsNetwork, int] = {"alex": 3, "vgg": 2}
@@ -112,28 +110,28 @@ class Lpips:
         lacking = list[LpipsNetwork]()
         networks: list[LpipsNetwork] = [LPIPS_CONVENTIONS[name].network for name in wanted]
         for network in dict.fromkeys(networks):
-            files = sorted(folder.glob(WEIGHT_FILES[network])) if folder.is_dir() else []
-            if not files:
+            file = folder / Path(WEIGHT_URLS[network]).name
+            if not file.is_file():
                 lacking.append(network)
                 continue
             try:
-                self._networks[network] = _load_network(network, files[0])
+                self._networks[network] = _load_network(network, file)
             except ImportError:
                 self.unavailable = (
                     "LPIPS needs torchmetrics: pip install 'instant-avatar-stream[lpips]'."
                 )
                 break
-            checksum = hashlib.sha256(files[0].read_bytes()).hexdigest()[:8]
-            known = "" if checksum in files[0].name else ", which is not torchvision's file"
-            self.versions[f"LPIPS {network}"] = f"{files[0].name}, SHA-256 {checksum}…{known}"
+            checksum = hashlib.sha256(file.read_bytes()).hexdigest()[:8]
+            known = "" if checksum in file.name else ", which is not torchvision's file"
+            self.versions[f"LPIPS {network}"] = f"{file.name}, SHA-256 {checksum}…{known}"
         if self._networks:
             self.versions = {"LPIPS": f"torchmetrics {version('torchmetrics')}"} | self.versions
         if lacking and self.unavailable is None:
-            wants = " and ".join(f"{WEIGHT_FILES[each]} ({WEIGHT_URLS[each]})" for each in lacking)
+            urls = " and ".join(WEIGHT_URLS[each] for each in lacking)
             self.unavailable = (
-                f"LPIPS ({', '.join(lacking)}) was not measured: {folder} lacks {wants}. Put them "
-                "there, or name their folder with --lpips-weights; they are not downloaded "
-                "by this program."
+                f"LPIPS ({', '.join(lacking)}) was not measured: {folder} lacks the files of {urls}"
+                ". Fetch them into that folder, or name another with --lpips-weights; this program "
+                "downloads nothing."
             )
         self.conventions = tuple(
             name for name in wanted if LPIPS_CONVENTIONS[name].network in self._networks
