@@ -73,9 +73,13 @@ def run(job: ResultsJob) -> int:
         film(job, sample)
     codes = [0]
     with ThreadPoolExecutor(job.jobs) as pool:
-        for done in as_completed([pool.submit(compare, job, sample) for sample in samples]):
-            codes.append(done.result())
-            write_page(job, samples, hardware.lines())  # so that an interrupted one has a page, too
+        running = [pool.submit(compare, job, sample) for sample in samples]
+        try:
+            for done in as_completed(running):
+                codes.append(done.result())
+                write_page(job, samples, hardware.lines())  # an interrupted run has a page, too
+        finally:
+            pool.shutdown(cancel_futures=True)
     return max(codes)
 
 
