@@ -154,7 +154,8 @@ def compare(arguments: CompareArguments, console: Console) -> int:
         OSError: If the disk is full; the methods that are done are kept.
     """
     arguments.validate()
-    missing = [name for name in arguments.methods if not _is_done(arguments, name)]
+    names = list(dict.fromkeys(arguments.methods))
+    missing = [name for name in names if arguments.overwrite or not _is_done(arguments, name)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     OutputFileList(arguments.out).create()
     data = None
@@ -169,7 +170,7 @@ def compare(arguments: CompareArguments, console: Console) -> int:
         for name in missing:
             if data is not None and not stop.is_set():
                 _train_method(name, data, arguments, console, stop)
-    done = [name for name in arguments.methods if _is_done(arguments, name)]
+    done = [name for name in names if _is_done(arguments, name)]
     results = [json.loads((arguments.out / name / "scores.json").read_text()) for name in done]
     if results:
         table = comparison_table(results)

@@ -33,7 +33,6 @@ class ComparedCapture:
         frames: To train on.
         held_out: Every tenth frame of the video.
         novel: Poses that were never filmed, with their true pictures; empty where there are none.
-        fit_seconds: CPU time of opening and fitting it; no method is charged for that.
         ready_seconds: CPU time of making the frames ready for the product; it alone is charged.
     """
 
@@ -42,7 +41,6 @@ class ComparedCapture:
     frames: list[TrainingFrame]
     held_out: list[HeldOutFrame]
     novel: list[HeldOutFrame]
-    fit_seconds: float
     ready_seconds: float
 
     @classmethod
@@ -52,11 +50,9 @@ class ComparedCapture:
         Raises:
             InputError: If it cannot be used.
         """
-        began = time.process_time()
         capture = open_capture(CaptureInputs(video=folder), size_px=size_px)
         if capture.motion.proportions is None and (fit := fit_capture(capture)) is not None:
             capture = apply_fit(capture, fit)
-        fit_seconds = time.process_time() - began
         rig = Rig.from_shaped_body(capture.shaped)
         warm_up(Trainer(rig, TrainConfig(), torch.device("cpu")))
         began, frames, held_out = time.process_time(), [], []
@@ -80,7 +76,6 @@ class ComparedCapture:
             frames=frames,
             held_out=held_out,
             novel=[HeldOutFrame(observation=seen) for seen in novel],
-            fit_seconds=fit_seconds,
             ready_seconds=ready_seconds,
         )
 

@@ -44,6 +44,14 @@ def test_what_is_done_is_not_trained_again(compared, monkeypatch):
     assert compare.main([*compared[1], "--methods", "ours"]) == 0
 
 
+def test_overwrite_trains_again(compared, monkeypatch):
+    trained = []
+    monkeypatch.setattr(compare, "_train_method", lambda name, *_: trained.append(name))
+    monkeypatch.setattr(compare, "_write_sheet", lambda *_: None)
+    assert compare.main([*compared[1], "--methods", "ours", "ours", "--overwrite"]) == 0
+    assert trained == ["ours"]
+
+
 def test_other_conditions_are_refused(compared, capsys):
     _, words = compared
     words = [*words, "--methods", "ours", "--seed", "1"]
