@@ -213,7 +213,8 @@ class RunFolder:
 
     def _was_started(self) -> bool:
         """Whether a run was started here, even if it was killed before it wrote a file."""
-        return OutputFileList(self.path).exists() or (self.path / LOCK).is_file()
+        lists = (OutputFileList(self.path), OutputFileList(self.tracking))
+        return any(each.exists() for each in lists) or (self.path / LOCK).is_file()
 
     def _foreign_file(self) -> Path | None:
         """Return a foreign file where a run would write; None if there is none."""

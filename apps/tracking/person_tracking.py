@@ -136,6 +136,7 @@ def track_person(
     own_masks = not source.has_alpha and given is None
     if given is not None and inputs.masks is None:
         console.info(f"Using the masks in {given}, which lie beside the video.")
+    _check_parts(source, inputs, given)
     with atomic_folder(folder) if own_masks else nullcontext() as part:
         tracked = _run_networks(source, inputs, part, console, stop)
         for warning in source.warnings:
@@ -157,6 +158,18 @@ def track_person(
     return PersonTracking(
         capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
     )
+
+
+def _check_parts(source: FrameSource, inputs: CaptureInputs, masks: Path | None) -> None:
+    """Open body, camera and masks that the user named, before minutes of tracking.
+
+    Raises:
+        InputError: If one cannot be used.
+    """
+    load_body_model(inputs.body)
+    assume_camera(inputs.video, inputs.cameras, source)
+    if masks is not None:
+        associate_masks(open_masks(masks, invert=False), source)
 
 
 def _frames_up_to(source: FrameSource, last: int) -> slice:

@@ -59,6 +59,11 @@ def test_tracked_poses_that_lie_in_the_way_are_found_before_any_work(tmp_path):
     write_text_atomically(run.tracked_poses, "mine")
     with pytest.raises(InputError, match=r"tracking/poses\.npz was not written by ia-ingest"):
         run.check_usable([], resume=False, overwrite=True)
+    run.tracked_poses.unlink()
+    with pytest.raises(InputError, match="No run to --resume"):
+        run.check_usable([], resume=True, overwrite=False)
+    OutputFileList(run.tracking).create()  # Ctrl-C came while the person was tracked
+    run.check_usable([], resume=True, overwrite=False)
     apart = tmp_path / "tracked"
     apart.mkdir()
     OutputFileList(apart).create()

@@ -140,6 +140,16 @@ def test_bad_arguments_are_named(video, words, reason, capsys, monkeypatch, tmp_
     assert reason in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize("option", ["--masks", "--cameras", "--body"])
+def test_parts_that_are_missing_are_named_before_tracking(option, video, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert track.main([str(video), "--out", str(out / "p.npz"), option, "nowhere"]) == 2
+    told = capsys.readouterr().err
+    assert "nowhere" in told
+    assert "tracking the person" not in told
+    assert not out.exists()
+
+
 def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch):
     monkeypatch.setattr(person_tracking, "MAX_FRAMES", 8)
     inputs = CaptureInputs(video=video)
