@@ -111,6 +111,11 @@ ITERATIONS = 2
 FEWER_ITERATIONS = 1
 """GrabCut iterations where both clothes and background are known."""
 
+DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
+"""Level of the brightest pixels (2 %) below which a video is brightened, and the level after it."""
+NOISE_BLUR_PX = 1.0
+"""Gaussian σ, px, by which the noise of a dark video is smoothed."""
+
 CUT_ERROR_M = 0.006
 """Standard error of the segmentation's border where it has not leaked, metres."""
 MIN_SHAPE_ERROR_M = 0.002
@@ -175,6 +180,7 @@ class GrabCutSegmenter:
         self._head = shaped.body.weights.argmax(axis=1) == HEAD_JOINT
         self._scale = WorkingResolution(shaped)
         self._wider_m = 0.0
+        self._gain: float | None = None
         self._shape_error_m = INITIAL_SHAPE_ERROR_M
         self.mask_count, self.agreement = 0, 0.0
 
@@ -192,6 +198,7 @@ class GrabCutSegmenter:
         if size_px != frame.size_px:
             way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
             rgb = cv2.resize(rgb, size_px, interpolation=way)
+        rgb = self._brighten(rgb)
         around, shape = self._expected_shape(pose, small)
         self._background.reset_if_moved(
             small, rgb, shape.signed_distance_px > 2.0 * UNKNOWN_BAND_M * around.px_per_m
@@ -215,6 +222,18 @@ class GrabCutSegmenter:
             return found
         change = cv2.resize(found - mixed, frame.size_px, interpolation=cv2.INTER_LINEAR)
         return np.clip(_blend(alpha, weight, shape, frame.size_px) + change, 0.0, 1.0)
+
+    def _brighten(
+        self, rgb: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Brighten a dark video, all frames alike, and smooth its noise: limits are in levels."""
+        if self._gain is None:
+            bright = max(1.0, float(np.percentile(rgb, 98)))
+            self._gain = BRIGHT_LEVEL / bright if bright < DARK_LEVEL else 1.0
+        if self._gain == 1.0:
+            return rgb
+        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), NOISE_BLUR_PX)
+        return np.clip(self._gain * smooth, 0.0, 255.0).astype(np.uint8)
 
     def _refine_border(
         self,

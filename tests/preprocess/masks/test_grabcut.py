@@ -103,6 +103,16 @@ def test_clothes_wider_than_the_body_are_segmented(shaped, camera, film):
     assert 0.6 < find.agreement < 0.95
 
 
+def test_the_person_is_found_in_a_twentieth_of_the_light(shaped, camera, film, rng):
+    find, found = GrabCutSegmenter(shaped), []
+    for index in range(6):
+        frame, pose, true = film(0.3 * index, index)
+        noisy = frame.rgb / 20.0 + rng.normal(0.0, 1.5, frame.rgb.shape)
+        dark = replace(frame, rgb=np.clip(noisy, 0, 255).astype(np.uint8))
+        found.append(agreement(find(dark, pose, camera), true))
+    assert min(found[2:]) > 0.9
+
+
 def test_the_background_model_helps_where_poses_are_off(shaped, camera, film):
     def shifted(pose: BodyPose) -> BodyPose:
         return replace(pose, root_translation=pose.root_translation + np.array([0.03, 0.0, 0.0]))
