@@ -22,11 +22,18 @@ from apps.batching.live_table import CaptureState, LiveTable
 from apps.batching.local_executor import AttemptExecutor, LocalExecutor
 from apps.batching.node_resources import usable_cores
 from apps.batching.ray_executor import RAY_LOCAL, RayExecutor
-from apps.batching.remote_files import is_url
+from apps.batching.remote_files import RemoteFileError, is_url
 from apps.batching.summary_page import BatchSummary, CorePrice, write_summary
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console, StderrConsole
-from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, run_command
+from apps.cli.exit_codes import (
+    DONE,
+    INTERRUPTED,
+    NO_AVATAR,
+    RESOURCE_UNAVAILABLE,
+    CommandExit,
+    run_command,
+)
 from apps.cli.interrupt import stop_on_interrupt
 from apps.cli.output_paths import check_disjoint_from_inputs, check_writable
 from apps.run.ingest_arguments import IngestArguments
@@ -163,7 +170,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
     given = parse_arguments(BatchArguments, PROGRAM, fill_ray_address(words[:cut]))
-    return run_command(PROGRAM, lambda: batch(given, words[cut + 1 :], StderrConsole()))
+
+    def run() -> int:
+        try:
+            return batch(given, words[cut + 1 :], StderrConsole())
+        except RemoteFileError as error:
+            raise CommandExit(str(error), RESOURCE_UNAVAILABLE) from error
+
+    return run_command(PROGRAM, run)
 
 
 def fill_ray_address(words: Sequence[str]) -> list[str]:

@@ -15,10 +15,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, final
 
-from apps.batching.ingest_attempt import PACKAGE_NAME, AttemptOutcome
-from apps.batching.remote_files import is_url, list_files, open_remote, read_text, send_files
+from apps.batching.ingest_attempt import FAILED_NAME, PACKAGE_NAME, folder_of
+from apps.batching.remote_files import (
+    RemoteFileError,
+    explain_errors,
+    is_url,
+    list_files,
+    open_remote,
+    read_text,
+    send_files,
+)
 from apps.cli.console import Console
-from apps.cli.exit_codes import BAD_INPUT, DONE, RESOURCE_UNAVAILABLE, CommandExit
+from apps.cli.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
 from apps.run.run_lock import claim_folder
 from capture.atomic_files import atomic_folder, check_replaceable_folder, write_text_atomically
 from capture.output_file_list import OutputFileList
@@ -27,8 +35,6 @@ RESULTS_NAME = "results.jsonl"
 """One line per attempt."""
 PARTS_NAME = "_parts"
 """Folder with a results file for each part of a batch that was split by --index and --of."""
-FAILED_NAME = "_failed"
-"""Folder with the logs of captures without an avatar."""
 REMOTE_LOCK_NAME = "_lock.json"
 """Name of the lock behind a URL; it exists as long as a batch writes there."""
 PUSH_INTERVAL_S = 30.0
@@ -83,12 +89,6 @@ class AttemptRecord:
     def reserved_core_s(self) -> float:
         """Core-seconds for which the machine was paid: wall time of the cores asked for."""
         return self.wall_s * float(self.machine.get("used_cores", 1))
-
-
-def attempt_status(outcome: AttemptOutcome) -> str:
-    """Return the status of an attempt by the exit code of ia-ingest."""
-    known: dict[int | None, str] = {DONE: "done", BAD_INPUT: "refused"}
-    return known.get(outcome.exit_code, "failed")
 
 
 @final
@@ -170,7 +170,8 @@ class BatchFolder:
             os.fsync(file.fileno())
         self._records[record.identity] = record
         if self.url is not None and time.monotonic() - self._pushed_at > PUSH_INTERVAL_S:
-            self.push()
+            with suppress(RemoteFileError):  # the next push sends it
+                self.push()
 
     def check_place(self, name: str) -> None:
         """Check that the folder of a capture may be written.
@@ -192,7 +193,7 @@ class BatchFolder:
         failed = self.path / FAILED_NAME / name
         if self.url is not None:
             if files:  # others were sent by the machine that made them
-                send_files(f"{self.url}/{self.folder_of(name, status)}", files, last=PACKAGE_NAME)
+                send_files(f"{self.url}/{folder_of(name, status)}", files, last=PACKAGE_NAME)
             return
         if status == "done":
             OutputFileList(failed).remove_all()
@@ -200,15 +201,10 @@ class BatchFolder:
                 failed.rmdir()
         if not files:
             return
-        with atomic_folder(self.path / self.folder_of(name, status)) as part:
+        with atomic_folder(self.path / folder_of(name, status)) as part:
             for relative, content in files.items():
                 (part / relative).parent.mkdir(parents=True, exist_ok=True)
                 (part / relative).write_bytes(content)
-
-    @staticmethod
-    def folder_of(name: str, status: str) -> str:
-        """Return the folder of an attempt's files, relative to --out."""
-        return name if status == "done" else f"{FAILED_NAME}/{name}"
 
     def has_package(self, name: str) -> bool:
         """Whether the avatar of a capture is there."""
@@ -235,10 +231,10 @@ class BatchFolder:
         """Send the results file, and renew the lock, if the folder is a URL."""
         if self.url is None:
             return
+        self._pushed_at = time.monotonic()
         own = self.path / self.results_name
         files = {self.results_name: own.read_bytes()} if own.exists() else {}
         send_files(self.url, files | {self._lock_name: self._lock_label()})
-        self._pushed_at = time.monotonic()
 
     def _read(self) -> None:
         parts = sorted(self.path.glob(f"{PARTS_NAME}/*/{RESULTS_NAME}"))
@@ -261,12 +257,14 @@ class BatchFolder:
     @contextmanager
     def _remote_lock(self) -> Iterator[None]:
         """Create an object that only one process can create, and remove it at the end."""
-        system, path = open_remote(f"{self.url}/{self._lock_name}")
-        try:
-            system.pipe_file(path, self._lock_label(), mode="create")
-        except FileExistsError:
-            self._check_abandoned(f"{self.url}/{self._lock_name}")
-            system.pipe_file(path, self._lock_label())
+        own = f"{self.url}/{self._lock_name}"
+        system, path = open_remote(own)
+        with explain_errors(own, "create"):
+            try:
+                system.pipe_file(path, self._lock_label(), mode="create")
+            except FileExistsError:
+                self._check_abandoned(own)
+                system.pipe_file(path, self._lock_label())
         try:
             others = [f"{self.url}/{REMOTE_LOCK_NAME}"]
             if self.part is None:
@@ -276,7 +274,8 @@ class BatchFolder:
                 self._check_abandoned(lock)
             yield
         finally:
-            system.rm_file(path)
+            with explain_errors(own, "remove"):
+                system.rm_file(path)
 
     def _check_abandoned(self, lock: str) -> None:
         """Raise if a lock was renewed a short time ago."""

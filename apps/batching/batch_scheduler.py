@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import final
 
-from apps.batching.batch_folder import AttemptRecord, BatchFolder, attempt_status
+from apps.batching.batch_folder import AttemptRecord, BatchFolder
 from apps.batching.capture_discovery import BatchCapture
 from apps.batching.ingest_attempt import AttemptOutcome, IngestJob
 from apps.batching.live_table import CaptureState, LiveTable
@@ -142,7 +142,6 @@ class BatchScheduler:
         common, options = self._limits.job, dict(capture.options)
         cores = options.setdefault("threads", common.cores)
         asked_mb = NEED_MARGIN * self._need_mb if self._need_mb else FIRST_NEED_MB
-        url = self._folder.url
         return replace(
             common,
             name=capture.name,
@@ -152,7 +151,7 @@ class BatchScheduler:
             cores=cores,
             gpus=self._limits.gpus if options.get("device") == "cuda" else 0.0,
             memory_mb=common.limit_mb or asked_mb,
-            send_to=None if url is None else f"{url}/{capture.name}",
+            send_to=self._folder.url,
         )
 
     def _start(self, job: IngestJob) -> None:
@@ -166,7 +165,7 @@ class BatchScheduler:
         if outcome.interrupted:
             self._set(job.name, status="waiting")
             return
-        status = attempt_status(outcome)
+        status = outcome.status
         self._folder.place_files(job.name, outcome.files, status)
         record = AttemptRecord(
             capture=job.name,

@@ -33,6 +33,8 @@ TURNING_NAME = "turning.webp"
 """The animation of report.html as a file, for the summary."""
 PACKAGE_NAME = "avatar.iavatar"
 """The avatar; it is sent last."""
+FAILED_NAME = "_failed"
+"""Folder in --out with the logs of captures without an avatar."""
 KEPT_FILES = (
     LOG_NAME, TURNING_NAME, "report.json", "report.html", "cameras.npz", "poses.npz",
     "tracking/poses.npz", "tracking/grade.json", PACKAGE_NAME,
@@ -69,7 +71,7 @@ class IngestJob:
         scratch: Folder on the node's own disk.
         disk_bytes: Bytes that all attempts on a node may have fetched at a time; None for any.
         checkpoint: Whether the checkpoint is brought back too.
-        send_to: URL to which files are sent; None to hand them back.
+        send_to: URL of --out, to which files are sent; None to hand them back.
     """
 
     name: str
@@ -113,6 +115,22 @@ class AttemptOutcome:
     files: dict[str, bytes] = field(default_factory=dict)
     interrupted: bool = False
 
+    @property
+    def status(self) -> str:
+        """Return "done", "refused" (bad input) or "failed", by the exit code."""
+        return attempt_status(self.exit_code)
+
+
+def attempt_status(exit_code: int | None) -> str:
+    """Return "done", "refused" (bad input) or "failed"."""
+    known: dict[int | None, str] = {DONE: "done", BAD_INPUT: "refused"}
+    return known.get(exit_code, "failed")
+
+
+def folder_of(name: str, status: str) -> str:
+    """Return the folder of a capture's files, relative to --out."""
+    return name if status == "done" else f"{FAILED_NAME}/{name}"
+
 
 def run_attempt(
     job: IngestJob,
@@ -139,7 +157,8 @@ def run_attempt(
             files = _collect(folder / job.name, folder / LOG_NAME, checkpoint=job.checkpoint)
             figures = read_figures(files.get("report.json", b""))
             if job.send_to is not None and not stopped():
-                send_files(job.send_to, files, last=PACKAGE_NAME)
+                place = f"{job.send_to}/{folder_of(job.name, attempt_status(code))}"
+                send_files(place, files, last=PACKAGE_NAME)
                 files = {}
     except InputError as error:
         return AttemptOutcome(exit_code=BAD_INPUT, cause=str(error), machine=machine)

@@ -10,12 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from apps.cli.exit_codes import CommandExit
 from capture.input_error import InputError
 
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 """Start of a URL."""
 VERSION_KEYS = ("ETag", "etag", "md5Hash", "LastModified", "updated", "mtime", "created")
 """What tells that a remote file has changed, best first."""
+
+
+class RemoteFileError(OSError):
+    """A remote file system refused or failed; the message names the URL."""
 
 
 class ListedFile(NamedTuple):
@@ -57,14 +62,18 @@ def _list_local(place: Path) -> Iterator[tuple[str, ListedFile]]:
 
 
 def _list_remote(url: str) -> dict[str, ListedFile]:
-    with _explained(url, "list"):
-        system, path = open_remote(url)
-        found = system.find(path, detail=True)
-    files = {}
+    try:
+        with explain_errors(url, "list"):
+            system, path = open_remote(url)
+            found = system.find(path, detail=True)
+    except RemoteFileError as error:
+        raise InputError(f"{error}. Check the address, and the credentials.") from error
+    files, base = {}, path.rstrip("/")
     for name, entry in sorted(found.items()):
-        if "/." not in name and entry.get("size") is not None:
+        below = name.removeprefix(base)
+        if "/." not in below and entry.get("size") is not None:
             version = next((str(entry[key]) for key in VERSION_KEYS if entry.get(key)), "")
-            files[system.unstrip_protocol(name)] = ListedFile(int(entry["size"]), version)
+            files[url.rstrip("/") + below] = ListedFile(int(entry["size"]), version)
     return files
 
 
@@ -94,7 +103,7 @@ def read_text(place: str) -> str:
     try:
         if not is_url(place):
             return Path(place).read_text(encoding="utf-8-sig")
-        with _explained(place, "read"):
+        with explain_errors(place, "read"):
             system, path = open_remote(place)
             return system.cat_file(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -113,7 +122,7 @@ def fetch_inputs(
         folder: Where to write.
 
     Raises:
-        OSError: If a file cannot be fetched, or has another size than listed.
+        RemoteFileError: If a file cannot be fetched, or has another size than listed.
     """
     local = {}
     for root in filter(is_url, [video, *map(str, options.values())]):
@@ -123,11 +132,11 @@ def fetch_inputs(
         path = local[root].joinpath(*url[len(root.rstrip("/")) :].strip("/").split("/"))
         path = Path(str(path).rstrip("/"))
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _explained(url, "fetch"):
+        with explain_errors(url, "fetch"):
             system, name = open_remote(url)
             system.get_file(name, str(path))
         if path.stat().st_size != size:
-            raise OSError(f"{url} has {path.stat().st_size} bytes; {size} were listed.")
+            raise RemoteFileError(f"{url} has {path.stat().st_size} bytes; {size} were listed.")
     moved = {name: str(local.get(str(value), value)) for name, value in options.items()}
     kept = {name: value for name, value in options.items() if moved[name] == str(value)}
     return str(local.get(video, video)), {**moved, **kept}
@@ -137,9 +146,9 @@ def send_files(url: str, files: Mapping[str, bytes], *, last: str = "") -> None:
     """Write files below a URL; each appears whole, and `last` after all others.
 
     Raises:
-        OSError: If a file cannot be written.
+        RemoteFileError: If a file cannot be written.
     """
-    with _explained(url, "write to"):
+    with explain_errors(url, "write to"):
         system, base = open_remote(url)
         for name in sorted(files, key=lambda name: name == last):
             path = f"{base.rstrip('/')}/{name}"
@@ -148,11 +157,12 @@ def send_files(url: str, files: Mapping[str, bytes], *, last: str = "") -> None:
 
 
 @contextmanager
-def _explained(url: str, verb: str) -> Iterator[None]:
-    """Turn whatever a remote file system raises into an OSError that names the URL."""
+def explain_errors(url: str, verb: str) -> Iterator[None]:
+    """Turn whatever a remote file system raises into a `RemoteFileError`."""
     try:
         yield
-    except InputError:
+    except (InputError, CommandExit):
         raise
     except Exception as error:  # each file system has errors of its own
-        raise OSError(f"cannot {verb} {url}: {type(error).__name__}: {error}") from error
+        message = f"cannot {verb} {url}: {type(error).__name__}: {error}"
+        raise RemoteFileError(message) from error

@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from apps.batching.batch_folder import AttemptRecord, BatchFolder
-from apps.batching.ingest_attempt import LOG_NAME, TURNING_NAME
+from apps.batching.ingest_attempt import LOG_NAME, TURNING_NAME, folder_of
 from apps.batching.live_table import CaptureState
 from apps.report.report_schema import format_psnr
 from capture.input_error import InputError
@@ -244,7 +244,7 @@ def _tails_table(summary: BatchSummary) -> str:
 def _card(state: CaptureState, place: int) -> str:
     record, name = state.record, state.capture.name
     figures = {} if record is None else record.figures
-    folder = quote(BatchFolder.folder_of(name, state.status))
+    folder = quote(folder_of(name, state.status))
     words, link, inside = "not learnt yet", "", ""
     if record is not None and state.status == "done":
         words = format_psnr(figures.get("psnr"), figures.get("verdict"))

@@ -28,9 +28,13 @@ def act(words):
             held.append(bytearray(b"x" * 20_000_000))
             time.sleep(0.02)
     if "bad" not in words:  # a shorter end of training, as in tests/apps/conftest.py
+        from apps.animation.driving_motion import demo_motion
         from avatar.training import held_out_pose_fitting
         from export.bake import bake_tables, fine_tuning
-        bake_tables.FINE_TUNING_PICTURES = 4
+        demo_motion.__defaults__ = (6,)
+        fine_tuning.ROUNDS = 1
+        bake_tables.FINE_TUNING_PICTURES = 2
+        bake_tables.VOXEL_FACTORS = (1.6, 1.6)
         fine_tuning.TRAINING_PX = fine_tuning.VALIDATION_PX = 128
         held_out_pose_fitting.CORRECTIONS_PER_FRAME = 4
 
