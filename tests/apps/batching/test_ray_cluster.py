@@ -60,7 +60,7 @@ def records(out: Path) -> list[dict]:
 
 
 def wait_for_done(count: int, out: Path, batch: subprocess.Popen) -> None:
-    """Wait until so many avatars are there."""
+    """Wait for a number of avatars."""
     while sum(record["status"] == "done" for record in records(out)) < count:
         assert batch.poll() is None, batch.communicate()
         time.sleep(0.2)
