@@ -156,7 +156,7 @@ def _curve_caption(curve: Sequence[CurvePoint]) -> str:
     scored = [len(point.frames) for point in curve if point.frames]
     drops = largest_drops(curve)
     text = ""
-    sets = {(p.video, tuple(number for number, _ in p.frames)) for p in curve if p.frames}
+    sets = {(p.video, frozenset(number for number, _ in p.frames)) for p in curve if p.frames}
     if len(sets) > len({video for video, _ in sets}):
         text = (
             f"Points average different sets of frames ({min(scored)} to {max(scored)}), so the "
@@ -237,13 +237,14 @@ def _by_side(shares: Mapping[str, float]) -> str:
 
 def _pairs(pairs: Sequence[ComparisonPair]) -> str:
     figures = (
-        f'<figure><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
+        f'<figure tabindex="0"><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
         f'<img src="{pair.render}" alt="frame {pair.frame} rendered"></div>'
         f"<figcaption>frame {pair.frame}: video | avatar, "
         f"{escape(format_psnr(pair.psnr, pair.verdict))}</figcaption></figure>"
         for pair in pairs
     )
-    return f'<div class="pairs">{"".join(figures)}</div>' if pairs else ""
+    told = '<p class="legend">Click a pair to enlarge it, and beside it to go back.</p>'
+    return f'<div class="pairs">{"".join(figures)}</div>{told}' if pairs else ""
 
 
 def _animation(data_uri: str | None) -> str:

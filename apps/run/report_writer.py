@@ -80,7 +80,7 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     return f", and check poses and masks: {shlex.join(words)}"
 
 
-ANIMATION_PX = 320
+ANIMATION_PX = 480
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""

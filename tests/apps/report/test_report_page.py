@@ -148,6 +148,9 @@ def test_the_page_explains_drops_of_the_curve():
     assert "2 held-out frames were scored" in same
     other = replace(fallen, frames=((3, 28.0), (13, 16.0)), video=2)
     assert "different sets" not in report_page(report(curve=(nine, fallen, other)), name="clip")
+    ordered = replace(nine, frames=((9, 20.0), (19, 21.0)))
+    reordered = replace(ordered, frames=ordered.frames[::-1])
+    assert "different sets" not in report_page(report(curve=(ordered, reordered)), name="clip")
     assert "best is 2.0 dB" in same
     assert "drops could not be measured" in report_page(report(curve=(one,)), name="clip")
 
@@ -222,6 +225,8 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
     assert "Skipped, pose invalid: frame 7." in page
     assert "url(" not in page
     assert "prefers-color-scheme: dark" in page
+    assert 'tabindex="0"' in page  # a click enlarges a pair, by its focus alone
+    assert "Click a pair to enlarge it" in page
 
 
 def test_a_page_without_pictures_or_scores_is_whole_too():
