@@ -237,7 +237,8 @@ def _by_side(shares: Mapping[str, float]) -> str:
 
 def _pairs(pairs: Sequence[ComparisonPair]) -> str:
     figures = (
-        f'<figure tabindex="0"><div class="two"><img src="{pair.truth}" alt="frame {pair.frame} of the video">'
+        f'<figure tabindex="0"><div class="two"><img src="{pair.truth}" '
+        f'alt="frame {pair.frame} of the video">'
         f'<img src="{pair.render}" alt="frame {pair.frame} rendered"></div>'
         f"<figcaption>frame {pair.frame}: video | avatar, "
         f"{escape(format_psnr(pair.psnr, pair.verdict))}</figcaption></figure>"
