@@ -8,7 +8,7 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32
 
 MEMORY_FRAMES = 30.0
 """Length of the running mean, frames."""
@@ -27,18 +27,51 @@ MIN_SAMPLES = 50
 """Fewest known background pixels from which gains are estimated."""
 
 
+SIGHT_WINDOW_PX = 7
+"""Edge of the windows in which a background is recognized, px."""
+MIN_TEXTURE = 7.0
+"""Least standard deviation of a channel in a window that can be recognized, in levels."""
+MAX_UNLIKE_FRACTION = 0.2
+"""Largest squared difference from the plate in a window, relative to the plate's own variance."""
+MIN_KNOWN_FRACTION = 0.7
+"""Least fraction of a window that must be known."""
+
+PixelMask = Bool[np.ndarray, "height width"]
+
+
 class PlateColors(NamedTuple):
-    """The background at some pixels of a frame.
+    """The background in a part of a frame.
 
     Attributes:
-        known: Which of the pixels are known; the others have no row below.
+        known: Which pixels are known.
         mean: Their colors at the frame's exposure, in levels.
         variance: Variance of a channel.
     """
 
-    known: Bool[np.ndarray, "pixels"]
-    mean: Float32[np.ndarray, "3 known"]
-    variance: Float32[np.ndarray, "known"]
+    known: PixelMask
+    mean: Float32[np.ndarray, "3 height width"]
+    variance: Float32[np.ndarray, "height width"]
+
+    def in_sight(self, image: Float32[np.ndarray, "3 height width"]) -> PixelMask:
+        """Where the same part of the frame shows the background's texture: no person is before it.
+
+        A flat background of a sleeve's color says little, leaves and books say nearly everything.
+        """
+        window = SIGHT_WINDOW_PX, SIGHT_WINDOW_PX
+        weight = self.known.astype(np.float32)
+        share = cv2.blur(weight, window)
+        off, texture, squared = (np.zeros_like(weight) for _ in range(3))
+        for seen, mean in zip(image, self.mean, strict=True):
+            expected = mean * weight
+            off += (seen - mean) ** 2
+            squared += expected * mean
+            texture -= cv2.blur(expected, window) ** 2
+        off = cv2.blur(off * weight, window)
+        texture /= np.maximum(share, np.float32(0.01))
+        texture += cv2.blur(squared, window)
+        textured = texture > np.float32(3.0 * MIN_TEXTURE**2) * share
+        alike = off < np.float32(MAX_UNLIKE_FRACTION) * texture
+        return self.known & (share > MIN_KNOWN_FRACTION) & textured & alike
 
 
 @final
@@ -81,19 +114,14 @@ class BackgroundPlate:
                 self._gain = np.ones(3, np.float32)
                 return
 
-    def at(
-        self, rows: Int[np.ndarray, "pixels"], columns: Int[np.ndarray, "pixels"]
-    ) -> PlateColors:
-        """The background at some pixels of the aligned frame."""
-        index = rows * self._frames.shape[1] + columns
-        frames = self._frames.ravel()[index]
-        known = frames >= MIN_SEEN_FRAMES
-        index, frames = index[known], frames[known]
+    def within(self, part: tuple[slice, slice]) -> PlateColors:
+        """The background in some rows and columns of the aligned frame."""
+        frames = self._frames[part]
         # The mean of a few frames is uncertain itself.
-        variance = np.maximum(self._variance.ravel()[index], np.float32(MIN_SPREAD**2))
-        variance *= np.float32(1.0) + np.float32(2.0) / frames
-        mean = np.stack([plane.ravel()[index] for plane in self._mean])
-        return PlateColors(known, mean * self._gain[:, None], variance)
+        variance = np.maximum(self._variance[part], np.float32(MIN_SPREAD**2))
+        variance *= np.float32(1.0) + np.float32(2.0) / np.maximum(frames, np.float32(1.0))
+        mean = self._mean[:, part[0], part[1]] * self._gain[:, None, None]
+        return PlateColors(frames >= MIN_SEEN_FRAMES, mean, variance)
 
     def update(
         self,

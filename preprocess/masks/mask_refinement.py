@@ -4,8 +4,10 @@ The network's mask is coarse: a pixel of its square is several of the frame, fin
 between arm and trunk are lost. It is right at large, though, so only a band around its border is
 decided again, by Bayes' rule: the network's probability is the prior; the likelihoods are those of
 a pixel's color under the colors of person and background nearby, under the histograms of both, and,
-where a static camera has seen it, under the background itself (`BackgroundPlate`). A guided filter
-makes neighbors of like color agree and carries the result to full size.
+where a static camera has seen it, under the background itself (`BackgroundPlate`). Where
+its texture is in plain sight, there is no person. A guided filter makes neighbors of like color
+agree and carries the result to full size; before a known background, the border is then moved to
+where the colors change (`refine_border`).
 """
 
 from typing import NamedTuple, final
@@ -16,6 +18,8 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from preprocess.masks.background_plate import BackgroundPlate, PlateColors
 from preprocess.masks.guided_filter import apply_coefficients, guided_coefficients
+from preprocess.masks.local_colors import color_density, local_densities
+from preprocess.masks.matting import refine_border
 from preprocess.tracking.keypoints import CroppedMask
 
 WORKING_SCALE = 2.0
@@ -26,7 +30,7 @@ RESCALE_MARGIN = 0.4
 
 OUTER_BAND, INNER_BAND = 6.0, 6.0
 """Reach of the band outside and inside the mask's border, in the network's pixels."""
-MARGIN = 4.0
+MARGIN = 2.0
 """Width of the background beyond the band that is looked at, in the network's pixels."""
 SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
 """Probability, and distance from the border, of pixels that teach the person's colors."""
@@ -35,14 +39,6 @@ SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
 
 LOCAL_SIGMA = 3.0
 """Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
-NEIGHBORS_PX = 3
-"""Reduction of the image from which they are learnt."""
-LOCAL_SPREAD = 14.0
-"""Standard deviation of a color that the neighborhood's mean misses, in levels."""
-UNSEEN = 0.02
-"""Density of a color that no neighbor has, relative to `REFERENCE_SPREAD`."""
-REFERENCE_SPREAD = 16.0
-"""Standard deviation, in levels, at whose peak a density is 1."""
 UNSEEN_BACKGROUND = 0.00025
 """The same where the background is known."""
 SHADOW_GAIN = 0.6, 1.05
@@ -50,7 +46,7 @@ SHADOW_GAIN = 0.6, 1.05
 SHADOW_PROBABILITY = 0.1
 """Probability that a background pixel is shaded or lit by the person."""
 
-LOCAL_WEIGHT, PLATE_WEIGHT, HISTOGRAM_WEIGHT = 0.5, 2.0, 0.75
+LOCAL_WEIGHT, PLATE_WEIGHT, HISTOGRAM_WEIGHT = 0.5, 1.0, 0.75
 """Weights of the three log likelihood ratios."""
 MAX_LOG_RATIO = 8.0
 """Bound of their sum."""
@@ -63,6 +59,12 @@ FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
 CONTRAST = 2.0
 """Steepening of the filtered mask around 1/2."""
+SURE_ALPHA = 0.8
+"""Alpha above which a pixel teaches the person's color beside the border."""
+NEARBY_PX = 3
+"""Edge of the window in which it does, in twice the working image's pixels."""
+NEARBY_SPREAD = 14.0
+"""Standard deviation of a color that the window's mean misses, in levels."""
 PERSON_FREE_ALPHA = 0.05
 """Alpha below which a pixel enters the background plate."""
 
@@ -149,36 +151,44 @@ class MaskRefiner:
         self._plate.align(image, far)
         found = np.zeros(self._frame_px[::-1], np.float32)
         if band is not None:
-            alpha = self._decide(band, square_px / times)
+            (top, left), (height, width) = band.corner, band.prior.shape
+            part = np.s_[top : top + height, left : left + width]
+            plate = self._plate.within(part)
+            alpha = self._decide(band, plate, square_px / times)
             fitted = guided_coefficients(band.image, alpha, FILTER_RADIUS_PX, FILTER_TOLERANCE)
-            (top, left), (height, width) = band.corner, alpha.shape
             filtered = apply_coefficients(band.image, fitted)
             person = filtered > PERSON_FREE_ALPHA
-            kernel = np.ones((5, 5), np.uint8)
-            far[top : top + height, left : left + width] = (
-                cv2.dilate(person.astype(np.uint8), kernel) == 0
-            )
+            far[part] = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
             there = np.s_[
                 top * times : (top + height) * times, left * times : (left + width) * times
             ]
-            found[there] = _enlarge(rgb[there], fitted, times)
+            moved = _move_border(band.image, _steepen(filtered), plate)
+            found[there] = _enlarge(rgb[there], fitted, times, moved)
         self._plate.update(image, far)
         return found
 
-    def _decide(self, band: _Band, unit_px: float) -> Plane:
+    def _decide(self, band: _Band, plate: PlateColors, unit_px: float) -> Plane:
         """Probability of person in the band, and 0 or 1 beyond it."""
-        front, back = _local_densities(band, LOCAL_SIGMA * unit_px)
-        ratio = np.float32(LOCAL_WEIGHT) * np.log(front / back)
-        plate = self._plate.at(band.rows + band.corner[0], band.columns + band.corner[1])
-        behind = _plate_density(band.colors[:, plate.known], plate)
-        ratio[plate.known] = np.float32(PLATE_WEIGHT) * np.log(front[plate.known] / behind)
-        ratio += np.float32(HISTOGRAM_WEIGHT) * self._histogram_ratio(band)
+        shown = plate.in_sight(band.image)
+        band = band._replace(person=band.person & ~shown, background=band.background | shown)
         at = band.rows, band.columns
+        front, back = local_densities(
+            band.image, (band.person, band.background), at, LOCAL_SIGMA * unit_px
+        )
+        ratio = np.float32(LOCAL_WEIGHT) * np.log(front / back)
+        known = plate.known[at]
+        rows, columns = band.rows[known], band.columns[known]
+        behind = _plate_density(
+            band.colors[:, known], plate.mean[:, rows, columns], plate.variance[rows, columns]
+        )
+        ratio[known] = np.float32(PLATE_WEIGHT) * np.log(front[known] / behind)
+        ratio += np.float32(HISTOGRAM_WEIGHT) * self._histogram_ratio(band)
         prior = np.clip(band.prior[at], np.float32(0.01), np.float32(0.99))
         odds = prior / (np.float32(1.0) - prior)
         odds *= np.exp(np.clip(ratio, np.float32(-MAX_LOG_RATIO), np.float32(MAX_LOG_RATIO)))
         alpha = band.inside.astype(np.float32)
         alpha[at] = odds / (np.float32(1.0) + odds)
+        alpha[shown] = 0.0
         return _without_islands(alpha, band.inside)
 
     def _histogram_ratio(self, band: _Band) -> Pixels:
@@ -248,51 +258,16 @@ def _without_islands(alpha: Plane, inside: PixelMask) -> Plane:
     return alpha * kept[labels]
 
 
-def _density(squared: Pixels, variance: Pixels) -> Pixels:
-    """Density of a color at a squared distance from its mean, relative to the reference peak."""
-    ratio = np.float32(REFERENCE_SPREAD**2) / variance
-    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
-
-
-def _local_densities(band: _Band, sigma_px: float) -> tuple[Pixels, Pixels]:
-    """Density of the band's colors among the sure colors of person and of background near each.
-
-    Means and variances are those of a smaller image.
-    """
-    height, width = band.inside.shape
-    small_px = -(-width // NEIGHBORS_PX), -(-height // NEIGHBORS_PX)
-    planes = [cv2.resize(each, small_px, interpolation=cv2.INTER_AREA) for each in band.image]
-    planes.append(planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2)
-    index = band.rows // NEIGHBORS_PX * small_px[0] + band.columns // NEIGHBORS_PX
-
-    def density(chosen: PixelMask) -> Pixels:
-        share = cv2.resize(chosen.astype(np.float32), small_px, interpolation=cv2.INTER_AREA)
-        share = (share > 0.99).astype(np.float32)
-        weight, *moments = (
-            cv2.GaussianBlur(each * share, (0, 0), sigma_px / NEIGHBORS_PX).ravel()[index]
-            for each in (np.ones_like(share), *planes)
-        )
-        inverse = np.float32(1.0) / np.maximum(weight, np.float32(1e-6))
-        variance, squared = moments[3] * inverse, np.zeros_like(weight)
-        for color, moment in zip(band.colors, moments, strict=False):
-            mean = moment * inverse
-            variance -= mean * mean
-            squared += (color - mean) ** 2
-        variance = np.maximum(variance, np.float32(0.0)) / np.float32(3.0)
-        near = _density(squared, variance + np.float32(LOCAL_SPREAD**2))
-        near[weight < 1e-3] = 0.0
-        return near + np.float32(UNSEEN)
-
-    return density(band.person), density(band.background)
-
-
-def _plate_density(colors: Float32[np.ndarray, "3 pixels"], plate: PlateColors) -> Pixels:
+def _plate_density(
+    colors: Float32[np.ndarray, "3 pixels"],
+    mean: Float32[np.ndarray, "3 pixels"],
+    variance: Pixels,
+) -> Pixels:
     """Density of colors where the background is known, as it is or in the person's shadow.
 
     A shadow has the background's color, only darker (Horprasert et al. 1999, a statistical approach
     for background subtraction and shadow detection).
     """
-    mean = plate.mean
     dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
     length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
     gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
@@ -301,8 +276,8 @@ def _plate_density(colors: Float32[np.ndarray, "3 pixels"], plate: PlateColors) 
         plain += (color - expected) ** 2
         shaded += (color - gain * expected) ** 2
     return (
-        np.float32(1.0 - SHADOW_PROBABILITY) * _density(plain, plate.variance)
-        + np.float32(SHADOW_PROBABILITY) * _density(shaded, plate.variance)
+        np.float32(1.0 - SHADOW_PROBABILITY) * color_density(plain, variance)
+        + np.float32(SHADOW_PROBABILITY) * color_density(shaded, variance)
         + np.float32(UNSEEN_BACKGROUND)
     )
 
@@ -313,18 +288,48 @@ def _color_bins(colors: Float32[np.ndarray, "3 *pixels"]) -> Int[np.ndarray, "*p
     return (red << 8) | (green << 4) | blue
 
 
+def _steepen(alpha: Plane) -> Plane:
+    """Steepen a mask around 1/2."""
+    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - 0.5 * CONTRAST)
+    return np.clip(steep, np.float32(0.0), np.float32(1.0))
+
+
+def _move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
+    """How much more person a pixel is, by its color between the person's and the background's."""
+    sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
+    size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
+    half_px = (size_px[0] + 1) // 2, (size_px[1] + 1) // 2
+    weight, *planes = (
+        cv2.resize(each, half_px, interpolation=cv2.INTER_AREA)
+        for each in (sure.astype(np.float32), *image)
+    )
+    inverse = np.float32(1.0) / np.maximum(cv2.blur(weight, window), np.float32(1e-6))
+    front = [cv2.blur(plane * weight, window) * inverse for plane in planes]
+    total = planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2
+    spread = cv2.blur(total * weight, window) * inverse
+    spread -= front[0] ** 2 + front[1] ** 2 + front[2] ** 2
+    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + NEARBY_SPREAD**2)
+    spread[inverse > 1e5] = np.inf
+    person = cv2.resize(cv2.merge(front), size_px)
+    behind = np.where(plate.known, np.sqrt(plate.variance), np.float32(np.inf))
+    colors, before = (np.moveaxis(each, 0, 2) for each in (image, plate.mean))
+    known = cv2.resize(spread.astype(np.float32), size_px, interpolation=cv2.INTER_NEAREST)
+    return refine_border(colors, alpha, (before, behind), (person, known)) - alpha
+
+
 def _enlarge(
     rgb: UInt8[np.ndarray, "rows columns 3"],
     coefficients: Float32[np.ndarray, "4 height width"],
     times: int,
+    moved: Plane,
 ) -> Float32[np.ndarray, "rows columns"]:
-    """The mask at full size: the filter's enlarged coefficients, applied to the frame."""
+    """The mask at full size: the filter's coefficients, enlarged and applied, and moved."""
     size_px = rgb.shape[1], rgb.shape[0]
 
     def full(plane: Plane) -> Float32[np.ndarray, "rows columns"]:
         return plane if times == 1 else cv2.resize(plane, size_px)
 
-    alpha = np.float32(CONTRAST) * full(coefficients[3]) + np.float32(0.5 - 0.5 * CONTRAST)
+    alpha = full(coefficients[3])
     for channel, slope in zip(cv2.split(np.ascontiguousarray(rgb)), coefficients, strict=False):
-        alpha += cv2.multiply(channel, full(slope), scale=CONTRAST, dtype=cv2.CV_32F)
-    return np.clip(alpha, np.float32(0.0), np.float32(1.0))
+        alpha = alpha + cv2.multiply(channel, full(slope), dtype=cv2.CV_32F)
+    return np.clip(_steepen(alpha) + full(moved), np.float32(0.0), np.float32(1.0))

@@ -9,7 +9,7 @@ color. The result is the mean over all displacements.
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Shaped, UInt8
 
 from preprocess.body.silhouette import signed_distance_px
 
@@ -84,10 +84,16 @@ def _local_mean_color(
 
 BORDER_SIGMA_PX = 0.35
 """Standard deviation of a mask's border error, px."""
-BORDER_SHIFTS_PX = np.arange(-1.6, 1.61, 0.2, dtype=np.float32)
+BORDER_SHIFTS_PX = np.linspace(-1.6, 1.6, 9, dtype=np.float32)
 """Displacements of the border that are averaged, px."""
 BORDER_BAND_PX = 2.2
 """Largest distance from the mask's border of a pixel that is refined, px."""
+
+COLOR_AXES = np.array(
+    [[0.45, 0.35, -0.118], [0.88, -0.293, -0.232], [0.171, -0.057, 0.35]], np.float32
+)
+"""Brightness, red and blue of a color, as columns. The last two count less: videos store them at
+half the resolution, so at a border they are the neighbors' too."""
 
 OUTLIER_PROBABILITY = 0.2
 """Probability of a foreground color that the appearance model does not predict."""
@@ -100,7 +106,7 @@ LIKELIHOOD_EXPONENT = 0.6
 
 
 def refine_border(
-    rgb: UInt8[np.ndarray, "height width 3"],
+    rgb: Shaped[np.ndarray, "height width 3"],
     alpha: Float32[np.ndarray, "height width"],
     background: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
     foreground: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
@@ -108,7 +114,7 @@ def refine_border(
     """Move a mask's border to where the colors change from person to background.
 
     Args:
-        rgb: The image.
+        rgb: The image, in levels of any type.
         alpha: The mask.
         background: Expected background color of each pixel and its standard deviation, in levels.
         foreground: Expected color of the person and its standard deviation, in levels. Where
@@ -119,10 +125,8 @@ def refine_border(
     at = (np.abs(outside) < BORDER_BAND_PX) & np.isfinite(spread)
     away = outside[at]
     tried = np.clip(0.5 - (away[:, None] + BORDER_SHIFTS_PX), 0.0, 1.0).astype(np.float32)
-    off, apart = (
-        rgb[at].astype(np.float32) - background[0][at],
-        foreground[0][at] - background[0][at],
-    )
+    off = (rgb[at].astype(np.float32) - background[0][at]) @ COLOR_AXES
+    apart = (foreground[0][at] - background[0][at]) @ COLOR_AXES
     squared = (off**2).sum(axis=1)[:, None] - 2.0 * tried * (off * apart).sum(axis=1)[:, None]
     squared += tried**2 * (apart**2).sum(axis=1)[:, None]
     noise = (background[1][at] ** 2)[:, None] * (1.0 - tried) ** 2 + 1.0
@@ -132,7 +136,9 @@ def refine_border(
     likely += OUTLIER_PROBABILITY * _color_likelihood(
         squared, noise, tried, np.float32(OUTLIER_SPREAD)
     )
-    weight = likely**LIKELIHOOD_EXPONENT * np.exp(-0.5 * (BORDER_SHIFTS_PX / BORDER_SIGMA_PX) ** 2)
+    weight = np.float32(LIKELIHOOD_EXPONENT) * np.log(likely)
+    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(BORDER_SIGMA_PX)) ** 2
+    np.exp(weight, out=weight)
     found = alpha.copy()
     found[at] = (weight * tried).sum(axis=1) / weight.sum(axis=1)
     return found

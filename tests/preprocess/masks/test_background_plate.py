@@ -7,7 +7,7 @@ from preprocess.masks.background_plate import BackgroundPlate
 
 SIZE = 40, 60
 FREE = np.ones(SIZE, dtype=bool)
-ROWS, COLUMNS = (each.ravel() for each in np.mgrid[: SIZE[0], : SIZE[1]])
+ALL = np.s_[: SIZE[0], : SIZE[1]]
 
 
 def _wall() -> np.ndarray:
@@ -24,8 +24,8 @@ def _plate(frames: int) -> BackgroundPlate:
 
 def test_background_is_known_once_seen_twice() -> None:
     """One frame may be mistaken."""
-    assert not _plate(1).at(ROWS, COLUMNS).known.any()
-    assert _plate(2).at(ROWS, COLUMNS).known.all()
+    assert not _plate(1).within(ALL).known.any()
+    assert _plate(2).within(ALL).known.all()
 
 
 def test_what_was_never_free_stays_unknown() -> None:
@@ -35,30 +35,46 @@ def test_what_was_never_free_stays_unknown() -> None:
     for _ in range(3):
         plate.align(_wall(), free)
         plate.update(_wall(), free)
-    assert np.array_equal(plate.at(ROWS, COLUMNS).known, free.ravel())
+    assert np.array_equal(plate.within(ALL).known, free)
 
 
 def test_colors_follow_the_exposure() -> None:
     """A frame in other light is compared with the background in that light."""
     plate, gain = _plate(3), np.array([0.85, 0.95, 1.1], np.float32)[:, None, None]
     plate.align(gain * _wall(), FREE)
-    found = plate.at(ROWS, COLUMNS)
-    assert found.mean == pytest.approx((gain * _wall()).reshape(3, -1), abs=0.5)
+    found = plate.within(ALL)
+    assert found.mean == pytest.approx(gain * _wall(), abs=0.5)
 
 
 def test_moved_camera_forgets_the_background() -> None:
     """If a good part of the background differs, nothing is known until it was seen again."""
     plate, moved = _plate(5), np.roll(_wall(), 2, axis=2)
     plate.align(moved, FREE)
-    assert not plate.at(ROWS, COLUMNS).known.any()
+    assert not plate.within(ALL).known.any()
     for _ in range(2):
         plate.update(moved, FREE)
-    assert plate.at(ROWS, COLUMNS).mean == pytest.approx(moved.reshape(3, -1), abs=0.5)
+    assert plate.within(ALL).mean == pytest.approx(moved, abs=0.5)
 
 
 def test_another_size_keeps_the_background() -> None:
     """A person who comes nearer is looked at in a smaller image."""
     plate = _plate(3)
     plate.align(np.full((3, 20, 30), 130.0, np.float32), np.zeros((20, 30), dtype=bool))
-    rows, columns = (each.ravel() for each in np.mgrid[:20, :30])
-    assert plate.at(rows, columns).known.all()
+    assert plate.within(np.s_[:20, :30]).known.all()
+
+
+def test_texture_in_plain_sight_is_no_person() -> None:
+    """Leaves and books are recognized where no person is before them; a plain wall never is."""
+    frame = _wall()
+    frame[:, 10:30, 20:40] = 120.0  # a person
+    plate = _plate(3)
+    plate.align(frame, frame[0] != 120.0)
+    shown = plate.within(ALL).in_sight(frame)
+    assert not shown[10:30, 20:40].any()
+    assert shown[:6].all()
+    assert shown[34:].all()
+    plain, wall = BackgroundPlate(), np.full((3, *SIZE), 120.0, np.float32)
+    for _ in range(3):
+        plain.align(wall, FREE)
+        plain.update(wall, FREE)
+    assert not plain.within(ALL).in_sight(wall).any()

@@ -154,3 +154,42 @@ def test_things_of_the_persons_color_that_are_apart_stay_background() -> None:
     assert truth[spot].max() < 0.01
     assert alpha[spot].max() < 0.5
     assert _iou(alpha, truth) > 0.96
+
+
+def test_stripes_of_the_walls_color_stay_person() -> None:
+    """A shirt of red and white stripes before a wall that is nearly white."""
+    wall = np.full((SIZE_PX[1], SIZE_PX[0], 3), 205.0, np.float32)
+    stripes = np.where(np.arange(SIZE_PX[1])[:, None, None] // 8 % 2, COLOR, [222.0, 220.0, 216.0])
+    refiner, found = MaskRefiner(SIZE_PX), []
+    for number in range(12):
+        _, mask, truth = _frame((number % 8 - 4) * 5, wall)
+        rgb = truth[..., None] * stripes + (1.0 - truth[..., None]) * wall
+        rgb += np.random.default_rng(number).normal(0.0, 3.0, rgb.shape)
+        found.append(_iou(refiner(np.clip(rgb, 0.0, 255.0).astype(np.uint8), mask), truth))
+    assert np.mean(found[6:]) > 0.95
+
+
+def test_border_before_a_known_background_is_exact_to_a_part_of_a_pixel() -> None:
+    """Pixels of the border show how far they are person."""
+    refiner, off = MaskRefiner(SIZE_PX), []
+    wall = np.full((SIZE_PX[1], SIZE_PX[0], 3), 205.0, np.float32)
+    for number in range(12):
+        rgb, mask, truth = _frame((number % 8 - 4) * 5, wall)
+        off.append(
+            float(np.abs(refiner(rgb, mask) - truth)[(truth > 0.02) & (truth < 0.98)].mean())
+        )
+    assert np.mean(off[6:]) < 0.147
+
+
+def test_textured_background_that_the_network_takes_for_person_is_cleared() -> None:
+    """What the plate knows and the frame shows is not person, whatever the network says."""
+    refiner, background = MaskRefiner(SIZE_PX), _background(1)
+    for number in range(6):
+        refiner(*_frame((number - 3) * 5, background)[:2])
+    rgb, mask, truth = _frame(0, background)
+    values = mask.values.copy()
+    values[36:62, 42:54] = 255  # beside the left leg
+    wrong = CroppedMask(values=values, image_from_crop=mask.image_from_crop)
+    taken = (wrong.resample(SIZE_PX, SIZE_PX) > 0.9) & (truth < 0.01)
+    assert taken.sum() > 300
+    assert refiner(rgb, wrong)[taken].mean() < 0.1
