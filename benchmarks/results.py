@@ -26,7 +26,7 @@ from studio.shoot import ShootConfig, film_capture
 ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
 """Methods, in the order of the tables."""
 PICTURE_NAME = "results.webp"
-"""Beside the page: the truth and each method, of the first sample."""
+"""Beside the page: the truth and each method, of the first exact sample."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,9 @@ def write_page(job: ResultsJob, samples: list[ComparedSample], conditions: list[
     if job.write.exists() and BEGIN in (text := job.write.read_text()):
         before, after = text.split(BEGIN)[0], text.split(END)[1]
     write_text_atomically(job.write, before + "\n".join([BEGIN, *lines, END]) + after)
-    sheet = cv2.imread(str(folder_of(job, next(iter(found))) / "pictures.png"))
+    sheet = cv2.imread(
+        str(folder_of(job, min(found, key=lambda sample: sample.kind)) / "pictures.png")
+    )
     if sheet is not None:
         _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
         (job.write.parent / PICTURE_NAME).write_bytes(code.tobytes())
