@@ -2,7 +2,7 @@
 
 A striped shirt has several colors, none of which is their mean. So the sure pixels of a frame are
 sorted into a few colors (k-means), each with a spread; near a pixel the person's colors are these,
-mixed as often as they are found on the person around it, and the background's likewise.
+mixed as often as they are found on the person around it, and the same for the background.
 """
 
 import cv2
