@@ -62,7 +62,7 @@ class CompareArguments:
         ours          the product
 
     The preset "small" is each method at the size that learns most in a minute of one core; "paper"
-    has the paper's sizes, and needs hours.
+    has the paper's sizes, of which a step takes seconds to minutes (Anim-NeRF: 8 GB of memory).
 
     OUT then holds table.md, comparison.json, pictures.png (truth, then each method), and for each
     method scores.json and its pictures of held-out frames and, for a sample, of novel poses. A
