@@ -142,7 +142,7 @@ def _listed_captures(place: str, files: Mapping[str, ListedFile]) -> Iterator[Fo
         files = {Path(path).absolute().as_posix(): state for path, state in files.items()}
     if list(files) == [place]:  # a file: its parts lie beside it
         above = place.rsplit("/", 1)[0]
-        beside = list_files(above)
+        beside = files if place.startswith("http") else list_files(above)
         kept = _stem_parts(_Tree(above, beside), Path(place).name)
         options = {option: f"{above}/{name}" for option, name in kept.items()}
         yield Path(place).stem, place, options, _below(beside, [place, *options.values()])

@@ -28,8 +28,6 @@ MAX_ROWS = 16
 """Running captures that are listed."""
 MAX_ENDED = 8
 """Ended captures that are listed."""
-LINE_LENGTH = 48
-"""Longest excerpt of a log or a cause in the table, characters."""
 QUALITY = re.compile(r"(-?\d+\.\d+) dB(?: \(([a-z ]+)\))?")
 """A PSNR in the output of ia-ingest."""
 
@@ -99,10 +97,10 @@ class LiveTable:
             self._console.print(f"{self._counts(states, color=False)}", highlight=False)
 
     def log(self, state: CaptureState) -> None:
-        """Note the end of an attempt."""
+        """Note the end of an attempt; causes are printed on a terminal, too."""
         self._quality.pop(state.capture.name, None)
         self._ended.append(state)
-        if not self._console.is_terminal:
+        if not self._console.is_terminal or state.status in ("refused", "failed"):
             self._console.print(escape(_ended_line(state)), highlight=False)
 
     def _draw(self, states: list[CaptureState], progress: Mapping[str, AttemptProgress]) -> Group:
@@ -118,7 +116,7 @@ class LiveTable:
                 "[cyan]learning[/]" + (f" ({state.attempts + 1})" if state.attempts else ""),
                 format_duration(now - each.since),
                 self._quality.get(state.capture.name, ""),
-                escape(doing[:LINE_LENGTH]),
+                escape(doing),
             )
         if len(running) > MAX_ROWS:
             table.add_row(f"… and {len(running) - MAX_ROWS} more", "", "", "", "")
@@ -132,7 +130,7 @@ class LiveTable:
                 f"[{color}]{record.status}[/]",
                 format_duration(record.wall_s),
                 quality if record.status == "done" else "",
-                escape(record.figures.get("verdict") or record.cause)[:LINE_LENGTH],
+                escape(record.figures.get("verdict") or record.cause),
             )
         return Group(self._counts(states, color=True), table)
 

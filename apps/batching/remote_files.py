@@ -65,7 +65,7 @@ def _list_remote(url: str) -> dict[str, ListedFile]:
     try:
         with explain_errors(url, "list"):
             system, path = open_remote(url)
-            found = system.find(path, detail=True)
+            found = _find(system, path)
     except RemoteFileError as error:
         raise InputError(f"{error}. Check the address, and the credentials.") from error
     files, base = {}, path.rstrip("/")
@@ -75,6 +75,20 @@ def _list_remote(url: str) -> dict[str, ListedFile]:
             version = next((str(entry[key]) for key in VERSION_KEYS if entry.get(key)), "")
             files[url.rstrip("/") + below] = ListedFile(int(entry["size"]), version)
     return files
+
+
+def _find(system: Any, path: str) -> dict[str, dict[str, Any]]:
+    """Return the entries of a file, or of all files below a folder; none if it does not exist."""
+    try:
+        entry = system.info(path)
+    except FileNotFoundError:
+        return {}
+    if entry.get("mimetype") == "text/html":
+        raise InputError(
+            f"{path} is a web page: web servers list no folders. Name the files in a manifest "
+            "(docs/batch.md)."
+        )
+    return {path: entry} if entry["type"] == "file" else system.find(path, detail=True)
 
 
 def open_remote(url: str) -> tuple[Any, str]:

@@ -29,8 +29,10 @@ COLUMNS: tuple[str, ...] = (
 )  # fmt: skip
 """Columns of summary.csv."""
 STYLE = """
-main { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); }
-main a { display: block; aspect-ratio: 1; overflow: hidden; color: var(--soft); }
+main { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr));
+  align-items: start; }
+main a { display: block; padding: 0.45rem 0.8rem 0; color: var(--soft); }
+main .done a { padding: 0; aspect-ratio: 1; overflow: hidden; }
 main img { object-fit: cover; }
 main .failed, main .refused { border-color: var(--masked); }
 .filters { display: flex; flex-wrap: wrap; gap: 0.8rem; margin: 1.6rem 0 1rem; }

@@ -6,8 +6,11 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -75,9 +78,9 @@ def store(hooked, monkeypatch):
         server.wait()
 
 
-def learn(work: Path, *words: str) -> subprocess.CompletedProcess:
+def learn(work: Path, *words: str, place: str = "s3://films/may") -> subprocess.CompletedProcess:
     """Run ia-batch from the films in the store."""
-    command = [sys.executable, "-m", "apps.batch", "s3://films/may", "--cores", "1"]
+    command = [sys.executable, "-m", "apps.batch", place, "--cores", "1"]
     command += ["--scratch", str(work), *words]
     path = f"{ROOT}{os.pathsep}{os.environ['PYTHONPATH']}"
     return subprocess.run(
@@ -130,3 +133,24 @@ def test_without_credentials_the_store_says_so(tmp_path, store, monkeypatch):
     assert ended.returncode == 2, ended.stderr
     assert "cannot list s3://films/may" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_a_manifest_of_a_web_server_names_files(tmp_path, copies, hooked):
+    copies(tmp_path / "films", ["bad", "bad2"])
+    (tmp_path / "films" / "list.csv").write_text("capture,name\nbad.mp4,anna\nbad2.mp4,\n")
+    (tmp_path / "work").mkdir()
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path / "films"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        place = f"http://127.0.0.1:{server.server_port}"
+        words = ["--out", str(tmp_path / "out"), "--retries", "0"]
+        ended = learn(tmp_path / "work", *words, place=f"{place}/list.csv")
+        refused = learn(tmp_path / "work", *words, place=place)
+        server.shutdown()
+    lines = (tmp_path / "out" / "results.jsonl").read_text().splitlines()
+    status = {record["capture"]: record["cause"] for record in map(json.loads, lines)}
+    assert ended.returncode == 1, ended.stderr
+    assert set(status) == {"anna", "bad2"}
+    assert all("no video that can be opened" in cause for cause in status.values())
+    assert refused.returncode == 2
+    assert "web servers list no folders" in refused.stderr
