@@ -205,6 +205,7 @@ def _train_method(
 ) -> None:
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
     from baselines.systems.compared_systems import make_system, train_config
+    from benchmarks.hardware import Hardware
 
     config = train_config(data, arguments.seconds, arguments.steps)
     began = time.process_time()
@@ -232,6 +233,7 @@ def _train_method(
         found = {
             "method": name,
             "conditions": arguments.conditions(name),
+            "commit": Hardware.here().commit,
             "core_seconds": spent,
             "steps": system.steps,
             "training_frames": len(data.frames),

@@ -120,7 +120,9 @@ def write_page(job: ResultsJob, samples: list[ComparedSample], conditions: list[
     if not found:
         return
     track = "the studio's own turn" if job.motion is None else f"{job.motion.name}, on the spot"
-    lines = results_lines(found, [*conditions, f"filmed: {job.frames} frames, {track}"])
+    commits = sorted({each["commit"] for results in found.values() for each in results})
+    told = [f"trained at {', '.join(commits)}", f"filmed: {job.frames} frames, {track}"]
+    lines = results_lines(found, [*conditions, *told])
     if job.write is None:
         print("\n".join(lines))
         return

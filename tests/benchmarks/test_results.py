@@ -15,7 +15,7 @@ def result(method, novel):
         {"core_seconds": 30.0, "steps": 5, "held_out": 20.0, "novel": novel - 1.0},
         {"core_seconds": 60.0, "steps": 10, "held_out": 21.0, "novel": novel},
     ]
-    return {"method": method, "novel": scores, "held_out": scores, "curve": curve}
+    return {"method": method, "commit": "abc", "novel": scores, "held_out": scores, "curve": curve}
 
 
 def test_each_sample_is_a_column_and_the_gain_is_stated():
