@@ -58,7 +58,7 @@ def results_lines(found: Found, conditions: Sequence[str]) -> list[str]:
         ]
         lines += ["", *_score_table(part, "novel"), *_gain_lines(part)]
         lines += ["", f"## Held-out frames after {budget}", "", *_score_table(part, "held_out")]
-        lines += ["", "## Novel poses over time, and the time that is missing", ""]
+        lines += ["", f"## Novel poses over time, in runs of {budget}", ""]
         lines += [
             f"PSNR on four of the twelve poses, within a run of {budget}. Last column: core time "
             "until a method is as good as ours at the end; beyond the run it is extrapolated by "
