@@ -11,6 +11,8 @@ import pytest
 
 from apps import check, ingest
 from apps.checks.capture_validation import check_opened_capture, passes_quick_check
+from apps.checks.preflight_check import preflight_check
+from apps.cli.console import Console
 from benchmarks import capture_corruptions
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -144,9 +146,16 @@ def test_two_persons_who_touch_in_the_masks_are_named(spoilt, call_check):
     assert "another person" in said
 
 
-def with_neighbor(folder: Path) -> None:
-    """Shows the person twice in each mask, side by side and touching."""
-    for path in (folder / "masks").iterdir():
+def test_ingest_warns_of_masks_that_nothing_explains(spoilt, capsys):
+    inputs = CaptureInputs(video=spoilt(lambda folder: with_neighbor(folder, share=0.6)))
+    preflight_check(open_capture(inputs), inputs, Console(), force=False)
+    assert "times the body's area" in " ".join(capsys.readouterr().err.split())
+
+
+def with_neighbor(folder: Path, share: float = 1.0) -> None:
+    """Shows the person twice in masks, side by side and touching."""
+    paths = sorted((folder / "masks").iterdir())
+    for path in paths[: round(share * len(paths))]:
         mask = cv2.imread(str(path), 0)
         moved = np.roll(mask, round(0.25 * mask.shape[1]), axis=1)
         cv2.imwrite(str(path), np.maximum(mask, moved))
