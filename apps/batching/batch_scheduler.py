@@ -14,9 +14,9 @@ from apps.batching.ingest_attempt import AttemptOutcome, IngestJob
 from apps.batching.live_table import CaptureState, LiveTable
 from apps.batching.local_executor import AttemptExecutor
 
-FIRST_NEED_MB = 2000.0
-"""Memory to ask for until a capture has been measured, MB: 540 px and 300 frames take 1,650
-(docs/benchmarks.md)."""
+FIRST_NEED_MB = 2500.0
+"""Memory to ask for until a capture has been measured, MB: a tracked film of 300 frames took 2,242
+(docs/scale.md)."""
 NEED_MARGIN = 1.15
 """Factor from the most memory measured to what captures ask for."""
 POLL_S = 0.5
