@@ -103,7 +103,8 @@ def test_parts_and_their_merge(tmp_path, copies):
     assert len(records(out)) == 3
 
 
-def test_sigterm_ends_what_runs_at_once(tmp_path, copies, hooked):
+@pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
+def test_sigterm_or_a_second_ctrl_c_ends_what_runs(tmp_path, copies, hooked, signals):
     copies(tmp_path / "films", ["hangs"])
     running = start(tmp_path / "films", tmp_path / "out", "--scratch", str(tmp_path / "work"))
     for _ in range(1200):
@@ -112,8 +113,14 @@ def test_sigterm_ends_what_runs_at_once(tmp_path, copies, hooked):
             break
         assert running.poll() is None
         time.sleep(0.05)
-    running.send_signal(signal.SIGTERM)
-    _, said = running.communicate(timeout=60)
+    assert running.stderr is not None
+    running.send_signal(signals[0])
+    said = ""
+    if signals[1:]:  # the first one waits for what runs
+        while "Stopping; captures that run are finished first" not in said:
+            said += running.stderr.readline()
+        running.send_signal(signals[1])
+    said += running.communicate(timeout=60)[1]
     assert running.returncode == 130
     assert "To go on: ia-batch" in said
     assert not (tmp_path / "out" / "results.jsonl").exists()
