@@ -72,9 +72,29 @@ def natural_sort_key(path: Path) -> list[tuple[int, str]]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The pictures in a folder, in natural order."""
+    """The pictures in a folder, in natural order.
+
+    Raises:
+        InputError: If a pipe or a device has the name of one.
+    """
     images = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-    return sorted((file for file in images if not file.name.startswith(".")), key=natural_sort_key)
+    found = sorted((file for file in images if not file.name.startswith(".")), key=natural_sort_key)
+    for file in found:
+        refuse_pipe(file)
+    return found
+
+
+def refuse_pipe(path: Path) -> None:
+    """Refuse what is neither a file nor a folder: it may be waited for without end.
+
+    Raises:
+        InputError: Naming it.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(
+            f"{path} is a pipe or a device; a file or a folder was expected. Store what comes from "
+            "it in a file first, or name a camera as camera:0."
+        )
 
 
 def read_image(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.hdr_video import HDR_TRANSFERS, tone_map_hdr
-from capture.image_folder import has_cutout_alpha, silence_opencv
+from capture.image_folder import has_cutout_alpha, refuse_pipe, silence_opencv
 from capture.input_error import InputError
 
 MAX_DECODE_FAILURES = 16
@@ -170,8 +170,9 @@ def open_decoder(path: Path) -> VideoDecoder:
     """PyAV's decoder if it is installed, which sees damage and knows HDR; else OpenCV's.
 
     Raises:
-        InputError: If it is no video that can be opened.
+        InputError: If it is no video that can be opened, or no file.
     """
+    refuse_pipe(path)
     if importlib.util.find_spec("av") is not None:
         return PyAvDecoder(path)
     return OpenCvDecoder(path)

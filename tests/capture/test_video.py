@@ -1,5 +1,8 @@
 """Videos as they come from phones: whole, turned, cut off, rotten, or none at all."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -105,6 +108,16 @@ def test_what_is_no_video_is_refused(tmp_path, content, capfd):
     with pytest.raises(InputError, match="no video that can be opened"):
         open_source(path)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+@pytest.mark.parametrize(("name", "given"), [("film", "film"), ("v.mp4", ""), ("images/0.png", "")])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name, given):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    os.mkfifo(tmp_path / name)
+    for place in (tmp_path / given, Path(os.devnull)):
+        with pytest.raises(InputError, match="pipe or a device"):
+            open_source(place)
 
 
 def test_a_missing_file_is_refused(tmp_path):
