@@ -20,7 +20,7 @@ from apps.batching.capture_discovery import BATCH_OPTIONS, find_captures, resolv
 from apps.batching.ingest_attempt import IngestJob
 from apps.batching.live_table import CaptureState, LiveTable
 from apps.batching.local_executor import AttemptExecutor, LocalExecutor
-from apps.batching.node_resources import usable_cores
+from apps.batching.node_resources import LOCK_NAME, usable_cores
 from apps.batching.ray_executor import RAY_LOCAL, RayExecutor
 from apps.batching.remote_files import RemoteFileError, is_url
 from apps.batching.summary_page import BatchSummary, CorePrice, write_summary
@@ -35,7 +35,7 @@ from apps.cli.exit_codes import (
     run_command,
 )
 from apps.cli.interrupt import stop_on_interrupt
-from apps.cli.output_paths import check_disjoint_from_inputs, check_writable
+from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file, check_writable
 from apps.run.ingest_arguments import IngestArguments
 from capture.input_error import InputError
 
@@ -134,8 +134,11 @@ class BatchArguments:
             raise InputError(f"--index is {self.index}, but must lie between 0 and {self.of - 1}.")
         if self.merge and self.index is not None:
             raise InputError("--merge joins all parts; omit --index and --of.")
+        inputs = [Path(place) for place in self.captures if not is_url(place)]
+        if self.scratch is not None and self.ray is None:  # else it is on other machines
+            place = self.scratch / LOCK_NAME
+            check_output_file(place, "--scratch", inputs, overwrite=True, below=False)
         if not is_url(self.out):
-            inputs = [Path(place) for place in self.captures if not is_url(place)]
             check_disjoint_from_inputs(Path(self.out), "--out", inputs)
             if Path(self.out).exists() and not Path(self.out).is_dir():
                 raise InputError(f"--out {self.out} is a file; a folder was expected.")
@@ -208,6 +211,9 @@ def batch(arguments: BatchArguments, ingest_options: Sequence[str], rich: Stderr
     common = parse_common_options(ingest_options)
     with console.status("looking for captures"):
         captures = find_captures(arguments.captures, common)
+    if not is_url(arguments.out):  # of manifests, too
+        named = {place for capture in captures for place in capture.paths()}
+        check_disjoint_from_inputs(Path(arguments.out), "--out", sorted(named))
     if arguments.part is not None:
         captures = captures[arguments.index :: arguments.of]
     with folder.claim(console):

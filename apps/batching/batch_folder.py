@@ -29,10 +29,17 @@ from apps.cli.console import Console
 from apps.cli.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
 from apps.run.run_lock import claim_folder
 from capture.atomic_files import atomic_folder, check_replaceable_folder, write_text_atomically
+from capture.input_error import InputError
 from capture.output_file_list import OutputFileList
 
 RESULTS_NAME = "results.jsonl"
 """One line per attempt."""
+FIRST_WORDS = b'{"capture": "'
+"""How every results file begins."""
+SUMMARY_NAMES = ("summary.csv", "summary.html")
+"""What is written at the end of a batch."""
+WRITTEN_NAMES = frozenset({RESULTS_NAME, *SUMMARY_NAMES})
+"""Names that no capture may have."""
 PARTS_NAME = "_parts"
 """Folder with a results file for each part of a batch that was split by --index and --of."""
 REMOTE_LOCK_NAME = "_lock.json"
@@ -140,11 +147,13 @@ class BatchFolder:
 
         Raises:
             CommandExit: If another batch is writing here.
+            InputError: If files of another program have the names of a batch's.
         """
         with ExitStack() as held:
             if self.url is not None:
                 self.path = Path(held.enter_context(TemporaryDirectory(prefix="ia-batch-mirror-")))
             own = self.path / self.results_name
+            self._check_names()
             if self.url is not None:
                 held.enter_context(self._remote_lock())
                 self._pull()
@@ -153,7 +162,6 @@ class BatchFolder:
                 held.enter_context(claim_folder(own.parent, console))
             else:
                 held.callback(OutputFileList(self.path).remove_if_empty)
-                OutputFileList(self.path).create()
             self._read()
             try:
                 yield
@@ -179,8 +187,14 @@ class BatchFolder:
         Raises:
             InputError: If it holds files of another program.
         """
+        if name in WRITTEN_NAMES:
+            raise InputError(
+                f"A capture cannot be called {name}, which is a file of the batch. Rename it, or "
+                "give a name in a manifest (docs/batch.md)."
+            )
         if self.url is None:
-            check_replaceable_folder(self.path / name)
+            for place in (self.path / name, self.path / FAILED_NAME / name):
+                check_replaceable_folder(place)
 
     def place_files(self, name: str, files: dict[str, bytes], status: str) -> None:
         """Write the files of an attempt, as a whole; those of a failed one into `_failed`.
@@ -218,6 +232,7 @@ class BatchFolder:
 
     def write_text(self, name: str, text: str, *, replace: bool | None = None) -> None:
         """Write a text file into the folder, whole or not at all; see `AtomicFile`."""
+        OutputFileList(self.path).create()
         write_text_atomically(self.path / name, text, replace=replace)
         if self.url is not None:
             send_files(self.url, {name: text.encode()})
@@ -235,6 +250,19 @@ class BatchFolder:
         own = self.path / self.results_name
         files = {self.results_name: own.read_bytes()} if own.exists() else {}
         send_files(self.url, files | {self._lock_name: self._lock_label()})
+
+    def _check_names(self) -> None:
+        """Raise if something of another program has the name of a file of the batch."""
+        parts = self.path.glob(f"{PARTS_NAME}/*/{RESULTS_NAME}")
+        wrong = [path for path in (self.path / RESULTS_NAME, *parts) if not _is_results(path)]
+        listed = OutputFileList(self.path)
+        summaries = [] if self.part is not None else [self.path / name for name in SUMMARY_NAMES]
+        wrong += [p for p in summaries if os.path.lexists(p) and not listed.owns(p.name)]
+        for path in wrong:
+            raise InputError(
+                f"{path} is not what ia-batch wrote (or was changed since), so it is not replaced. "
+                "Move it elsewhere, or name another folder (--out)."
+            )
 
     def _read(self) -> None:
         parts = sorted(self.path.glob(f"{PARTS_NAME}/*/{RESULTS_NAME}"))
@@ -302,6 +330,17 @@ class BatchFolder:
             local = self.path / name.removeprefix(f"{self.url}/")
             local.parent.mkdir(parents=True, exist_ok=True)
             local.write_text(read_text(name), encoding="utf-8")
+
+
+def _is_results(path: Path) -> bool:
+    """Whether a results file is ours, by its first line, or is not there; one cut short is ours."""
+    if not os.path.lexists(path):
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        line = file.readline(len(FIRST_WORDS))
+    return FIRST_WORDS.startswith(line)
 
 
 def read_records(lines: Iterable[str]) -> Iterator[AttemptRecord]:

@@ -57,6 +57,12 @@ class BatchCapture:
     input_key: str
     options_key: str
 
+    def paths(self) -> list[Path]:
+        """Return the local files and folders that it names."""
+        options = [str(self.options[key]) for key in PATH_OPTIONS if key in self.options]
+        named = [value for value in options if not KEYWORDS.fullmatch(value)]
+        return [Path(place) for place in (self.video, *named) if not is_url(place)]
+
 
 def find_captures(places: Iterable[str], common: Mapping[str, Any]) -> list[BatchCapture]:
     """Find the captures in folders, files, manifests and URLs.

@@ -1,6 +1,7 @@
 """Cores, memory and disk of the machine that an attempt runs on."""
 
 import os
+import re
 import shutil
 import socket
 import sys
@@ -22,6 +23,8 @@ PAGE_MB = 4096 / 1e6 if sys.platform == "win32" else os.sysconf("SC_PAGE_SIZE") 
 """Size of a memory page, MB."""
 WORK_PREFIX = "ia-batch-"
 """Start of the names of work folders on a node's disk."""
+WORK_PATTERN = re.compile(rf"{WORK_PREFIX}\d+-\d+")
+"""Names of work folders: process and time."""
 LOCK_NAME = "in-use"
 """File in a work folder: locked as long as its process lives; holds the bytes it has reserved."""
 POLL_S = 0.5
@@ -141,6 +144,8 @@ def _reserve(
 
 def _reserved_or_remove(folder: Path) -> int:
     """Return the bytes that a work folder has reserved; remove it if its process is gone."""
+    if WORK_PATTERN.fullmatch(folder.name) is None or folder.is_symlink():
+        return 0  # a user's, who likes the name
     try:
         with (folder / LOCK_NAME).open("rb+") as lock:
             if fcntl is None:
@@ -149,8 +154,10 @@ def _reserved_or_remove(folder: Path) -> int:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 return int(lock.read() or 0)
-    except (OSError, ValueError):
-        pass
+    except (OSError, ValueError):  # killed before it had a lock: it is empty, or a user's
+        with suppress(OSError):
+            folder.rmdir()
+        return 0
     shutil.rmtree(folder, ignore_errors=True)
     return 0
 

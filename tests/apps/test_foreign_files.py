@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from apps import check, evaluate, export, ingest, play, sample, track
+from apps import batch, check, evaluate, export, ingest, play, sample, track
 
 COMMANDS = {
-    "ia-check": check.main, "ia-evaluate": evaluate.main, "ia-export": export.main,
-    "ia-ingest": ingest.main, "ia-play": play.main, "ia-sample": sample.main,
-    "ia-track": track.main,
+    "ia-batch": batch.main, "ia-check": check.main, "ia-evaluate": evaluate.main,
+    "ia-export": export.main, "ia-ingest": ingest.main, "ia-play": play.main,
+    "ia-sample": sample.main, "ia-track": track.main,
 }  # fmt: skip
 
 OTHERS = (
@@ -23,8 +23,10 @@ OTHERS = (
     "cameras/01/intri.yml", "0000.png", "0001.png", "dance.npz", "truth/poses.npz", "index.html",
     "avatar.json", "mesh.glb", "mesh.ply", "clip.webm", "letter.txt", "table.md", "runs/a.png",
     ".avatar.iavatar.swp", ".report.1234.part.json", ".capture.99.old/letter.txt", "job.json",
+    "batch0/results.jsonl", "batch1/summary.html", "batch2/summary.csv", "batch3/_failed/bad/a.txt",
+    "batch4/_failed", "batch5/bad/b.txt", "batch6/_parts/0-of-2/results.jsonl",
     "grade.json", "skeleton.webm", "sub/grade.json", "film/skeleton.webm",
-    ".masks.1234.part/letter.txt",
+    ".masks.1234.part/letter.txt", "_failed/capture/ingest.log", "capture/notes.txt",
 )  # fmt: skip
 """Names of our own, and of others, that other people's files have."""
 
@@ -107,6 +109,15 @@ def called(line, **places):
         "ia-track {film} --out {hoard}/film/new.npz --overwrite",
         "ia-track {film} --out {hoard}/images/0000.png",
         "ia-track {film} --out {hoard}",
+        "ia-batch {film} --out {hoard}",
+        "ia-batch {film} --out {hoard}/letter.txt",
+        "ia-batch bad.mp4 --out {hoard}/batch0",
+        "ia-batch bad.mp4 --out {hoard}/batch1",
+        "ia-batch bad.mp4 --out {hoard}/batch2 --merge",
+        "ia-batch bad.mp4 --out {hoard}/batch3",
+        "ia-batch bad.mp4 --out {hoard}/batch4",
+        "ia-batch bad.mp4 --out {hoard}/batch5",
+        "ia-batch bad.mp4 --out {hoard}/batch6 --merge",
     ],
 )
 def test_a_place_with_other_peoples_files_is_refused(
@@ -114,6 +125,7 @@ def test_a_place_with_other_peoples_files_is_refused(
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("export.web.onnxruntime_web.runtime_files", dict)
+    (tmp_path / "bad.mp4").write_text("no video")
     before = contents(tmp_path)
     assert called(line, film=film, hoard=hoard, run=run, package=package) == 2
     assert contents(tmp_path) == before
@@ -159,6 +171,18 @@ def test_a_place_with_other_peoples_files_is_refused(
         "ia-track {above}/film.mp4 --masks {capture}/masks --out {capture}/masks/sub/new.npz",
         "ia-track {above}/film.mp4 --body {above}/body.npz --out {above}/body.npz --overwrite",
         "ia-track {above}/film.mp4 --out {run}/poses.npz",
+        "ia-batch {capture} --out {capture}",
+        "ia-batch {capture} --out {capture}/runs",
+        "ia-batch . --out .",
+        "ia-batch {capture} --out {above}",
+        "ia-batch {above}/link --out {capture}",
+        "ia-batch {capture}/video.mp4 --out {capture}",
+        "ia-batch {above}/rows.csv --out {capture}/runs",
+        "ia-batch {above}/rows.csv --out {above}/others",
+        "ia-batch {above}/film.mp4 --out {above}/new --scratch {above}/film.mp4",
+        "ia-batch {capture} --out {above}/new --scratch {capture}",
+        "ia-batch {capture} --out {above}/new --scratch {capture}/masks",
+        "ia-batch {above}/film.mp4 --out {capture}/masks -- --masks {capture}/masks",
     ],
 )
 def test_no_command_writes_over_what_it_reads(
@@ -168,10 +192,35 @@ def test_no_command_writes_over_what_it_reads(
     (tmp_path / "link").symlink_to(capture)
     os.link(capture / "video.mp4", tmp_path / "film.mp4")
     (tmp_path / "body.npz").write_text("mine")
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "poses.npz").write_text("mine")
+    rows = "capture,poses\n{0}/capture,\n{0}/film.mp4,{0}/others/poses.npz\n"
+    (tmp_path / "rows.csv").write_text(rows.format(tmp_path))
     before = contents(tmp_path)
     assert called(line, capture=capture, above=tmp_path, run=run, package=package) == 2
     assert contents(tmp_path) == before
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_batch_beside_other_peoples_files_leaves_them(hoard, tmp_path, monkeypatch, capsys):
+    for name in ("ia-batch-avatars/a.txt", "ia-batch-1-2/in-use-by-me.txt", "in-use"):
+        (hoard / name).parent.mkdir(exist_ok=True)
+        (hoard / name).write_text("mine")
+    (tmp_path / "bad.mp4").write_text("no video")
+    before = contents(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    line = "ia-batch bad.mp4 --out {hoard} --scratch {hoard} --retries 0"
+    for again in ("", " --again", " --index 0 --of 1", " --merge"):
+        assert called(line + again, hoard=hoard) == 1, capsys.readouterr().err
+        assert unchanged(before, tmp_path), again
+    kept = contents(hoard)
+    assert kept["_failed/bad/ingest.log"]
+    for name in ("results.jsonl", "summary.html"):
+        (hoard / name).write_text("mine")
+        before = contents(hoard)
+        assert called(line + " --again", hoard=hoard) == 2
+        assert contents(hoard) == before
+        (hoard / name).write_bytes(kept[name])
 
 
 @pytest.mark.slow
