@@ -36,7 +36,8 @@ for words in {commands!r}:
 
 
 def names(requirements: list[str]) -> set[str]:
-    return {requirement.split(">=")[0] for requirement in requirements}
+    """Names as they are imported."""
+    return {requirement.split(">=")[0].replace("-", "_") for requirement in requirements}
 
 
 def without(absent: set[str], commands: list[list[str]], folder: Path) -> list[str]:
