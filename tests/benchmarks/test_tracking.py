@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from avatar.events import Stepped, WaitingForFrame
 from benchmarks.first_tracked_step import FirstStep
 from benchmarks.tracking import (
-    PACKAGES_BEFORE,
+    OTHER_PACKAGES,
     TrackingJob,
     bare_film,
     measure_installation,
@@ -145,7 +145,7 @@ def test_a_bare_film_of_the_same_name_replaces_another(capture, tmp_path):
 
 
 def test_tracking_needs_no_new_package_and_fits_into_the_installation():
-    assert run_time_packages() == PACKAGES_BEFORE
+    assert run_time_packages() == OTHER_PACKAGES
     networks, packages = measure_installation()
     assert networks.value is not None
     assert 1.0 < networks.value < 25.0
