@@ -58,7 +58,8 @@ class IngestArguments:
 
     Exit codes: 0 done; 1 trained, but the avatar is not usable (verdict "failed" in the report; the
     package is written if there is anything to draw); 2 bad input; 3 disk full, device or run folder
-    busy (the checkpoint is kept); 130 Ctrl-C, after checkpoint and package were written.
+    busy (the checkpoint is kept); 130 Ctrl-C, after checkpoint and package, or the frames that were
+    tracked until then, were written.
     """
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]

@@ -2,12 +2,15 @@
 
 import json
 import shlex
+import threading
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from apps.cli.capture_options import format_frame_range
 from apps.cli.console import Console
+from apps.cli.exit_codes import INTERRUPTED, CommandExit
+from apps.cli.interrupt import stop_on_interrupt
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
 from apps.tracking.person_tracking import PersonTracking, needs_tracking, print_grade, track_person
@@ -24,9 +27,11 @@ def track_missing_poses(
     """Return the arguments with poses and masks that were tracked in the video.
 
     Unchanged if poses were given, or the source is live. Poses are written to the run's folder
-    tracking/, as ia-track writes them.
+    tracking/, as ia-track writes them. After Ctrl-C that folder holds the frames before it, and a
+    resumed run goes on with the next.
 
     Raises:
+        CommandExit: After Ctrl-C.
         InputError: If the video cannot be read, or no person is found in it.
         OSError: If the disk is full.
     """
@@ -35,19 +40,29 @@ def track_missing_poses(
         return arguments
     stored = _read_stored(run) if arguments.resume else None
     asked = _describe_request(arguments)
-    if stored is None or stored["request"] != asked:
+    if stored is not None and stored["request"] != asked:
+        stored = None
+    if stored is None or not stored["complete"]:
         beside = find_own_poses(arguments.video.parent)
         if beside is not None:
             console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
-        tracking = _track(inputs, run, console)
+        with stop_on_interrupt(console, "keeping the frames that were tracked") as stop:
+            tracking = _track(inputs, run, console, stop, resume=stored is not None)
         chosen = tracking.inputs.frames
         stored = {
             "request": asked,
             "frames": None if chosen is None else [chosen.start, chosen.stop, chosen.step],
             "masks": tracking.inputs.masks == run.tracking / "masks",
             "grade": tracking.grade.as_json(),
+            "complete": not tracking.interrupted,
         }
         write_text_atomically(run.tracking_grade, json.dumps(stored, indent=1) + "\n")
+        if stop.is_set():
+            raise CommandExit(
+                f"stopped by Ctrl-C. {tracking.grade.frames} tracked frames are kept in "
+                f"{run.tracking}: to go on from there, run the same command with --resume.",
+                INTERRUPTED,
+            )
         if tracking.grade.is_good_enough or arguments.force:
             print_grade(tracking.grade, console)
         else:
@@ -89,13 +104,20 @@ def read_tracking_report(arguments: IngestArguments, run: RunFolder) -> dict[str
     return None if stored is None else stored["grade"]
 
 
-def _track(inputs: CaptureInputs, run: RunFolder, console: Console) -> PersonTracking:
+def _track(
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    stop: threading.Event,
+    *,
+    resume: bool,
+) -> PersonTracking:
     """Track the person into the run's folder; leave no empty folder if that fails."""
     run.tracking.mkdir(parents=True, exist_ok=True)
     OutputFileList(run.tracking).create()
     OutputFileList(run.tracking).remove_temporaries()
     try:
-        return track_person(inputs, run.tracked_poses, console)
+        return track_person(inputs, run.tracked_poses, console, stop=stop, resume=resume)
     finally:
         OutputFileList(run.tracking).remove_if_empty()
         with suppress(OSError):  # not empty
@@ -126,6 +148,6 @@ def _read_stored(run: RunFolder) -> dict[str, Any] | None:
         stored = json.loads(run.tracking_grade.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    expected = {"request", "frames", "masks", "grade"}
+    expected = {"request", "frames", "masks", "grade", "complete"}
     usable = isinstance(stored, dict) and stored.keys() == expected
     return stored if usable and run.tracked_poses.is_file() else None

@@ -1,7 +1,7 @@
 """Key points of one person over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +63,12 @@ class KeypointTrack:
             size_px=size_px,
             times_s=None if times_s is None else np.array(times_s, dtype=np.float64),
         )
+
+    def join(self, later: "KeypointTrack") -> "KeypointTrack":
+        """This track and one of later frames, both with times and problems, as one."""
+        names = ("frames", "image_px", "world_m", "visibility", "presence", "times_s", "problems")
+        both = {name: (getattr(self, name), getattr(later, name)) for name in names}
+        return replace(self, **{name: np.concatenate(parts) for name, parts in both.items()})
 
     def as_arrays(self) -> dict[str, Shaped[np.ndarray, "..."]]:
         """The arrays that a pose file holds of it."""

@@ -66,6 +66,7 @@ def track_video(
     *,
     advance: Callable[[int], None] = lambda done: None,
     stop: threading.Event | None = None,
+    before: TrackedVideo | None = None,
 ) -> TrackedVideo:
     """Find the person in each wanted frame of a recording.
 
@@ -77,16 +78,15 @@ def track_video(
             person was not found. None writes none.
         advance: Called with the number of frames done.
         stop: Ends tracking early once it is set; what was found until then is returned.
+        before: What was found in the frames before those of `source`; it is returned with the rest.
 
     Raises:
         InputError: If the person is found in too few frames.
         OSError: If a mask cannot be written.
     """
-    frames: list[int] = []
+    frames, problems = list[int](), list[int]()
     found: list[PersonKeypoints] = []
-    problems: list[int] = []
-    finder = ProblemFinder()
-    times: dict[int, float] = {}
+    finder, times = ProblemFinder(), dict[int, float]()
     waiting: list[Future[None]] = []
     interrupted = False
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="masks") as pool:
@@ -112,10 +112,11 @@ def track_video(
     if mask_folder is not None and not interrupted:
         first = dict(zip(frames[:FRAMES_REFINED_AGAIN], found, strict=False))
         _refine_again(source, first, refine, mask_folder)
-    if len(found) < min(MIN_FOUND, max(1, len(times) // 4)) or not found:
-        raise InputError(_too_few_message(source, len(found), len(times)))
     track = KeypointTrack.of(frames, found, source.size_px, [times[number] for number in frames])
     track = replace(track, problems=np.array(problems, dtype=np.int64))
+    if before is not None:
+        track, times = before.keypoints.join(track), before.frame_times_s | times
+    _require_person(source, len(track), len(times))
     return TrackedVideo(keypoints=track, frame_times_s=times, interrupted=interrupted)
 
 
@@ -153,9 +154,12 @@ def _write_mask(
     path.write_bytes(code.tobytes())
 
 
-def _too_few_message(source: FrameSource, found: int, total: int) -> str:
+def _require_person(source: FrameSource, found: int, total: int) -> None:
+    """Raise InputError if the person was found in too few of the frames."""
+    if found and found >= min(MIN_FOUND, max(1, total // 4)):
+        return
     where = "none" if not found else f"only {found}"
-    return (
+    raise InputError(
         f"A person was found in {where} of {total} frames of {source.path}. Tracking needs one "
         "person, from head to feet in the picture, upright, in good light, at least a quarter of "
         "its height. Is the video rotated, or does it start before the person comes in "

@@ -1,14 +1,19 @@
 """ia-ingest of a video alone: the person is tracked first, or while the frames come."""
 
 import json
+import signal
 
+import numpy as np
 import pytest
 
 from apps import ingest
+from apps.cli.console import Console
 from apps.evaluation.evaluation_frames import held_out_frames
 from apps.run.run_folder import RunFolder
-from apps.tracking import tracked_run
+from apps.tracking import person_tracking, tracked_run
 from avatar.training import warmup
+from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
+from preprocess.capture_session import CaptureInputs
 from preprocess.live import tracked_stream
 from preprocess.poses.pose_file import read_motion
 from tests.apps.conftest import Outcome
@@ -45,6 +50,48 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert again.code == 0, again.err
     frames = held_out_frames(RunFolder(path=out), None)
     assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
+
+
+class CountingTracker(BlazePoseTracker):
+    """Ctrl-C comes in the ninth frame of all that it is shown."""
+
+    frames = 0
+
+    def __call__(self, rgb):
+        CountingTracker.frames += 1
+        if CountingTracker.frames == 9:
+            signal.raise_signal(signal.SIGINT)
+        return super().__call__(rgb)
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
+    monkeypatch.setattr(CountingTracker, "frames", 0)
+    monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
+    done, out = ingest_video()
+    assert done.code == 130
+    assert "9 tracked frames are kept" in done.complaint()
+    assert "--resume" in done.complaint()
+    first = read_motion(out / "tracking" / "poses.npz").keypoints
+    again, out = ingest_video("--resume")
+    assert again.code == 0, again.err
+    assert CountingTracker.frames == 9 + 1 + 11  # the ninth again: is it the same person?
+    all_frames = read_motion(out / "tracking" / "poses.npz").keypoints
+    assert all_frames.frames.tolist() == list(range(20))
+    np.testing.assert_array_equal(all_frames.image_px[:9], first.image_px)
+    assert len(list((out / "tracking" / "masks").glob("*.png"))) == 20
+
+
+def test_a_resumed_run_does_not_join_two_persons(video, tmp_path, monkeypatch):
+    poses = tmp_path / "out" / "poses.npz"
+    inputs = CaptureInputs(video=video, frames=slice(0, 8))
+    person_tracking.track_person(inputs, poses, Console())
+    monkeypatch.setattr(person_tracking, "SAME_PERSON", 0.0)
+    monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
+    monkeypatch.setattr(CountingTracker, "frames", 10)
+    inputs = CaptureInputs(video=video, frames=slice(0, 10))
+    person_tracking.track_person(inputs, poses, Console(), resume=True)
+    assert CountingTracker.frames == 10 + 1 + 10  # all once more
 
 
 @pytest.mark.slow
