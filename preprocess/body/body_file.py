@@ -33,7 +33,10 @@ def load_body_model(path: Path | None = None) -> BodyModel:
     """
     path = path or Path(str(files("preprocess") / "data" / "body24.npz"))
     if not path.is_file():
-        raise InputError(f"There is no body file {path}. Leave --body out for the embedded body.")
+        what = "is no file" if path.exists() else "does not exist"
+        raise InputError(
+            f"{path} {what}; a body file was expected. Leave --body out for the embedded body."
+        )
     if path.suffix.lower() == ".npz":
         arrays = read_npz(path, BODY_KEYS)
     elif path.suffix.lower() == ".pkl":

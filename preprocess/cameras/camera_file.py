@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from capture.camera import Camera, same_aspect_ratio
+from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.body_pose import Motion, RelativeFocalLength
@@ -74,6 +75,7 @@ def read_cameras(
             another aspect ratio.
     """
     path = resolve_camera_path(path)
+    refuse_pipe(path)
     if path.suffix.lower() != ".npz":
         return _read_external(path, size_px, source)
     return _read_npz_cameras(path, size_px)

@@ -13,7 +13,12 @@ from jaxtyping import Float, Float32, Shaped
 from PIL import Image, ImageOps
 
 from capture.camera import same_aspect_ratio
-from capture.image_folder import IMAGE_SUFFIXES, has_cutout_alpha, natural_sort_key
+from capture.image_folder import (
+    IMAGE_SUFFIXES,
+    has_cutout_alpha,
+    natural_sort_key,
+    refuse_pipe,
+)
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.video import VIDEO_SUFFIXES
@@ -191,6 +196,7 @@ def open_masks(path: Path, *, invert: bool | None = None, person: str | None = N
     """
     if not path.exists():
         raise InputError(f"There are no masks {path}; expected a folder of images, or an .npz.")
+    refuse_pipe(path)
     if path.is_dir():
         return _open_folder(path, invert)
     count, read = _open_file(path, person)
@@ -203,6 +209,8 @@ def _open_folder(path: Path, invert: bool | None) -> Masks:
     files = sorted((file for file in files if not file.name.startswith(".")), key=natural_sort_key)
     if not files:
         raise InputError(f"{path} holds no masks; expected images or .npy files, one per frame.")
+    for file in files:
+        refuse_pipe(file)
     names = tuple(file.stem for file in files)
     return Masks(path, len(files), lambda row: read_mask(files[row]), invert=invert, names=names)
 

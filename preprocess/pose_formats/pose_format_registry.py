@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.capture_paths import resolve_pose_path
@@ -135,6 +136,7 @@ def read_poses(
             that name.
     """
     path = resolve_pose_path(path)
+    refuse_pipe(path)
     if path.suffix.lower() == ".jsonl":
         return read_motion(path, default_model=default_model)
     content = read_untrusted_file(path)

@@ -50,6 +50,29 @@ def test_a_video_that_cannot_be_tracked(refused, capture):
     refused(capture / "video.mp4", words=["person", "--poses"])
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("poses", "p.npz"), ("poses", "p.jsonl"), ("cameras", "c.json"), ("masks", "m.mp4"),
+     ("body", "b.npz")],
+)  # fmt: skip
+def test_a_pipe_is_refused_instead_of_waited_for(refused, capture, tmp_path, option, name):
+    os.mkfifo(tmp_path / name)
+    refused(capture, f"--{option}", tmp_path / name, words=[name, "file", "expected"])
+
+
+def test_a_pipe_among_masks_is_refused(refused, capture):
+    masks_of(capture)[3].unlink()
+    os.mkfifo(masks_of(capture)[0].with_name("000003.png"))
+    refused(capture, words=["000003.png is a pipe"])
+
+
+@pytest.mark.parametrize("option", ["poses", "cameras", "masks", "body"])
+def test_a_folder_without_what_was_asked_for(refused, capture, tmp_path, option):
+    (tmp_path / "empty").mkdir()
+    refused(capture, f"--{option}", tmp_path / "empty", words=["empty", "expected"])
+
+
 @pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:grabcut"]])
 def test_poses_in_degrees(refused, capture, changed, flags):
     with np.load(capture / "poses.npz") as given:
