@@ -8,13 +8,15 @@ mean than a few of them in whole.
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
 from apps.cli.console import Console
+from apps.report.learning_curve import CurvePoint
+from apps.report.report_schema import finite_mean
 from avatar.evaluation.held_out import (
     HeldOutFrame,
     coarse_to_fine_order,
@@ -23,6 +25,7 @@ from avatar.evaluation.held_out import (
 )
 from avatar.evaluation.image_metrics import composite_on_white
 from avatar.evaluation.pixel_sample import PixelSample, score_fine_sample
+from avatar.evaluation.sharpness import better_verdict, overall_verdict
 from avatar.events import HeldOutScore
 from avatar.field.avatar_model import Avatar
 from avatar.render import render
@@ -58,6 +61,17 @@ class FinalScores:
     sampled: tuple[HeldOutScore, ...] = ()
     fitted: tuple[HeldOutScore, ...] = ()
     renderings: dict[int, WhiteImage] = field(default_factory=dict)
+
+    def summarize(self, last: CurvePoint) -> CurvePoint:
+        """The learning curve's last point with these scores, and the report's verdict on them."""
+        return replace(
+            last,
+            psnr=finite_mean([score.psnr for score in self.given]),
+            psnr_mask=finite_mean([score.psnr_mask for score in self.given]),
+            verdict=better_verdict(overall_verdict(self.given), overall_verdict(self.fitted)),
+            frames=tuple((score.frame, score.psnr) for score in self.given),
+            pixels=None,
+        )
 
 
 class _ScoredFrame(NamedTuple):

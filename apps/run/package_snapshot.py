@@ -13,6 +13,7 @@ from avatar.training.trainer import Trainer
 from export.bake.bake_tables import ExportRefused
 from export.bake.render_targets import PosedView
 from export.build import ExportReport, export_avatar
+from export.package.package_file import update_metrics
 from preprocess.capture_session import Capture
 from preprocess.observe import shrink_to_longer_side
 
@@ -78,6 +79,19 @@ def write_package_snapshot(
     except ExportRefused as error:
         return PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
     return PackageSnapshot(export_report=exported, refusal=None, ready_at=time.perf_counter())
+
+
+def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapshot:
+    """Replace the scores in the package that was written, if one was.
+
+    Raises:
+        OSError: If the disk is full; the package is kept as it was.
+    """
+    exported = snapshot.export_report
+    if exported is None:
+        return snapshot
+    size = update_metrics(exported.path, {"held_out": asdict(scores)})
+    return replace(snapshot, export_report=replace(exported, bytes=size))
 
 
 def prefer_final(quick: PackageSnapshot, final: PackageSnapshot) -> PackageSnapshot:

@@ -21,6 +21,7 @@ from apps.run.continual_learning import EarlierVideos, earlier_video_names
 from apps.run.package_snapshot import (
     PackageSnapshot,
     prefer_final,
+    store_scores,
     validation_views,
     write_package_snapshot,
 )
@@ -201,6 +202,8 @@ class TrainingSession:
         if quick:
             final = self._write_package("writing the final package, with finer detail", views)
             package = prefer_final(package, final)
+        if result.scores.given and self.curve:
+            package = store_scores(package, result.scores.summarize(self.curve[-1]))
         return replace(result, package=package)
 
     def _check_trained(self, result: TrainingResult) -> None:

@@ -84,6 +84,25 @@ def write_package(package: AvatarPackage, path: Path) -> int:
         return draft.finish(package)
 
 
+def update_metrics(path: Path, metrics: Mapping[str, Any]) -> int:
+    """Write other training metrics into a package's manifest, which keeps the rest of them.
+
+    Args:
+        path: A package that this program has just written.
+        metrics: Metrics to add or to replace, by name (JSON).
+
+    Returns:
+        The new size in bytes.
+
+    Raises:
+        OSError: If the disk is full; the package is then as it was.
+    """
+    with zipfile.ZipFile(path) as old, PackageWriter(path) as draft:
+        manifest = Manifest.from_json(old.read(MANIFEST_ENTRY))
+        draft.copy_entries(old)
+        return draft.close(replace(manifest, metrics={**manifest.metrics, **metrics}))
+
+
 @final
 class PackageWriter:
     """Writes a package under a temporary name, and removes it unless it is finished.
@@ -130,7 +149,21 @@ class PackageWriter:
         self._add(PREVIEW_ENTRY, package.preview)
         for number, frame in enumerate(package.golden):
             self._add(golden_entry(number), frame.tobytes())
-        manifest = replace(package.manifest, sha256=dict(self._sums))
+        return self.close(package.manifest)
+
+    def copy_entries(self, archive: zipfile.ZipFile) -> None:
+        """Add all entries of an older package but its manifest."""
+        for name in archive.namelist():
+            if name != MANIFEST_ENTRY:
+                self._add(name, archive.read(name))
+
+    def close(self, manifest: Manifest) -> int:
+        """Add the manifest with the checksums of what was added, and rename the package.
+
+        Returns:
+            Its size in bytes.
+        """
+        manifest = replace(manifest, sha256=dict(self._sums))
         self._add(MANIFEST_ENTRY, manifest.to_json().encode())
         self._archive.close()
         size = self._file.tell()

@@ -140,6 +140,7 @@ def without_baking(monkeypatch) -> None:
         )  # fmt: skip
 
     monkeypatch.setattr(package_snapshot, "export_avatar", export_nothing)
+    monkeypatch.setattr(package_snapshot, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(report_writer, "demo_animation", lambda player: "data:,")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)

@@ -131,10 +131,9 @@ def test_the_clock_counts_training_alone(report):
 def test_the_package_is_the_one_that_was_reported(run, report):
     assert (run / "avatar.iavatar").stat().st_size == report["package"]["bytes"]
     kept = Player.load(run / "avatar.iavatar").manifest.metrics
-    marks = report["curve"][:-1]  # it does not wait for the scores after the last step
-    assert (kept["held_out"] or {}).get("psnr") == pytest.approx(
-        marks[-1]["psnr"] if marks else None, abs=1e-4
-    )
+    assert kept["held_out"]["verdict"] == report["verdict"]
+    assert kept["held_out"]["psnr"] == pytest.approx(report["held_out"]["psnr"], abs=1e-4)
+    assert [frame for frame, _ in kept["held_out"]["frames"]] == report["held_out"]["frames"]
     assert kept["recipe"]["rays"] == report["recipe"]["rays"]
 
 
