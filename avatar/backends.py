@@ -16,15 +16,16 @@ from jaxtyping import Float32
 
 from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import (
+    FEATURES_PER_LEVEL,
     Backend,
     CorrespondenceTables,
     DensityGrid,
+    HashLevels,
     MarchSettings,
     RayBatch,
     RaySamples,
     SolvedCorrespondences,
 )
-from avatar.kernels.hash_levels import FEATURES_PER_LEVEL, HashLevels
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.kernels.torch_skinning import skin_points
 from capture.input_error import InputError
@@ -181,17 +182,12 @@ def _march_to_seeds(
     canonical: Float32[torch.Tensor, "points 3"],
 ) -> Float32[torch.Tensor, "points 3"]:
     """Canonical points that marching finds for skinned points; 0 where it finds none."""
-    extent = rig.box_high - rig.box_low
-    low, shape = torch.from_numpy(rig.box_low), np.array(rig.skin_distance.shape, dtype=np.float32)
-    nodes_per_m = torch.from_numpy((np.array(rig.weights.shape[:3], np.float32) - 1) / extent)
+    low, nodes_per_m = torch.from_numpy(rig.box_low), torch.from_numpy(rig.nodes_per_m)
     posed = skin_points(
         canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
     )
-    grid = DensityGrid(
-        torch.ones(rig.skin_distance.shape, dtype=torch.uint8),
-        torch.ones(rig.skin_distance.shape), low,
-        torch.from_numpy(shape / extent),
-    )  # fmt: skip
+    full = torch.ones(rig.skin_distance.shape)
+    grid = DensityGrid(full.to(torch.uint8), full, low, torch.from_numpy(rig.cells_per_m))
     rays = RayBatch(
         posed, torch.tensor([[0.6, 0.64, 0.48]]).repeat(len(posed), 1),
         torch.zeros(len(posed), dtype=torch.int32), torch.zeros(len(posed)),

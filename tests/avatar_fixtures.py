@@ -12,7 +12,7 @@ from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
-from avatar.kernels.hash_levels import HashLevels
+from avatar.kernels.backend_protocol import HashLevels
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer

@@ -119,6 +119,18 @@ class Rig:
             seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
 
+    @property
+    def nodes_per_m(self) -> Float32[np.ndarray, "3"]:
+        """Nodes of the skinning volume per metre along each axis."""
+        nodes = np.array(self.weights.shape[:3], dtype=np.float32) - 1
+        return nodes / (self.box_high - self.box_low)
+
+    @property
+    def cells_per_m(self) -> Float32[np.ndarray, "3"]:
+        """Occupancy cells per metre along each axis."""
+        cells = np.array(self.skin_distance.shape, dtype=np.float32)
+        return cells / (self.box_high - self.box_low)
+
     def skinning_nodes_within(self, reach_m: float) -> SparseSkinningNodes:
         """Sparse weights of the nodes about all cells within a distance of the skin, metres."""
         if reach_m not in self._nodes_by_reach:

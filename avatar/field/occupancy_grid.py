@@ -50,12 +50,11 @@ class OccupancyGrid:
     def __init__(self, rig: Rig, device: torch.device, *, band_m: float = CLOTHING_BAND_M) -> None:
         """Starts with the whole clothing band occupied."""
         band = torch.from_numpy(rig.skin_distance <= band_m).to(device)
-        cells = np.array(rig.skin_distance.shape, dtype=np.float32)
         self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
             density=torch.where(band, INITIAL_DENSITY, 0.0),
             low=torch.from_numpy(rig.box_low).to(device),
-            cells_per_m=torch.from_numpy(cells / (rig.box_high - rig.box_low)).to(device),
+            cells_per_m=torch.from_numpy(rig.cells_per_m).to(device),
         )
         self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)

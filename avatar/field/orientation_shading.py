@@ -67,8 +67,7 @@ class OrientationShading:
         slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-6)
         self._normals = torch.from_numpy(slope.astype(np.float32)).to(device)
         self._low = torch.from_numpy(rig.box_low).to(device)
-        cells_per_m = np.array(distance.shape, dtype=np.float32) / (rig.box_high - rig.box_low)
-        self._cells_per_m = torch.from_numpy(cells_per_m).to(device)
+        self._cells_per_m = torch.from_numpy(rig.cells_per_m).to(device)
         self._gram: Float64[Tensor, "harmonics harmonics"] = torch.zeros(
             HARMONICS, HARMONICS, dtype=torch.float64, device=device
         )

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import Backend
-from avatar.kernels.hash_levels import FEATURES_PER_LEVEL, HashLevels
+from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, Backend, HashLevels
 
 HIDDEN_WIDTH = 64
 """Width of the hidden layer."""

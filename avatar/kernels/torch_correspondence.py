@@ -1,9 +1,12 @@
 """Reference of the correspondence grid in plain torch: roots and second-order terms per cell."""
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from torch import Tensor
 
+from avatar.deformation.rig import Rig
+from avatar.kernels.backend_protocol import SolvedCorrespondences
 from avatar.kernels.torch_skinning import broyden_roots, interpolate_volume, skin_points
 
 MAX_ROOTS = 3
@@ -32,26 +35,22 @@ SkinningTensors = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def solve_correspondences(
-    volume: SkinningTensors,
-    seeds: Float[Tensor, "seeds 3"],
-    parts: Int32[Tensor, "seeds"],
-    distance: Float[Tensor, "cx cy cz"],
-    cells_per_m: Float[Tensor, "3"],
-    band_m: float,
-    cell_m: float,
-) -> tuple[Float[Tensor, "3"], Int32[Tensor, "gx gy gz"], Float[Tensor, "rows 12"]]:
-    """Corner, packed cells and roots of one pose's `CorrespondenceGrid`.
+    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float,
+    device: torch.device,
+) -> SolvedCorrespondences:  # fmt: skip
+    """Correspondence grid of one pose.
 
     A cell's roots are those that Broyden's method finds from the nearest seed of each of the four
     nearest body parts, if they are no farther from the canonical skin than the band.
-
-    Args:
-        volume: Skinning volume and bone transforms.
-        seeds, parts: Canonical points of the skin, metres, and the body part of each.
-        distance, cells_per_m: Distance from the canonical skin, metres, in cells of the box.
-        band_m: Distance from the skin that is covered, metres.
-        cell_m: Edge of a cell, metres.
     """
+    weights, box_low, nodes_per_m, matrices, seeds, parts, distance, cells_per_m = (
+        torch.from_numpy(part).to(device)
+        for part in (
+            rig.weights, rig.box_low, rig.nodes_per_m, bones,
+            rig.seeds, rig.seed_parts, rig.skin_distance, rig.cells_per_m,
+        )
+    )  # fmt: skip
+    volume = weights, box_low, nodes_per_m, matrices
     posed = skin_points(seeds, *volume)
     low = posed.amin(dim=0) - band_m
     shape = torch.ceil((posed.amax(dim=0) + band_m - low) / cell_m).long().tolist()
@@ -73,7 +72,9 @@ def solve_correspondences(
     cell, rank = kept.nonzero(as_tuple=True)
     warp, bent = taylor_expansion(root[cell, rank], center[cell], volume, cell_m)
     index, roots = _pack_cells(cell, warp, bent, len(center))
-    return low, index.reshape(shape), roots
+    return SolvedCorrespondences(
+        *(part.cpu().numpy() for part in (low, index.reshape(shape), roots))
+    )
 
 
 def _search_starts(

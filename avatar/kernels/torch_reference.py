@@ -6,10 +6,18 @@ The compiled kernels must agree with it; devices without compiled kernels run it
 import math
 
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from torch import Tensor
 
-from avatar.kernels.hash_levels import PRIMES, HashLevels
+from avatar.kernels.backend_protocol import (
+    PRIMES,
+    CorrespondenceTables,
+    DensityGrid,
+    HashLevels,
+    MarchSettings,
+    RayBatch,
+    RaySamples,
+)
 
 MAX_LOG_DENSITY = 9.0
 """Log density (log 1/m) at which the activation is clamped."""
@@ -126,39 +134,18 @@ def loss_per_ray(
 
 
 def march(
-    origins: Float32[Tensor, "rays 3"],
-    directions: Float32[Tensor, "rays 3"],
-    slots: Int32[Tensor, "rays"],
-    jitter: Float32[Tensor, "rays"],
-    sample_step_m: float,
-    cell_index: Int32[Tensor, "slots cells"],
-    cell_roots: Float32[Tensor, "slots roots 12"],
-    cell_low: Float32[Tensor, "slots 3"],
-    cell_shape: Int32[Tensor, "slots 3"],
-    cell_m: float,
-    occupied: UInt8[Tensor, "x y z"],
-    density: Float32[Tensor, "x y z"],
-    low: Float32[Tensor, "3"],
-    cells_per_m: Float32[Tensor, "3"],
-    opaque_margin_steps: int,
-    max_samples: int,
-) -> tuple[
-    Float32[Tensor, "samples 3"],
-    Int32[Tensor, "samples"],
-    Int32[Tensor, "rays"],
-    Int32[Tensor, "rays"],
-]:
-    """Canonical samples along body-frame rays, packed ray by ray.
+    rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
+    """Canonical samples along rays, and the jitter at which full rays continue.
 
     Samples lie on the lattice `t = entry + (k + jitter) sample_step_m`. A sample is kept if its
     cell has a root whose canonical cell is occupied; of several roots the one of highest cached
     density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
     `OPAQUE_DEPTH`, or after `max_samples` samples.
-
-    Returns:
-        The points, the root row that each was warped with, the number of samples of each ray, and
-        the step after each ray's last sample.
     """
+    origins, directions, slots, jitter = rays
+    cell_index, cell_roots, cell_low, cell_shape, cell_m = cells
+    sample_step_m = how.sample_step_m
     slot = slots.long()
     shape = cell_shape[slot]
     towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
@@ -183,7 +170,7 @@ def march(
         exists = (packed & 3) > candidate
         row = root_row(packed, candidate)
         canonical = canonical_points(cell_roots, slot[:, None], row, packed & 4 > 0, offset)
-        cached, kept = _cached_density(canonical, occupied, density, low, cells_per_m)
+        cached, kept = _cached_density(canonical, grid)
         better = exists & kept & (cached > best)
         best = torch.where(better, cached, best)
         rows = torch.where(better, row, rows)
@@ -192,10 +179,12 @@ def march(
     kept = best >= 0.0
     opaque = torch.cumsum(best.clamp(min=0.0) * sample_step_m, dim=1) > OPAQUE_DEPTH
     counted = (opaque & kept).int()
-    kept &= torch.cumsum(counted, dim=1) - counted <= opaque_margin_steps
-    kept &= torch.cumsum(kept.int(), dim=1) <= max_samples
+    kept &= torch.cumsum(counted, dim=1) - counted <= how.opaque_margin_steps
+    kept &= torch.cumsum(kept.int(), dim=1) <= how.max_samples
     after = torch.arange(1, steps + 1, device=slot.device) * kept
-    return points[kept], rows[kept].int(), kept.sum(dim=1).int(), after.amax(dim=1).int()
+    count = kept.sum(dim=1).int()
+    samples = RaySamples(points[kept], torch.cumsum(count, 0) - count, count, rows[kept].int())
+    return samples, jitter + after.amax(dim=1).int()
 
 
 def root_row(packed: Int32[Tensor, "*cells"], candidate: int) -> Int32[Tensor, "*cells"]:
@@ -226,32 +215,24 @@ def canonical_points(
 
 
 def _cached_density(
-    points: Float32[Tensor, "rays steps 3"],
-    occupied: UInt8[Tensor, "x y z"],
-    density: Float32[Tensor, "x y z"],
-    low: Float32[Tensor, "3"],
-    cells_per_m: Float32[Tensor, "3"],
+    points: Float32[Tensor, "rays steps 3"], grid: DensityGrid
 ) -> tuple[Float32[Tensor, "rays steps"], Bool[Tensor, "rays steps"]]:
     """Cached density of the canonical cells that hold the points, and which are occupied."""
-    shape = torch.tensor(occupied.shape, device=points.device)
-    cell = torch.floor((points - low) * cells_per_m).long()
+    shape = torch.tensor(grid.occupied.shape, device=points.device)
+    cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
     inside = ((cell >= 0) & (cell < shape)).all(dim=-1)
     x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=-1)
-    return density[x, y, z], inside & (occupied[x, y, z] != 0)
+    return grid.density[x, y, z], inside & (grid.occupied[x, y, z] != 0)
 
 
 def scatter_max_density(
-    points: Float[Tensor, "points 3"],
-    log_density: Float[Tensor, "points"],
-    low: Float32[Tensor, "3"],
-    cells_per_m: Float32[Tensor, "3"],
-    density: Float32[Tensor, "x y z"],
+    points: Float32[Tensor, "points 3"], log_density: Float32[Tensor, "points"], grid: DensityGrid
 ) -> None:
     """Raises, in place, the cached density of each sample's cell to the sample's own."""
-    shape = torch.tensor(density.shape, device=points.device)
-    cell = ((points - low) * cells_per_m).long()
+    shape = torch.tensor(grid.density.shape, device=points.device)
+    cell = ((points - grid.low) * grid.cells_per_m).long()
     inside = ((cell >= 0) & (cell < shape)).all(dim=1)
     x, y, z = cell[inside].unbind(dim=1)
-    flat = (x * density.shape[1] + y) * density.shape[2] + z
+    flat = (x * grid.density.shape[1] + y) * grid.density.shape[2] + z
     here = torch.exp(log_density[inside].clamp(max=MAX_LOG_DENSITY))
-    density.view(-1).scatter_reduce_(0, flat, here, "amax")
+    grid.density.view(-1).scatter_reduce_(0, flat, here, "amax")

@@ -1,9 +1,10 @@
 """Reference of skinning, its inverse, and the operations of pose refinement, in plain torch."""
 
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from torch import Tensor
 
+from avatar.kernels.backend_protocol import CorrespondenceTables, RaySamples, SkinningVolume
 from avatar.kernels.torch_reference import root_row
 
 
@@ -77,49 +78,47 @@ MAX_ROOT_STEP_M = 0.05
 
 
 def bone_wrenches(
-    points: Float[Tensor, "samples 3"],
-    grad_points: Float[Tensor, "samples 3"],
-    roots: Float[Tensor, "samples 12"],
-    bones: Float[Tensor, "samples 24 12"],
-    weights: Float[Tensor, "x y z 24"],
-    low: Float[Tensor, "3"],
-    nodes_per_m: Float[Tensor, "3"],
-) -> Float[Tensor, "samples 24 6"]:
-    """Force and moment that each sample exerts on each bone.
+    samples: RaySamples,
+    grad_points: Float32[Tensor, "samples 3"],
+    slots: Int32[Tensor, "rays"],
+    cells: CorrespondenceTables,
+    skin: SkinningVolume,
+    bones: Float32[Tensor, "slots 24 12"],
+) -> Float32[Tensor, "rays 24 6"]:
+    """Force and moment that each ray's samples exert on each bone.
 
     The loss pulls the canonical point with g_x, so it pulls the posed one with g = J⁻ᵀ g_x; a bone
     of weight w takes the force w g and, about the body frame's origin, the moment w (B x) × g.
     """
+    ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.counts)
+    slot = slots[ray].long()
+    roots = cells.roots[slot, samples.root_rows.long()]
     force = (roots[:, 3:].unflatten(1, (3, 3)).mT @ grad_points[..., None])[:, None, :, 0]
-    share = interpolate_volume(points, weights, low, nodes_per_m)[..., None]
-    matrix = bones.unflatten(2, (3, 4))
-    carried = (matrix[..., :3] @ points[:, None, :, None])[..., 0] + matrix[..., 3]
+    share = interpolate_volume(samples.points, *skin)[..., None]
+    matrix = bones[slot].unflatten(2, (3, 4))
+    carried = (matrix[..., :3] @ samples.points[:, None, :, None])[..., 0] + matrix[..., 3]
     moment = torch.linalg.cross(carried, force.expand_as(carried))
-    return torch.cat([share * force, share * moment], dim=2)
+    wrench = torch.cat([share * force, share * moment], dim=2)
+    return wrench.new_zeros(len(slots), 24, 6).index_add_(0, ray, wrench)
 
 
 def update_roots(
-    packed_cells: Int32[Tensor, "gx gy gz"],
-    grid_low: Float[Tensor, "3"],
-    cell_m: float,
-    roots: Float[Tensor, "roots 12"],
-    weights: Float[Tensor, "x y z 24"],
-    low: Float[Tensor, "3"],
-    nodes_per_m: Float[Tensor, "3"],
-    bones: Float[Tensor, "24 12"],
+    cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
 ) -> None:
     """Moves roots, in place, by one chord step towards what is skinned to their cell's centre.
 
     How the warp bends about a root is taken along as it is, like the inverse Jacobian.
     """
-    cell = (packed_cells > 0).nonzero()
+    nx, ny, nz = cells.shape[slot].tolist()
+    packed_cells = cells.packed_cells[slot, : nx * ny * nz].view(nx, ny, nz)
+    roots, cell = cells.roots[slot], (packed_cells > 0).nonzero()
     packed = packed_cells[tuple(cell.T)]
     for candidate in range(3):
         held = (packed & 3) > candidate
         row = root_row(packed[held], candidate).long()
-        center = grid_low + (cell[held] + 0.5) * cell_m
+        center = cells.low[slot] + (cell[held] + 0.5) * cells.cell_m
         x, inverse = roots[row, :3], roots[row, 3:].unflatten(1, (3, 3))
-        error = center - skin_points(x, weights, low, nodes_per_m, bones)
+        error = center - skin_points(x, *skin, bones)
         step = (inverse @ error[..., None])[..., 0]
         moves = step.norm(dim=1) <= MAX_ROOT_STEP_M
         roots[row, :3] = torch.where(moves[:, None], x + step, x)

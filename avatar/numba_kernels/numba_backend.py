@@ -13,6 +13,7 @@ from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
     DensityGrid,
     Features,
+    HashLevels,
     HashTable,
     MarchSettings,
     Points,
@@ -23,7 +24,6 @@ from avatar.kernels.backend_protocol import (
     SkinningVolume,
     SolvedCorrespondences,
 )
-from avatar.kernels.hash_levels import HashLevels
 from avatar.numba_kernels import (
     numba_correspondence,
     numba_hash_grid,

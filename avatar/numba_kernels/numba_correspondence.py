@@ -47,14 +47,12 @@ def solve_correspondences(
 ) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
     """Corner, packed cells and roots of one pose's `CorrespondenceGrid`."""
     volume = blended_transform_volume(rig, bones, band_m + SEARCH_MARGIN_M)
-    extent = rig.box_high - rig.box_low
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
     room = np.empty(MATRIX_LANES + 15, dtype=np.float32)
     pose_seeds(*volume, rig.seeds, posed, inverses, room)
     low = posed.min(axis=0) - np.float32(band_m)
     shape = np.ceil((posed.max(axis=0) + np.float32(band_m) - low) / cell_m).astype(int)
     index = np.empty(tuple(shape), dtype=np.int32)
-    cells_per_m = np.array(rig.skin_distance.shape, dtype=np.float32) / extent
     capacity = index.size
     while True:
         found = (  # untouched memory costs nothing
@@ -64,7 +62,7 @@ def solve_correspondences(
         )  # fmt: skip
         count = flood_fill_roots(
             *volume, rig.seeds, posed, inverses,
-            rig.skin_distance, cells_per_m, np.float32(band_m + 0.5 * cell_m),
+            rig.skin_distance, rig.cells_per_m, np.float32(band_m + 0.5 * cell_m),
             low, np.float32(cell_m), index.shape, *found, room,
         )  # fmt: skip
         if count <= capacity:
@@ -84,8 +82,7 @@ def blended_transform_volume(
     lanes[:, :12] = bones
     transforms = np.zeros((*rig.weights.shape[:3], MATRIX_LANES), dtype=np.float32)
     blend_nodes(*rig.skinning_nodes_within(reach_m), lanes, transforms.reshape(-1, MATRIX_LANES))
-    last = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
-    return transforms, rig.box_low, last / (rig.box_high - rig.box_low)
+    return transforms, rig.box_low, rig.nodes_per_m
 
 
 @compile_kernel(**NO_ALLOCATION)

@@ -9,7 +9,7 @@ write to one place: no atomics, and the same sums for any number of threads.
 import numpy as np
 from numba import get_num_threads, prange
 
-from avatar.kernels.hash_levels import FEATURES_PER_LEVEL, PRIMES
+from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, PRIMES
 from avatar.numba_kernels.kernel_compiler import (
     FAST_MATH,
     add4,

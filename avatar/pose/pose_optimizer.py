@@ -109,11 +109,10 @@ class PoseOptimizer:
         self.poses_may_be_exact = poses_may_be_exact
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
-        nodes = np.array(rig.weights.shape[:3], dtype=np.float32) - 1
         self.skinning = SkinningVolume(
             torch.from_numpy(rig.weights).to(device),
             torch.from_numpy(rig.box_low).to(device),
-            torch.from_numpy(nodes / (rig.box_high - rig.box_low)).to(device),
+            torch.from_numpy(rig.nodes_per_m).to(device),
         )
         self._wrenches = torch.zeros(capacity, MAX_RAYS_PER_FRAME, 24, 6, device=device)
         self._losses = torch.zeros(capacity, MAX_RAYS_PER_FRAME, device=device)

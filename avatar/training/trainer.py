@@ -18,8 +18,7 @@ from avatar.field.avatar_model import Avatar
 from avatar.field.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
-from avatar.kernels.backend_protocol import Backend
-from avatar.kernels.hash_levels import HashLevels
+from avatar.kernels.backend_protocol import Backend, HashLevels
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.frame_exposure import FrameExposures
 from avatar.training.optimizer import UncompiledAdam, update_ema

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from avatar.backends import backend_for
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.field.radiance_field import RadianceField
-from avatar.kernels.hash_levels import HashLevels
+from avatar.kernels.backend_protocol import HashLevels
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 from avatar.training.trainer import NETWORK_RATE_FACTOR
 from baselines.systems.method_settings import MethodSettings

@@ -11,8 +11,13 @@ from avatar.backends import backend_for
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import DensityGrid, MarchSettings, RayBatch, RaySamples
-from avatar.kernels.hash_levels import FEATURES_PER_LEVEL
+from avatar.kernels.backend_protocol import (
+    FEATURES_PER_LEVEL,
+    DensityGrid,
+    MarchSettings,
+    RayBatch,
+    RaySamples,
+)
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.render import correspondence_tables

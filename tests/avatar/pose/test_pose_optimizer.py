@@ -11,8 +11,7 @@ from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels import torch_skinning
-from avatar.kernels.backend_protocol import CorrespondenceTables, RaySamples
-from avatar.kernels.hash_levels import FEATURES_PER_LEVEL
+from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, CorrespondenceTables, RaySamples
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.pose.pose_optimizer import (
