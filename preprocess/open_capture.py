@@ -24,8 +24,8 @@ from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import Motion
-from preprocess.body.motion_shape import shape_for_motion
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.cameras.camera_orientation import read_upright_cameras
 from preprocess.capture_paths import CapturePaths, find_capture_paths, find_live_capture_paths

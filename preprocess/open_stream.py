@@ -10,7 +10,7 @@ from capture.live.realtime_playback import RealtimePlayback
 from capture.source import FrameSource
 from capture.source_opening import open_live_source, open_source
 from preprocess.body.body_file import load_body_model, read_shaped_body
-from preprocess.cameras.assumed_camera import assume_camera
+from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_paths import CapturePaths
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.live.tracked_stream import LiveTracking, TrackedStream

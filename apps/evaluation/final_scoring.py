@@ -19,12 +19,13 @@ from apps.report.learning_curve import CurvePoint
 from apps.report.report_schema import finite_mean
 from avatar.evaluation.held_out import (
     HeldOutFrame,
+    PixelSample,
     coarse_to_fine_order,
+    score_fine_sample,
     score_frame,
     score_rendering,
 )
 from avatar.evaluation.image_metrics import composite_on_white
-from avatar.evaluation.pixel_sample import PixelSample, score_fine_sample
 from avatar.evaluation.sharpness import better_verdict, overall_verdict
 from avatar.events import HeldOutScore
 from avatar.field.avatar_model import Avatar

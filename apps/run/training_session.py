@@ -33,8 +33,7 @@ from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.deformation.rig import Rig
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
-from avatar.evaluation.held_out import HeldOutFrame, add_held_out
-from avatar.evaluation.pixel_sample import PIXELS_PER_FRAME
+from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
 from avatar.evaluation.sharpness import overall_verdict
 from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
 from avatar.training.frame_stream import StreamItem, prepare_items, separate_held_out

@@ -23,7 +23,7 @@ from preprocess.alignment.silhouette_objective import sample_masks
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.silhouette import SkinPoints
-from preprocess.cameras.assumed_camera import assume_camera
+from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion

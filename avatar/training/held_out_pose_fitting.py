@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.evaluation.pixel_sample import score_fine_sample
+from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample, score_frame
 from avatar.events import HeldOutScore
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction

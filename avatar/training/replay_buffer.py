@@ -16,7 +16,7 @@ from torch import Tensor
 from avatar.deformation.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.pose.pose_optimizer import RootCorrection
-from avatar.training.keyframe_selection import view_descriptor
+from avatar.training.frame_stream import view_descriptor
 from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose

@@ -7,11 +7,11 @@ from typing import final
 from avatar.evaluation.held_out import (
     FRAMES_PER_EVALUATION,
     HeldOutFrame,
+    PixelSample,
     add_held_out,
     coarse_to_fine_order,
     subsample_evenly,
 )
-from avatar.evaluation.pixel_sample import PixelSample
 from avatar.events import (
     Evaluated,
     Finished,

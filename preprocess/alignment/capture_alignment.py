@@ -35,8 +35,8 @@ from preprocess.alignment.silhouette_objective import (
     sample_masks,
 )
 from preprocess.body.body_pose import Motion
-from preprocess.body.motion_shape import shape_for_motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.body.silhouette import SkinPoints
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import Masks

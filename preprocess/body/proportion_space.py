@@ -1,7 +1,8 @@
 """Proportions of a person: a linear space of shapes around a shaped body.
 
 The directions are the body model's own shape coefficients, the lengths of bones, and the girths of
-body parts. Girths also take up the thickness of clothes and hair, which no body model has.
+body parts. Girths also take up the thickness of clothes and hair, which no body model has. The
+person of a motion has the proportions, or the betas, that its poses were made for.
 """
 
 from dataclasses import dataclass
@@ -9,8 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from capture.input_error import InputError
+from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import (
+    BodyModel,
+    ShapedBody,
+    betas_for_motion,
+    with_smpl_joints,
+)
 
 BONE_GROUPS = {
     "hip width": (1, 2), "thigh": (4, 5), "shin": (7, 8), "foot": (10, 11), "trunk": (3, 6, 9),
@@ -110,3 +118,28 @@ def _lengthen(
                 weight * np.clip(place, 0.0, 1.0)[:, None] * (moved[children[0]] - moved[bone])
             )
     return vertices, moved
+
+
+def shape_for_motion(body: BodyModel, motion: Motion) -> ShapedBody:
+    """The person that a motion's tracker had in mind, as nearly as the body allows.
+
+    A body that is not SMPL's takes the rest joints of SMPL's mean shape if the poses are SMPL's:
+    then its joints move exactly as SMPL's do. Its skin goes along, each vertex with its joints.
+
+    Raises:
+        InputError: If the motion's proportions are of another number than the body's.
+    """
+    if motion.proportions is not None and motion.body_model == body.family:
+        space = ProportionSpace.around(body.with_shape())
+        if len(motion.proportions) != space.count:
+            raise InputError(
+                f"The poses hold {len(motion.proportions)} proportions, the body has "
+                f"{space.count}; they were made for another version of the body."
+            )
+        return space.shape(motion.proportions)
+    shaped = body.with_shape(betas_for_motion(body, motion))
+    return (
+        shaped
+        if body.family == "smpl" or motion.body_model == body.family
+        else with_smpl_joints(shaped)
+    )

@@ -1,4 +1,4 @@
-"""Cameras of pictures that a rotation flag turns: made for them as stored, or as shown?"""
+"""Cameras of upright pictures: of those that a rotation flag turns, and before poses are known."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,8 +10,10 @@ from capture.camera import Camera
 from capture.image_folder import exif_orientation, list_images
 from capture.input_error import InputError
 from capture.source import FrameSource
-from preprocess.cameras.camera_file import CameraTrack, read_cameras
+from preprocess.body.body_pose import RelativeFocalLength
+from preprocess.cameras.camera_file import DEFAULT_FOCAL_RATIO, CameraTrack, read_cameras
 from preprocess.cameras.colmap import find_colmap_model
+from preprocess.capture_paths import find_own_cameras
 
 MIRRORED_EXIF_QUARTER_TURNS = {2: 0, 4: 2, 5: 1, 7: 3}
 """Counter-clockwise quarter turns that make a mirrored photograph upright after left and right were
@@ -123,3 +125,23 @@ def _principal_point_offset_px(track: CameraTrack) -> float:
     """How far the first camera's principal point is from the middle of its picture, in pixels."""
     camera = track.cameras[0]
     return float(np.abs(np.array(camera.center_px) - np.array(camera.size_px) / 2.0).sum())
+
+
+def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera:
+    """A camera at the origin: the first one of a file, or a phone's where there is none.
+
+    Args:
+        video: The video, beside which cameras may lie.
+        named: Value of --cameras: a file, "static" or "solve", of which nothing is known yet, or
+            None.
+        source: The video's frames.
+
+    Raises:
+        InputError: If a file of cameras cannot be read.
+    """
+    unknown = named in ("static", "solve") or source.live
+    path = None if unknown else named or find_own_cameras(video)
+    if path is None:
+        phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(source.size_px)
+        return Camera.from_intrinsic(phone, source.size_px)
+    return replace(read_upright_cameras(Path(path), source)[0], camera_from_world=np.eye(4))

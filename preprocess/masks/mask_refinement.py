@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from preprocess.masks.background_plate import BackgroundPlate, PlateColors
-from preprocess.masks.guided_filter import apply_coefficients, guided_coefficients
 from preprocess.masks.local_colors import color_density, local_densities
-from preprocess.masks.matting import refine_border
+from preprocess.masks.matting import apply_coefficients, guided_coefficients, refine_border
 from preprocess.tracking.keypoints import CroppedMask
 
 WORKING_SCALE = 2.0

@@ -19,12 +19,14 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.root_placement import place_in_camera_world, transform_motion
 from preprocess.sfm.camera_solution import KEY, MISSING, PLACED, CameraSolution
-from preprocess.sfm.floor_plane import FloorPlane, fit_floor_plane, mean_camera_up
 from preprocess.sfm.metric_scale import (
     SOLE_THICKNESS_M,
+    FloorPlane,
     MetricScale,
     PersonInCameras,
     estimate_metric_scale,
+    fit_floor_plane,
+    mean_camera_up,
 )
 
 

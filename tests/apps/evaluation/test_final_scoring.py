@@ -14,8 +14,7 @@ from apps.evaluation.final_scoring import (
     score_finally,
 )
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, score_rendering
-from avatar.evaluation.pixel_sample import PixelSample
+from avatar.evaluation.held_out import HeldOutFrame, PixelSample, score_rendering
 from avatar.field.avatar_model import Avatar
 from avatar.training.trainer import Trainer
 from capture.camera import Camera

@@ -14,7 +14,7 @@ from apps.tracking import person_tracking
 from capture.source_opening import open_source
 from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.body.body_file import load_body_model
-from preprocess.body.motion_shape import shape_for_motion
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture

@@ -5,8 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar.evaluation.held_out import HeldOutFrame, score_frame, score_rendering
-from avatar.evaluation.pixel_sample import PIXELS_PER_FRAME, PixelSample
+from avatar.evaluation.held_out import (
+    PIXELS_PER_FRAME,
+    HeldOutFrame,
+    PixelSample,
+    score_frame,
+    score_rendering,
+)
 from avatar.render import render
 
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.training.frame_stream import RedundantFrame, prepare_stream
-from avatar.training.keyframe_selection import (
+from avatar.training.frame_stream import (
     JOINT_ANGLE_WEIGHT,
     MAX_KEYFRAME_INTERVAL_S,
     MIN_KEYFRAME_DISTANCE,
     KeyframeSelector,
+    RedundantFrame,
+    prepare_stream,
     view_descriptor,
 )
 from avatar.training.training_frame import TrainingFrame

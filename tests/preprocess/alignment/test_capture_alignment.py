@@ -13,8 +13,8 @@ from preprocess.alignment.capture_alignment import BodyAlignment, align_body, al
 from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
 from preprocess.body.body_file import load_body_model, read_shaped_body, write_shaped_body
 from preprocess.body.body_pose import Motion
-from preprocess.body.motion_shape import shape_for_motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.live.live_alignment import LiveAlignment

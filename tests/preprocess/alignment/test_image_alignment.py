@@ -18,8 +18,8 @@ from preprocess.alignment.mask_alignment import BodyPlacement, move_pelvis
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.motion_shape import shape_for_motion
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.body.silhouette import MeshSilhouette, SkinPoints
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.live.live_alignment import LiveAlignment

@@ -11,8 +11,8 @@ from preprocess.alignment.mask_alignment import BodyPlacement, place_body_on_mas
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
-from preprocess.body.motion_shape import shape_for_motion
 from preprocess.body.parametric_body import ShapedBody, smpl_rest_joints, with_smpl_joints
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.body.silhouette import SkinPoints, splat_silhouette
 
 SIZE = (96, 128)

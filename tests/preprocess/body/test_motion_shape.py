@@ -7,8 +7,7 @@ import pytest
 
 from capture.input_error import InputError
 from preprocess.body.body_file import load_body_model
-from preprocess.body.motion_shape import shape_for_motion
-from preprocess.body.proportion_space import ProportionSpace
+from preprocess.body.proportion_space import ProportionSpace, shape_for_motion
 
 
 def test_fitted_proportions_are_the_persons_shape_whatever_the_betas(motion):

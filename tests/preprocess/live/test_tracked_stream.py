@@ -10,7 +10,7 @@ from capture.frame import Frame
 from capture.input_error import InputError
 from preprocess.body.body_file import load_body_model
 from preprocess.body.silhouette import splat_silhouette
-from preprocess.cameras.assumed_camera import assume_camera
+from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.fitting.tracked_frames import LAG_FRAMES
 from preprocess.live import tracked_stream
 from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream

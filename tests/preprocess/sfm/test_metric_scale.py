@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from preprocess.sfm.floor_plane import FloorPlane
-from preprocess.sfm.metric_scale import SOLE_THICKNESS_M, PersonInCameras, estimate_metric_scale
+from preprocess.sfm.metric_scale import (
+    SOLE_THICKNESS_M,
+    FloorPlane,
+    PersonInCameras,
+    estimate_metric_scale,
+)
 
 TRUE = 0.4
 """Metres per unit of the solved world."""
