@@ -20,9 +20,9 @@ from apps.report.hardware import Hardware
 from apps.report.html_page import html_page, html_section, html_table
 from apps.report.learning_curve import CurvePoint, curve_svg, psnr_at
 from apps.report.report_schema import format_psnr
-from avatar.evaluation.body_parts import SCORED_PARTS
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
 from avatar.evaluation.sharpness import overall_verdict
+from avatar.evaluation.skin_patches import SCORED_PARTS
 from capture.atomic_files import atomic_folder
 
 CURVE_SECONDS = {5.0: "5 s", 10.0: "10 s", 60.0: "1 min", 180.0: "3 min", 300.0: "5 min"}

@@ -7,18 +7,18 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from avatar.evaluation.body_parts import SCORED_PARTS, label_parts, psnr_by_part, silhouette_of
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.evaluation.image_metrics import (
     SSIM_BORDER_PX,
     composite_over,
     ground_truth_over,
     psnr_of_errors,
+    silhouette_of,
     ssim,
     ssim_map,
 )
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
-from avatar.evaluation.skin_patches import SkinPatches
+from avatar.evaluation.skin_patches import SCORED_PARTS, SkinPatches, label_parts, psnr_by_part
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 

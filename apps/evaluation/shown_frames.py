@@ -8,8 +8,7 @@ import numpy as np
 
 from apps.evaluation.frame_scoring import BACKGROUNDS, FrameScore, PremultipliedImage
 from apps.report.webp import to_uint8, webp_data_uri
-from avatar.evaluation.body_parts import silhouette_of
-from avatar.evaluation.image_metrics import composite_over, ground_truth_over
+from avatar.evaluation.image_metrics import composite_over, ground_truth_over, silhouette_of
 from preprocess.observation import Observation
 
 MARGIN = 0.08

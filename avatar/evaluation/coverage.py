@@ -6,10 +6,9 @@ from enum import IntEnum
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches
-from preprocess.body.body_surface import visible_points
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, view_patches
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
@@ -17,10 +16,6 @@ MIN_SEEN_COSINE = 0.3
 """Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
 """Cosine from which a patch is well seen (53°)."""
-DEPTH_CELL_M = 0.03
-"""Cell size of the depth buffer for self-occlusion, metres."""
-DEPTH_TOLERANCE_M = 0.03
-"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
 MIN_PERSON_ALPHA = 0.5
 """Alpha above which a pixel shows the person."""
 
@@ -138,57 +133,6 @@ class Coverage:
         if len(stages) == len(self.stages) == len(cosines):
             np.maximum(self.cosines, cosines.astype(np.float32) / 255.0, out=self.cosines)
             np.maximum(self.stages, stages, out=self.stages)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PatchView:
-    """The patches of a posed body, as a camera sees them.
-
-    Attributes:
-        cosines: Of the angle between each normal and the direction to the camera.
-        unoccluded: Whether a patch faces the camera with no other before it.
-        pixels: Place in the image, px.
-    """
-
-    cosines: Float[np.ndarray, "patches"]
-    unoccluded: Bool[np.ndarray, "patches"]
-    pixels: Float[np.ndarray, "patches 2"]
-
-
-def view_patches(
-    patches: SkinPatches, shaped: ShapedBody, observation: Observation
-) -> PatchView | None:
-    """Project the patches in a frame's pose; None if some are behind the camera."""
-    camera, body = observation.camera, shaped.with_pose(observation.pose)
-    points, normals = pose_patches(patches, body.world_from_rest())
-    to_camera = camera.center_world - points
-    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    cosines = np.einsum("pa,pa->p", to_camera, normals)
-    in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
-    depths = in_camera[:, 2]
-    if depths.min() <= 0.0:
-        return None
-    plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-    free = visible_points(
-        plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
-    )
-    return PatchView(cosines=cosines, unoccluded=free, pixels=camera.project(points))
-
-
-def pose_patches(
-    patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
-) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
-    """Centres and unit normals of the patches in the world, by linear blend skinning.
-
-    Args:
-        patches: At rest.
-        world_from_rest: The joints' transforms (`PosedBody.world_from_rest`).
-    """
-    joints = world_from_rest[:, :3].reshape(24, 12).astype(np.float32)
-    blended = (patches.weights @ joints).reshape(-1, 3, 4)
-    points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]
-    normals = np.einsum("pab,pb->pa", blended[:, :, :3], patches.normals)
-    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:

@@ -18,6 +18,7 @@ from jaxtyping import Float32, Int
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.deformation.rig import Rig
 from avatar.evaluation.image_metrics import (
+    MASK_THRESHOLD,
     composite_on_white,
     composite_over,
     ground_truth_on_white,
@@ -36,8 +37,6 @@ Item = TypeVar("Item")
 
 MAX_HELD_OUT = 100
 """Held-out frames that are kept; bounds the memory of a long video."""
-MASK_THRESHOLD = 0.5
-"""Alpha above which a pixel belongs to the person."""
 FRAMES_PER_EVALUATION = 12
 """Held-out frames scored at each point of the learning curve; the end scores them all."""
 

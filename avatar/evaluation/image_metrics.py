@@ -6,6 +6,14 @@ from jaxtyping import Bool, Float, Float32, Shaped
 
 from preprocess.observation import Observation
 
+MASK_THRESHOLD = 0.5
+"""Alpha above which a pixel belongs to the person."""
+
+
+def silhouette_of(observation: Observation) -> Bool[np.ndarray, "height width"]:
+    """Pixels that show the person."""
+    return observation.alpha > MASK_THRESHOLD
+
 
 def composite_over(
     premultiplied: Float32[np.ndarray, "*shape 4"], background: float

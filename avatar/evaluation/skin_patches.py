@@ -1,4 +1,4 @@
-"""The skin in small patches: where each lies, where it looks, which side of which part it is."""
+"""The skin in small patches: where each lies and looks, and which body part a pixel shows."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,8 +8,10 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
 from avatar.deformation.rig import PART_OF_JOINT
+from avatar.evaluation.image_metrics import psnr_of_errors, silhouette_of
 from preprocess.body.body_surface import vertex_areas, vertex_normals, visible_points
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.observation import Observation
 
 PART_NAMES = (
     "torso", "left thigh", "right thigh", "left shin", "right shin", "left foot", "right foot",
@@ -127,3 +129,102 @@ def _visible_from_anywhere(
         )
         shown |= found & (cosine > 0.3)
     return shown
+
+
+DEPTH_CELL_M = 0.03
+"""Cell size of the depth buffer for self-occlusion, metres."""
+DEPTH_TOLERANCE_M = 0.03
+"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PatchView:
+    """The patches of a posed body, as a camera sees them.
+
+    Attributes:
+        cosines: Of the angle between each normal and the direction to the camera.
+        unoccluded: Whether a patch faces the camera with no other before it.
+        pixels: Place in the image, px.
+    """
+
+    cosines: Float[np.ndarray, "patches"]
+    unoccluded: Bool[np.ndarray, "patches"]
+    pixels: Float[np.ndarray, "patches 2"]
+
+
+def view_patches(
+    patches: SkinPatches, shaped: ShapedBody, observation: Observation
+) -> PatchView | None:
+    """Project the patches in a frame's pose; None if some are behind the camera."""
+    camera, body = observation.camera, shaped.with_pose(observation.pose)
+    points, normals = pose_patches(patches, body.world_from_rest())
+    to_camera = camera.center_world - points
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    cosines = np.einsum("pa,pa->p", to_camera, normals)
+    in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    depths = in_camera[:, 2]
+    if depths.min() <= 0.0:
+        return None
+    plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+    free = visible_points(
+        plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
+    )
+    return PatchView(cosines=cosines, unoccluded=free, pixels=camera.project(points))
+
+
+def pose_patches(
+    patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
+) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
+    """Centres and unit normals of the patches in the world, by linear blend skinning.
+
+    Args:
+        patches: At rest.
+        world_from_rest: The joints' transforms (`PosedBody.world_from_rest`).
+    """
+    joints = world_from_rest[:, :3].reshape(24, 12).astype(np.float32)
+    blended = (patches.weights @ joints).reshape(-1, 3, 4)
+    points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]
+    normals = np.einsum("pab,pb->pa", blended[:, :, :3], patches.normals)
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+SCORED_PARTS = ("head", "hands", "arms", "trunk", "legs")
+"""Parts that are scored on their own."""
+PART_BY_WORD = {"torso": "trunk", "head": "head", "hand": "hands", "arm": "arms", "forearm": "arms"}
+"""Scored part by the last word of a name of `PART_NAMES`; the others are legs."""
+SCORED_PART_OF = np.array(
+    [SCORED_PARTS.index(PART_BY_WORD.get(name.split()[-1], "legs")) for name in PART_NAMES]
+)
+
+
+def label_parts(
+    patches: SkinPatches, shaped: ShapedBody, observation: Observation
+) -> Int[np.ndarray, "pixels"] | None:
+    """Index into `SCORED_PARTS` of each pixel of the mask, by the nearest patch in view.
+
+    None if the body is behind the camera, or no patch is in view.
+    """
+    view = view_patches(patches, shaped, observation)
+    if view is None or not view.unoccluded.any():
+        return None
+    rows, columns = np.nonzero(silhouette_of(observation))
+    _, nearest = KDTree(view.pixels[view.unoccluded]).query(
+        np.column_stack([columns, rows]) + 0.5, workers=1
+    )
+    return SCORED_PART_OF[patches.parts[view.unoccluded]][nearest]
+
+
+def psnr_by_part(
+    errors: Float[np.ndarray, "height width 3"],
+    observation: Observation,
+    labels: Int[np.ndarray, "pixels"] | None,
+) -> dict[str, float]:
+    """PSNR of each part that the frame shows, dB, from squared errors."""
+    if labels is None:
+        return {}
+    of_person = errors[silhouette_of(observation)]
+    return {
+        f"psnr_{name}": psnr_of_errors(of_person[labels == part])
+        for part, name in enumerate(SCORED_PARTS)
+        if (labels == part).any()
+    }

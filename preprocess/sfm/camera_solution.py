@@ -1,17 +1,119 @@
-"""A solution: a camera for every frame, what each of them rests on, and its files."""
+"""A solution: a camera for every frame, the model that each rests on, its gates, and its files."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from capture.atomic_files import write_text_atomically
 from capture.camera import Camera
-from preprocess.sfm.quality_gates import QualityGate
-from preprocess.sfm.sparse_model import SparseModel
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SparseModel:
+    """What structure from motion found.
+
+    Attributes:
+        frames: Number of the frame that each camera belongs to, ascending.
+        camera_from_world: Rigid transforms; the world's unit is unknown.
+        focal_px: Focal length.
+        center_px: Principal point; the first pixel's centre is at (0.5, 0.5).
+        radial_distortion: First coefficient of radial distortion.
+        size_px: Width and height of the pictures.
+        points: What the cameras see.
+        observation_camera, observation_point: Rows of each observation's camera and point.
+        pixels: Where it was seen.
+    """
+
+    frames: Int[np.ndarray, "cameras"]
+    camera_from_world: Float[np.ndarray, "cameras 4 4"]
+    focal_px: float
+    center_px: tuple[float, float]
+    radial_distortion: float
+    size_px: tuple[int, int]
+    points: Float[np.ndarray, "points 3"]
+    observation_camera: Int[np.ndarray, "observations"]
+    observation_point: Int[np.ndarray, "observations"]
+    pixels: Float[np.ndarray, "observations 2"]
+
+    def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
+        """The lens, standing somewhere."""
+        return Camera(
+            focal_px=(self.focal_px, self.focal_px),
+            center_px=self.center_px,
+            size_px=self.size_px,
+            camera_from_world=camera_from_world,
+            distortion=(self.radial_distortion, 0.0, 0.0, 0.0) if self.radial_distortion else (),
+        )
+
+    def camera_centers(self) -> Float[np.ndarray, "cameras 3"]:
+        """Where the cameras stand."""
+        turned, moved = self.camera_from_world[:, :3, :3], self.camera_from_world[:, :3, 3]
+        return -np.einsum("cba,cb->ca", turned, moved)
+
+    def reprojection_errors_px(self) -> Float[np.ndarray, "observations"]:
+        """How far from each observation its point is projected, in pixels."""
+        off = np.zeros(len(self.pixels))
+        for row, transform in enumerate(self.camera_from_world):
+            mine = self.observation_camera == row
+            if mine.any():
+                drawn = self.camera(transform).project(self.points[self.observation_point[mine]])
+                off[mine] = np.linalg.norm(drawn - self.pixels[mine], axis=1)
+        return off
+
+    def observations_of_camera(self, row: int) -> Int[np.ndarray, "seen"]:
+        """The observations of one camera."""
+        return np.flatnonzero(self.observation_camera == row)
+
+    def without_cameras(self, doubtful: Bool[np.ndarray, "cameras"]) -> "SparseModel":
+        """The same without some of the cameras, and what only they saw."""
+        kept = ~doubtful[self.observation_camera]
+        row_of = np.cumsum(~doubtful) - 1
+        return replace(
+            self,
+            frames=self.frames[~doubtful],
+            camera_from_world=self.camera_from_world[~doubtful],
+            observation_camera=row_of[self.observation_camera[kept]],
+            observation_point=self.observation_point[kept],
+            pixels=self.pixels[kept],
+        )
+
+    def save(self, path: Path) -> None:
+        """As an .npz without objects."""
+        np.savez(path, allow_pickle=False, **vars(self))
+
+    @classmethod
+    def load(cls, path: Path) -> "SparseModel":
+        """What `save` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files if key != "allow_pickle"}
+        x, y = (float(value) for value in arrays.pop("center_px"))
+        width, height = (int(value) for value in arrays.pop("size_px"))
+        numbers = {key: float(arrays.pop(key)) for key in ("focal_px", "radial_distortion")}
+        return cls(center_px=(x, y), size_px=(width, height), **numbers, **arrays)
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityGate:
+    """One figure and its bound.
+
+    Attributes:
+        name: Key in the report.
+        value: Measured figure.
+        bound: Threshold that it is compared with.
+        passed: Whether it is good enough.
+        failure_reason: What it means if it is not.
+    """
+
+    name: str
+    value: float
+    bound: float
+    passed: bool
+    failure_reason: str
+
 
 MISSING, INTERPOLATED, PLACED, KEY = range(4)
 """Status of a frame: no camera, between its neighbors, placed by known points, or a key frame."""

@@ -16,7 +16,14 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.frame_association import interpolate_missing_cameras
 from preprocess.sfm import colmap_mapping
-from preprocess.sfm.camera_solution import INTERPOLATED, KEY, MISSING, PLACED, CameraSolution
+from preprocess.sfm.camera_solution import (
+    INTERPOLATED,
+    KEY,
+    MISSING,
+    PLACED,
+    CameraSolution,
+    SparseModel,
+)
 from preprocess.sfm.colmap_mapping import ColmapWorkspace
 from preprocess.sfm.point_tracking import StaticCameraTest, detect_static_camera
 from preprocess.sfm.quality_gates import (
@@ -35,7 +42,6 @@ from preprocess.sfm.sfm_keyframes import (
     select_keyframes,
     write_keyframes,
 )
-from preprocess.sfm.sparse_model import SparseModel
 from preprocess.sfm.stage_cache import StageCache, StageProgressFn
 
 SEED_OFFSETS = (0, 1)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from capture.input_error import InputError
-from preprocess.sfm.sparse_model import SparseModel
+from preprocess.sfm.camera_solution import SparseModel
 
 MAX_FEATURES = 2048
 """Most features per key frame."""

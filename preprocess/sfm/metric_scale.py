@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from preprocess.sfm.sparse_model import SparseModel
+from preprocess.sfm.camera_solution import SparseModel
 
 MAX_TILT_DEG = 20.0
 """Largest angle between the floor's normal and the first guess of up, degrees."""

@@ -5,13 +5,11 @@ in it. Wrong solutions fail one of the gates below, or contradict the other mapp
 that are tracked from frame to frame.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from preprocess.sfm.sparse_model import SparseModel
+from preprocess.sfm.camera_solution import QualityGate, SparseModel
 
 MIN_REGISTERED_FRACTION = 0.9
 """Fraction of the key frames that must have a camera."""
@@ -43,25 +41,6 @@ MAX_MODEL_DISTANCE = 0.01
 
 MAX_MODEL_ROTATION_DEG = 1.0
 """Largest rotation between two mappers' cameras, degrees."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class QualityGate:
-    """One figure and its bound.
-
-    Attributes:
-        name: Key in the report.
-        value: Measured figure.
-        bound: Threshold that it is compared with.
-        passed: Whether it is good enough.
-        failure_reason: What it means if it is not.
-    """
-
-    name: str
-    value: float
-    bound: float
-    passed: bool
-    failure_reason: str
 
 
 def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:

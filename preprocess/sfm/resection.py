@@ -15,9 +15,9 @@ from jaxtyping import Float, UInt8
 
 from capture.camera import Camera
 from capture.source import FrameSource
+from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.point_tracking import track_points
 from preprocess.sfm.sfm_keyframes import SfmKeyframe, to_grayscale
-from preprocess.sfm.sparse_model import SparseModel
 
 MIN_PNP_POINTS = 20
 """Fewest tracked points that a camera is placed by."""

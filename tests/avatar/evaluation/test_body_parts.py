@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from avatar.evaluation.body_parts import SCORED_PARTS, label_parts, psnr_by_part, silhouette_of
-from avatar.evaluation.skin_patches import SkinPatches
+from avatar.evaluation.image_metrics import silhouette_of
+from avatar.evaluation.skin_patches import SCORED_PARTS, SkinPatches, label_parts, psnr_by_part
 
 
 def test_each_pixel_has_the_part_that_is_there(shaped, observed):

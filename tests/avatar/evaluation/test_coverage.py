@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from avatar.evaluation.coverage import Coverage, VisibilityStage, pose_patches
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches
+from avatar.evaluation.coverage import Coverage, VisibilityStage
+from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, pose_patches
 from preprocess.body.body_surface import visible_points
 
 L_SHOULDER, R_SHOULDER = 15, 16

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from preprocess.sfm.sparse_model import SparseModel
+from preprocess.sfm.camera_solution import SparseModel
 
 HALF_M, HEIGHT_M = 3.0, 2.6
 PIXELS_PER_M = 160
