@@ -47,9 +47,9 @@ class OccupancyGrid:
         band_cells: Flat indices of the cells in the clothing band about the skin.
     """
 
-    def __init__(self, rig: Rig, device: torch.device, *, band_m: float = CLOTHING_BAND_M) -> None:
+    def __init__(self, rig: Rig, device: torch.device) -> None:
         """Starts with the whole clothing band occupied."""
-        band = torch.from_numpy(rig.skin_distance <= band_m).to(device)
+        band = torch.from_numpy(rig.skin_distance <= CLOTHING_BAND_M).to(device)
         self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
             density=torch.where(band, INITIAL_DENSITY, 0.0),

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample, score_frame
-from avatar.events import HeldOutScore
+from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction
 from avatar.training.frame_exposure import FrameExposures
@@ -28,17 +27,6 @@ RAYS_PER_CORRECTION = 512
 """Rays per correction of a pose."""
 FITTING_SHARE = 0.8
 """Share of fitting in the time that fitting and scoring take, for the progress."""
-
-
-def score_with_fitted_poses(
-    trainer: Trainer,
-    frames: list[HeldOutFrame],
-    *,
-    progress: Callable[[float], None] = lambda _: None,
-) -> tuple[HeldOutScore, ...]:
-    """Scores of whole images of held-out frames in poses fitted to them (`fit_test_poses`)."""
-    fitted = fit_test_poses(trainer, frames, progress=progress)
-    return tuple(score_frame(trainer.avatar, frame) for frame in fitted)
 
 
 def fit_test_poses(

@@ -15,6 +15,7 @@ from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.cameras.camera_file import CameraTrack, tracker_intrinsic_matrix
+from preprocess.cameras.named_camera import invert_rigid
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
 """Where SMPL-X's neutral mean shape has its pelvis at rest, metres (its joint regressor's)."""
@@ -38,9 +39,7 @@ def place_in_camera_world(
     if motion.space == "camera":
         motion = _refocus_motion(motion, shaped, cameras[0])
         if cameras.is_moving or not np.allclose(cameras[0].camera_from_world, np.eye(4)):
-            worlds = [
-                _rigid_inverse(_camera_of(motion, row, cameras)) for row in range(len(motion))
-            ]
+            worlds = [invert_rigid(_camera_of(motion, row, cameras)) for row in range(len(motion))]
             motion = transform_motion(motion, np.stack(worlds), shaped.joints[0])
         return replace(motion, space="world")
     if motion.camera_from_world is not None and not cameras_given:
@@ -144,10 +143,3 @@ def _same_intrinsics(intrinsic: Float[np.ndarray, "3 3"], camera: Camera) -> boo
 def _camera_of(motion: Motion, row: int, cameras: CameraTrack) -> Float[np.ndarray, "4 4"]:
     frame = row if motion.frames is None else int(motion.frames[row])
     return cameras[min(frame, len(cameras.cameras) - 1)].camera_from_world
-
-
-def _rigid_inverse(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    inverse = np.eye(4)
-    inverse[:3, :3] = transform[:3, :3].T
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse

@@ -64,9 +64,7 @@ def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
     return up / np.linalg.norm(up)
 
 
-def fit_floor_plane(
-    model: SparseModel, up: Float[np.ndarray, "3"], seed: int = 0
-) -> FloorPlane | None:
+def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlane | None:
     """The largest plane below the cameras that is nearly level and has next to nothing below it.
 
     RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over what is near.
@@ -74,7 +72,6 @@ def fit_floor_plane(
     Args:
         model: Cameras and points.
         up: A first guess.
-        seed: Of the draws.
     """
     views = np.bincount(model.observation_point, minlength=len(model.points))
     points = model.points[views >= MIN_VIEWS]
@@ -89,7 +86,7 @@ def fit_floor_plane(
     points = points[points @ up < lowest]
     if len(points) < MIN_POINTS:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     best, most = None, max(MIN_POINTS, MIN_INLIER_FRACTION * len(points))
     for _ in range(RANSAC_ITERATIONS):
         plane = _plane_through(points[rng.choice(len(points), 3, replace=False)], up)

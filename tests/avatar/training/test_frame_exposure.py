@@ -11,7 +11,7 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels.backend_protocol import RayBatch
 from avatar.training import checkpoint
 from avatar.training.frame_exposure import MAX_FRAME_GAP, FrameExposures
-from avatar.training.held_out_pose_fitting import score_with_fitted_poses
+from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.replay_buffer import TrainingBatch
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame
@@ -131,7 +131,9 @@ def test_training_finds_the_exposure_of_each_frame(trainers):
 
 def test_the_exposure_of_a_held_out_frame_is_fitted_in_the_fitted_score_only(trainers, clip):
     held = [HeldOutFrame(observation=exposed(clip.observations[4], DARK))]
-    with_gain, without = (score_with_fitted_poses(trainer, held)[0] for trainer in trainers)
+    with_gain, without = (
+        score_frame(trainer.avatar, *fit_test_poses(trainer, held)) for trainer in trainers
+    )
     given = score_frame(trainers[0].avatar, held[0])
     assert with_gain.psnr > given.psnr + 0.5
     assert with_gain.psnr > without.psnr + 0.5

