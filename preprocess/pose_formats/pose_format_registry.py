@@ -26,8 +26,7 @@ from preprocess.pose_formats import (
     vibe,
     wham,
 )
-from preprocess.poses.gap_filling import MAX_GAP_FRAMES, fill_gaps
-from preprocess.poses.motion_builder import MotionByPerson
+from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
 from preprocess.poses.pose_file import read_motion
 
 ADVICE_BY_KEYS = (

@@ -252,7 +252,7 @@ def test_frames_whose_poses_have_other_shapes_do_not_fit_together(world):
 
 
 def test_a_motion_with_moving_cameras_of_its_own_is_not_bridged_where_a_camera_is_missing(truth):
-    from preprocess.poses.gap_filling import fill_gaps
+    from preprocess.poses.motion_builder import fill_gaps
 
     some = replace(
         truth, frames=np.arange(40) * 2, camera_from_world=np.tile(np.eye(4), (40, 1, 1))
