@@ -21,9 +21,7 @@ from capture.input_error import InputError
 from capture.output_file_list import OutputFileList
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from avatar.evaluation.held_out import HeldOutFrame
     from baselines.systems.compared_capture import ComparedCapture
-    from baselines.systems.compared_systems import ComparedSystem
 
 PROGRAM = "python -m baselines.compare"
 Method = Literal["anim-nerf", "neural-body", "snarf", "instant-ngp", "ours"]
@@ -31,11 +29,6 @@ MARKS_S = (5.0, 10.0, 30.0, 60.0, 180.0, 300.0)
 """Core seconds after which the curve is scored."""
 STEP_MARKS = (1 / 12, 1 / 6, 1 / 2)
 """The same where steps are counted, as shares of them."""
-CURVE_FRAMES = 4
-"""Frames that a point of the curve is scored on: novel poses where there are any. The end scores
-all frames of both kinds."""
-
-
 MIN_COLUMN_PX = 100
 """Width of a column of the sheet above which pictures are not enlarged."""
 
@@ -53,7 +46,9 @@ class CompareArguments:
     All systems get the same capture (poses and body fitted to its masks as by ia-ingest), the same
     frames, rays, backgrounds and decay of learning rates, and one thread. Time is that of the
     processor, so that other programs hardly count; scoring is not charged, and neither is compiling
-    kernels. Baselines are our own implementations of their papers, in plain torch.
+    kernels. Baselines are our own implementations of their papers, in plain torch. Scores are those
+    in the poses given, and in poses fitted to the scored pictures; the fit is the same for all
+    systems, has the same budget, and uses nothing of a system but its pictures.
 
         anim-nerf     inverse skinning by the nearest vertices, a NeRF, poses optimized
         neural-body   a code for every vertex, diffused by a sparse 3-D network
@@ -65,8 +60,9 @@ class CompareArguments:
     has the paper's sizes, of which a step takes seconds to minutes (Anim-NeRF: 8 GB of memory).
 
     OUT then holds table.md, comparison.json, pictures.png (truth, then each method), and for each
-    method scores.json and its pictures of held-out frames and, for a sample, of novel poses. A
-    method that is there already is not trained again; Ctrl-C keeps those that are done.
+    method scores.json (with commit, machine and versions) and its pictures of held-out frames and,
+    for a sample, of novel poses. A method that is there already is not trained again; Ctrl-C keeps
+    those that are done.
 
     Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C.
     """
@@ -89,6 +85,8 @@ class CompareArguments:
     """Folder to write."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
     """Train methods again that are in OUT already."""
+    redo_older: Annotated[bool, FlagCreatePairsOff] = False
+    """Train those methods again that another commit trained."""
 
     def validate(self) -> None:
         """Checks ranges and folders.
@@ -125,21 +123,6 @@ class CompareArguments:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class CurvePsnr:
-    """Mean PSNR on white after some training, dB.
-
-    Attributes:
-        core_seconds, steps: Spent so far.
-        held_out, novel: Of a few novel poses, or of held-out frames where there are none.
-    """
-
-    core_seconds: float
-    steps: int
-    held_out: float | None
-    novel: float | None
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     given = parse_arguments(CompareArguments, PROGRAM, argv)
@@ -170,7 +153,7 @@ def compare(arguments: CompareArguments, console: Console) -> int:
         for name in missing:
             if data is not None and not stop.is_set():
                 _train_method(name, data, arguments, console, stop)
-    done = [name for name in names if _is_done(arguments, name)]
+    done = [name for name in names if (arguments.out / name / "scores.json").is_file()]
     results = [json.loads((arguments.out / name / "scores.json").read_text()) for name in done]
     if results:
         table = comparison_table(results)
@@ -182,12 +165,19 @@ def compare(arguments: CompareArguments, console: Console) -> int:
 
 
 def _is_done(arguments: CompareArguments, name: str) -> bool:
-    """Whether a method was trained before, under the same conditions."""
+    """Whether a method was trained before, under the same conditions, and is to be kept."""
+    from apps.report.hardware import Hardware
+
     scores = arguments.out / name / "scores.json"
-    if not scores.is_file():
+    kept = json.loads(scores.read_text()) if scores.is_file() else {}
+    if "made_on" not in kept:  # nothing, or by an earlier form of this program
         return False
-    before, now = json.loads(scores.read_text())["conditions"], arguments.conditions(name)
-    changed = [f"{key} {before[key]}, now {now[key]}" for key in now if before[key] != now[key]]
+    if arguments.redo_older and kept["made_on"]["commit"] != Hardware.here().commit:
+        return False
+    before, now = kept["conditions"], arguments.conditions(name)
+    changed = [
+        f"{key} {before.get(key)}, now {now[key]}" for key in now if before.get(key) != now[key]
+    ]
     if changed and not arguments.overwrite:
         raise InputError(
             f"{scores.parent} was trained with {'; '.join(changed)}. Choose another --out, or "
@@ -204,14 +194,16 @@ def _train_method(
     stop: threading.Event,
 ) -> None:
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
+    from apps.report.hardware import Hardware
+    from baselines.comparison_scores import curve_point, score_all
     from baselines.systems.compared_systems import make_system, train_config
-    from benchmarks.hardware import Hardware
 
-    config = train_config(data, arguments.seconds, arguments.steps)
+    made_on = asdict(Hardware.here())
+    config = train_config(data, arguments.seconds, arguments.steps, seed=arguments.seed)
     began = time.process_time()
     system = make_system(name, data, config, preset=arguments.preset, seed=arguments.seed)
     spent = time.process_time() - began + (data.ready_seconds if name == "ours" else 0.0)
-    curve: list[CurvePsnr] = []
+    curve: list[dict[str, Any]] = []
     marks = _marks(arguments)
     with console.progress(f"training {name}", 1.0) as bar:
         while (progress := _progress(arguments, spent, system.steps)) < 1.0 and not stop.is_set():
@@ -221,30 +213,29 @@ def _train_method(
             progress = _progress(arguments, spent, system.steps)
             bar.update(progress, f"{system.steps} steps, {spent:.0f} core-s")
             if marks and progress >= marks[0]:
-                curve.append(_curve_point(system, data, spent))
+                curve.append(asdict(curve_point(system, data, spent)))
                 marks = [mark for mark in marks if mark > progress]
     if stop.is_set():
         return
-    with atomic_folder(arguments.out / name) as folder:
-        final = {
-            kind: _score_all(system, frames, folder / kind)
-            for kind, frames in (("held_out", data.held_out), ("novel", data.novel))
-        }
+    began = time.process_time()
+    with atomic_folder(arguments.out / name) as folder, console.status(f"scoring {name}"):
         found = {
             "method": name,
             "conditions": arguments.conditions(name),
-            "commit": Hardware.here().commit,
+            "made_on": made_on,
             "core_seconds": spent,
             "steps": system.steps,
             "training_frames": len(data.frames),
             "picture_px": data.held_out[0].observation.camera.size_px,
-            "curve": [asdict(point) for point in curve],
-            **final,
+            "poses": "estimated" if data.capture.has_estimated_poses else "exact",
+            "curve": curve,
+            **score_all(system, data, folder),
+            "scoring_core_seconds": time.process_time() - began,
         }
         (folder / "scores.json").write_text(json.dumps(found, indent=1) + "\n")
-    novel = final["novel"]
-    shown = novel if novel["psnr"] is not None else final["held_out"]
-    console.info(f"{name}: {system.steps} steps, {shown['psnr']:.2f} dB")
+    novel = found["novel_fitted"]["psnr"]
+    shown = found["held_out_fitted"]["psnr"] if novel is None else novel
+    console.info(f"{name}: {system.steps} steps, {shown:.2f} dB in fitted poses")
 
 
 def _progress(arguments: CompareArguments, spent: float, steps: int) -> float:
@@ -258,49 +249,8 @@ def _marks(arguments: CompareArguments) -> list[float]:
     return [*(mark / arguments.seconds for mark in MARKS_S if mark < arguments.seconds), 1.0]
 
 
-def _curve_point(system: "ComparedSystem", data: "ComparedCapture", spent: float) -> CurvePsnr:
-    from avatar.evaluation.held_out import coarse_to_fine_order
-
-    frames = coarse_to_fine_order(data.novel or data.held_out)[:CURVE_FRAMES]
-    found = _score_all(system, frames, None)["psnr"]
-    held_out, novel = (None, found) if data.novel else (found, None)
-    return CurvePsnr(core_seconds=spent, steps=system.steps, held_out=held_out, novel=novel)
-
-
-def _score_all(
-    system: "ComparedSystem", frames: "list[HeldOutFrame]", folder: Path | None
-) -> dict[str, Any]:
-    """Mean scores and those of each frame; a folder gets the pictures on white, and the truth."""
-    import numpy as np
-
-    from avatar.evaluation.held_out import score_rendering
-    from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
-    from studio.capture_files import write_png
-
-    scores = []
-    if folder is not None:
-        (folder / "truth").mkdir(parents=True)
-    for frame in frames:
-        seen = frame.observation
-        rendering = system.render(seen)
-        scores.append(score_rendering(rendering, frame))
-        if folder is not None:
-            name = f"{seen.frame.index:04d}.png"
-            for place, image in (
-                (folder, composite_on_white(rendering)),
-                (folder / "truth", ground_truth_on_white(seen)),
-            ):
-                pixels = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
-                write_png(place / name, np.ascontiguousarray(pixels[..., ::-1]))
-    means = {
-        key: float(np.mean([getattr(score, key) for score in scores])) if scores else None
-        for key in ("psnr", "psnr_mask", "ssim")
-    }
-    return {**means, "frames": [asdict(score) for score in scores]}
-
-
 def _write_sheet(out: Path, done: list[str]) -> None:
-    """pictures.png: a row for a few frames, a column for the truth and for each method."""
+    """pictures.png: a row for a few frames, a column for the truth and for each method, fitted."""
     import cv2
     import numpy as np
 
@@ -309,7 +259,7 @@ def _write_sheet(out: Path, done: list[str]) -> None:
     names = names[:: max(1, len(names) // 4)][:4]
     columns = {
         "truth": out / done[0] / kind / "truth",
-        **{name: out / name / kind for name in done},
+        **{name: out / name / f"{kind}_fitted" for name in done},
     }
     rows = [
         np.hstack([np.asarray(cv2.imread(str(folder / name))) for folder in columns.values()])

@@ -1,28 +1,31 @@
 """Results of a comparison as Markdown: scores at the end, over time, and what time is missing."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-SCORES = (("psnr", 2), ("psnr_mask", 2), ("ssim", 4))
-"""Scores of each kind of frames, with their digits."""
+COLUMNS = (
+    ("", "psnr", "{}, PSNR given", 2), ("_fitted", "psnr", "fitted", 2),
+    ("_fitted", "psnr_mask", "in the mask", 2), ("_fitted", "ssim", "SSIM", 4),
+)  # fmt: skip
+"""Scores of each kind of frames: the poses', the score's name, the column's title, and digits."""
+KINDS = {"novel": "novel poses", "held_out": "held-out frames"}
+"""Kinds of frames."""
 MIN_SLOPE_DB = 0.1
 """Gain for each doubling of the time below which nothing is extrapolated, dB."""
 
 
 def comparison_table(results: Sequence[dict[str, Any]]) -> str:
     """Both tables of one capture: at the end of training, and over time."""
-    head = [
-        "", "core-s", "steps", "novel poses, PSNR", "in the mask", "SSIM",
-        "held-out PSNR", "in the mask", "SSIM",
-    ]  # fmt: skip
+    head = ["", "core-s", "steps", "core-ms a step"]
+    head += [title.format(told) for told in KINDS.values() for _, _, title, _ in COLUMNS]
     rows = [
         [
-            each["method"], f"{each['core_seconds']:.0f}", f"{each['steps']:,}",
+            each["method"], f"{each['core_seconds']:.0f}", f"{each['steps']:,}", step_cost(each),
             *(
-                number(each[kind][key], digits)
-                for kind in ("novel", "held_out")
-                for key, digits in SCORES
+                number(each[kind + poses][key], digits)
+                for kind in KINDS
+                for poses, key, _, digits in COLUMNS
             ),
         ]
         for each in results
@@ -38,8 +41,8 @@ def _by_time(results: Sequence[dict[str, Any]], kind: str) -> tuple[list[str], l
     counted = results[0]["conditions"]["steps"] is not None
     times = [point["steps" if counted else "core_seconds"] for point in longest]
     unit = "steps" if counted else "core-s"
-    what = "novel poses" if kind == "novel" else "held-out frames"
-    head = [f"{what}, PSNR after", *(f"{round(time):,} {unit}" for time in times)]
+    head = [f"{KINDS[kind]} in fitted poses, PSNR after"]
+    head += [f"{round(time):,} {unit}" for time in times]
     rows = []
     if ours:
         head.append("as good as ours at the end")
@@ -72,6 +75,11 @@ def time_to_reach(curve: Sequence[dict[str, Any]], kind: str, wanted: float) -> 
     if doublings > 20.0:
         return "not reached"
     return f"{duration(end * 2.0**doublings)} (extrapolated)"
+
+
+def step_cost(result: Mapping[str, Any]) -> str:
+    """CPU time of a step, core-ms."""
+    return f"{1000.0 * result['core_seconds'] / max(result['steps'], 1):,.0f}"
 
 
 def duration(seconds: float) -> str:

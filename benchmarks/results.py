@@ -1,10 +1,11 @@
 """The paper's tables with ours and the baselines, at equal core time: docs/results.md.
 
-    python -m benchmarks.results [--motion TRACK] [--seconds 60 300] [--write docs/results.md]
+    python -m benchmarks.results [--motion TRACK] [--plan whole] [--write docs/results.md]
 
 For each subject an exact and a phone-like sample are filmed and `python -m baselines.compare` is
 run on both, as many at a time as there are --jobs. What is in OUT already is not made again: Ctrl-C
-and the same command continue. `--seconds 60 --subjects 1` takes half an hour of core time.
+and the same command continue, with the most important comparisons first. Times are the processor's,
+so that other programs hardly count; commit, machine and versions come from the score files.
 """
 
 import json
@@ -13,45 +14,56 @@ import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import tyro
 
 from apps.cli.exit_codes import run_command
-from benchmarks.hardware import ROOT, Hardware
+from benchmarks.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
+from capture.input_error import InputError
 from studio.shoot import ShootConfig, film_capture
 
 ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
 """Methods, in the order of the tables."""
-PICTURE_NAME = "results.webp"
-"""Beside the page: the truth and each method, of the first exact sample."""
+MAIN = ("anim-nerf", "ours")
+"""What is compared first, and on all subjects."""
+PICTURES = {"exact": "results.webp", "phone": "results-phone.webp"}
+"""Beside the page: the truth and each method, of the first sample of each kind."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultsJob:
     """Films the samples, compares the systems on each, and writes the page."""
 
-    subjects: tuple[int, ...] = (1, 2, 3)
-    """Actors of the studio: the paper's S1 to S3."""
-    seconds: tuple[float, ...] = (60.0,)
-    """Core seconds of each method; each is a run of its own, with its own learning-rate decay."""
-    methods: tuple[str, ...] = ORDER
-    """What is compared."""
+    plan: Literal["short", "whole"] = "short"
+    """short: Anim-NeRF and ours on S1 to S3 for a minute, all methods on S1, and five minutes on
+    S1 (about 110 core-minutes). whole: all methods on all of them, one and five minutes."""
     motion: Path | None = None
     """Track whose poses the actors take while they are filmed, such as one of PeopleSnapshot; if
     not given, the studio's own turn."""
-    size: int = 128
+    size: int = 256
     """Width and height of the exact samples; the phone-like ones are 9:16 and as high."""
     frames: int = 60
     """Frames of each film."""
     jobs: int = 2
     """Comparisons at a time; each takes one core."""
+    redo_older: bool = False
+    """Train again what another commit trained; otherwise the page names such cells."""
     out: Path = Path("results")
     """Folder for samples and comparisons."""
     write: Path | None = None
-    """Markdown file whose tables are replaced; its picture lies beside it."""
+    """Markdown file whose tables are replaced; its pictures lie beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedComparison:
+    """Methods that are to be compared on a sample."""
+
+    sample: ComparedSample
+    methods: tuple[str, ...]
 
 
 def main() -> None:
@@ -61,26 +73,72 @@ def main() -> None:
 
 
 def run(job: ResultsJob) -> int:
-    """Films, compares and writes; an interrupted comparison leaves what is done."""
-    hardware = Hardware.here()
-    samples = [
-        ComparedSample(subject=subject, kind=kind, seconds=seconds)
-        for seconds in job.seconds
-        for kind in ("phone", "exact")
-        for subject in job.subjects
-    ]
+    """Films, compares and writes; an interrupted comparison leaves what is done.
+
+    Raises:
+        InputError: If OUT holds samples that were filmed otherwise.
+    """
+    planned = plan(job.plan)
+    samples = list(dict.fromkeys(each.sample for each in planned))
+    _claim(job)
     for sample in samples:
         film(job, sample)
-    codes = [0]
+    codes, done = [0], 0
     with ThreadPoolExecutor(job.jobs) as pool:
-        running = [pool.submit(compare, job, sample) for sample in samples]
+        running = [pool.submit(compare, job, each) for each in planned]
         try:
-            for done in as_completed(running):
-                codes.append(done.result())
-                write_page(job, samples, hardware.lines())  # an interrupted run has a page, too
+            for finished in as_completed(running):
+                codes.append(finished.result())
+                done += 1
+                print(f"{done} of {len(planned)} comparisons", file=sys.stderr, flush=True)
+                write_page(job, samples)
         finally:
             pool.shutdown(cancel_futures=True)
+            write_page(job, samples)  # an interrupted run has a page, too
     return max(codes)
+
+
+def plan(name: str) -> list[PlannedComparison]:
+    """The comparisons of a plan, the most important ones first; later ones may repeat methods."""
+    kinds: tuple[Literal["phone", "exact"], ...] = ("phone", "exact")
+    everything = [
+        (subject, kind, seconds) for seconds in (60.0, 300.0) for subject in (1, 2, 3)
+        for kind in kinds
+    ]  # fmt: skip
+    first = [each for each in everything if each[2] == 60.0]
+    ordered = [(each, MAIN) for each in first]
+    if name == "short":
+        ordered += [((1, kind, 60.0), _without("snarf")) for kind in kinds]
+        ordered += [((1, kind, 300.0), MAIN) for kind in kinds]
+        ordered += [((1, kind, 60.0), ORDER) for kind in kinds]
+    else:
+        ordered += [(each, ORDER) for each in everything]
+    return [
+        PlannedComparison(
+            sample=ComparedSample(subject=subject, kind=kind, seconds=seconds), methods=methods
+        )
+        for (subject, kind, seconds), methods in ordered
+    ]
+
+
+def _without(method: str) -> tuple[str, ...]:
+    return tuple(each for each in ORDER if each != method)
+
+
+def _claim(job: ResultsJob) -> None:
+    """Writes into OUT how its samples are filmed, or refuses one where they were otherwise."""
+    now = {
+        "size": job.size, "frames": job.frames,
+        "motion": None if job.motion is None else str(job.motion.resolve()),
+    }  # fmt: skip
+    path = job.out / "samples.json"
+    before = json.loads(path.read_text()) if path.is_file() else now
+    if before != now:
+        raise InputError(
+            f"{job.out} holds samples filmed with {before}, now {now}. Name another --out."
+        )
+    job.out.mkdir(parents=True, exist_ok=True)
+    write_text_atomically(path, json.dumps(now))
 
 
 def film(job: ResultsJob, sample: ComparedSample) -> None:
@@ -95,12 +153,13 @@ def film(job: ResultsJob, sample: ComparedSample) -> None:
     film_capture(place, config)
 
 
-def compare(job: ResultsJob, sample: ComparedSample) -> int:
-    """Compares all methods on a sample; the exit code."""
+def compare(job: ResultsJob, planned: PlannedComparison) -> int:
+    """Compares the methods on a sample; the exit code."""
+    sample = planned.sample
     command = [
-        sys.executable, "-m", "baselines.compare", str(job.out / sample.name),
+        sys.executable, "-m", "baselines.compare", str((job.out / sample.name).resolve()),
         "--seconds", f"{sample.seconds:g}", "--out", str(folder_of(job, sample)),
-        "--methods", *job.methods,
+        "--methods", *planned.methods, *(["--redo-older"] if job.redo_older else []),
     ]  # fmt: skip
     return subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
 
@@ -110,19 +169,17 @@ def folder_of(job: ResultsJob, sample: ComparedSample) -> Path:
     return (job.out / f"{sample.name}-{sample.seconds:g}s").resolve()
 
 
-def write_page(job: ResultsJob, samples: list[ComparedSample], conditions: list[str]) -> None:
-    """The page with new tables and a new picture; the text around the tables is kept."""
+def write_page(job: ResultsJob, samples: list[ComparedSample]) -> None:
+    """The page with new tables and new pictures; the text around the tables is kept."""
     found = {
-        sample: [json.loads(path.read_text()) for path in scores]
-        for sample in samples
-        if (scores := [path for name in ORDER if (path := scores_of(job, sample, name)).is_file()])
+        sample: scores
+        for sample in sorted(samples, key=lambda sample: (sample.kind != "phone", sample.subject))
+        if (scores := _scores(job, sample))
     }
     if not found:
         return
     track = "the studio's own turn" if job.motion is None else f"{job.motion.name}, on the spot"
-    commits = sorted({each["commit"] for results in found.values() for each in results})
-    told = [f"trained at {', '.join(commits)}", f"filmed: {job.frames} frames, {track}"]
-    lines = results_lines(found, [*conditions, *told])
+    lines = results_lines(found, [f"filmed: {job.frames} frames of {job.size} px, {track}"])
     if job.write is None:
         print("\n".join(lines))
         return
@@ -130,12 +187,20 @@ def write_page(job: ResultsJob, samples: list[ComparedSample], conditions: list[
     if job.write.exists() and BEGIN in (text := job.write.read_text()):
         before, after = text.split(BEGIN)[0], text.split(END)[1]
     write_text_atomically(job.write, before + "\n".join([BEGIN, *lines, END]) + after)
-    sheet = cv2.imread(
-        str(folder_of(job, min(found, key=lambda sample: sample.kind)) / "pictures.png")
-    )
-    if sheet is not None:
-        _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
-        (job.write.parent / PICTURE_NAME).write_bytes(code.tobytes())
+    for kind, name in PICTURES.items():
+        first = next((sample for sample in found if sample.kind == kind), None)
+        path = None if first is None else folder_of(job, first) / "pictures.png"
+        sheet = None if path is None else cv2.imread(str(path))
+        if sheet is not None:
+            _, code = cv2.imencode(".webp", sheet, [cv2.IMWRITE_WEBP_QUALITY, 80])
+            (job.write.parent / name).write_bytes(code.tobytes())
+
+
+def _scores(job: ResultsJob, sample: ComparedSample) -> list[dict[str, Any]]:
+    """What the score files of a sample hold, in the order of the methods; not of earlier forms."""
+    paths = [scores_of(job, sample, name) for name in ORDER]
+    read = [json.loads(path.read_text()) for path in paths if path.is_file()]
+    return [each for each in read if "made_on" in each]
 
 
 def scores_of(job: ResultsJob, sample: ComparedSample, method: str) -> Path:

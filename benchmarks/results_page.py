@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from baselines.comparison_table import markdown, number, time_to_reach
+from baselines.comparison_scores import CURVE_FRAMES
+from baselines.comparison_table import markdown, number, step_cost, time_to_reach
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 REQUIRED_GAIN_DB = 5.0
@@ -46,26 +47,50 @@ Found = Mapping[ComparedSample, Sequence[Mapping[str, Any]]]
 
 def results_lines(found: Found, conditions: Sequence[str]) -> list[str]:
     """The tables as Markdown; phone-like samples come first in each."""
-    lines = ["`python -m benchmarks.results`", "", *(f"* {line}" for line in conditions)]
+    told = [*_made_on_lines(found), *conditions]
+    lines = ["`python -m benchmarks.results`", "", *(f"* {line}" for line in told)]
     for seconds in sorted({sample.seconds for sample in found}):
         part = {sample: results for sample, results in found.items() if sample.seconds == seconds}
         budget = f"{seconds:g} core-seconds"
-        lines += [
-            "",
-            f"## Novel poses after {budget}",
-            "",
-            "PSNR in dB / SSIM, on white.",
-        ]
-        lines += ["", *_score_table(part, "novel"), *_gain_lines(part)]
-        lines += ["", f"## Held-out frames after {budget}", "", *_score_table(part, "held_out")]
+        for kind, title in (("novel", "Novel poses"), ("held_out", "Held-out frames")):
+            lines += ["", f"## {title} after {budget}"]
+            for poses, what in (("_fitted", "In fitted poses"), ("", "In the poses given")):
+                lines += ["", f"{what}: PSNR in dB / SSIM, on white.", ""]
+                lines += [*_score_table(part, kind + poses)]
+                lines += _gain_lines(part, kind + poses)
         lines += ["", f"## Novel poses over time, in runs of {budget}", ""]
         lines += [
-            f"PSNR on four of the twelve poses, within a run of {budget}. Last column: core time "
-            "until a method is as good as ours at the end; beyond the run it is extrapolated by "
-            "the gain of its last doubling of time.", "",
-            *_time_table(part),
+            f"PSNR in fitted poses on {CURVE_FRAMES} of the twelve, within a run of {budget}. Last "
+            "column: core time until a method is as good as ours at the end; beyond the run it is "
+            "extrapolated by the gain of its last doubling of time.", "",
+            *_time_table(part), "",
+            f"Core-ms of a step, and steps, in runs of {budget}:", "",
+            *_step_table(part),
         ]  # fmt: skip
     return [*lines, "", *_paper_lines()]
+
+
+def _made_on_lines(found: Found) -> list[str]:
+    """Commits, machines, versions and times, from the score files."""
+    made = [each["made_on"] for results in found.values() for each in results]
+    commits = sorted({each["commit"] for each in made})
+    dates, loads = sorted(each["date"] for each in made), [each["load"] for each in made]
+    machines = dict.fromkeys(
+        f"{each['processor']}, {each['cores']} cores, {each['memory_gb']} GB; {each['software']}"
+        for each in made
+    )
+    lines = [f"commit {', '.join(commits)}; {dates[0]} to {dates[-1]}", *machines]
+    lines.append(f"{min(loads):g} to {max(loads):g} processes wanted a core when each method began")
+    if len(commits) > 1:
+        newest = max(made, key=lambda each: each["date"])["commit"]
+        lines += [
+            f"of another commit, {each['made_on']['commit']}: {each['method']} on "
+            f"{_title(sample)}, {sample.seconds:g} s"
+            for sample, results in found.items()
+            for each in results
+            if each["made_on"]["commit"] != newest
+        ]
+    return lines
 
 
 def _score_table(found: Found, kind: str) -> list[str]:
@@ -80,13 +105,13 @@ def _scores(scores: Mapping[str, float] | None) -> str:
     return "-" if scores is None else f"{number(scores['psnr'], 2)} / {number(scores['ssim'], 4)}"
 
 
-def _gain_lines(found: Found) -> list[str]:
+def _gain_lines(found: Found, kind: str) -> list[str]:
     """What ours wins over Anim-NeRF on each sample."""
     gains = {}
     for sample, results in found.items():
         ours, theirs = _result(results, "ours"), _result(results, "anim-nerf")
         if ours is not None and theirs is not None:
-            gains[_title(sample)] = ours["novel"]["psnr"] - theirs["novel"]["psnr"]
+            gains[_title(sample)] = ours[kind]["psnr"] - theirs[kind]["psnr"]
     if not gains:
         return []
     told = ", ".join(f"{title} {gain:+.1f} dB" for title, gain in gains.items())
@@ -95,6 +120,15 @@ def _gain_lines(found: Found) -> list[str]:
         "",
         f"Ours over Anim-NeRF: {told}. At least +{REQUIRED_GAIN_DB:g} dB on {met} of {len(gains)}.",
     ]
+
+
+def _step_table(found: Found) -> list[str]:
+    rows = []
+    for method in _methods(found):
+        each = [_result(results, method) for results in found.values()]
+        cells = ("-" if one is None else f"{step_cost(one)}: {one['steps']:,}" for one in each)
+        rows.append([method, *cells])
+    return markdown(["", *(_title(sample) for sample in found)], rows)
 
 
 def _time_table(found: Found) -> list[str]:

@@ -1,10 +1,11 @@
 """The one trainer of all baselines: frames, rays, compositor, losses, poses and decay."""
 
+from itertools import product
 from typing import Any, final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from avatar.render import BodyFrameRays, pixel_chunks
@@ -14,6 +15,7 @@ from avatar.training.training_frame import TrainingFrame
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.posed_person import OccupiedCells, PoseTable, SkinnedPerson
 from baselines.systems.ray_rendering import BodyRays, PosedRadiance, render_rays
+from capture.camera import Camera
 from preprocess.observation import Observation
 
 RENDERED_RAYS = 4096
@@ -112,7 +114,8 @@ class BaselineSystem:
         world_from_body = self._person.rig.world_from_body(pose)
         width, height = camera.size_px
         picture = np.zeros((height, width, 4), dtype=np.float32)
-        for part, pixels in pixel_chunks(picture, 0, 0):
+        rows, columns = _seen_part(cells, camera, world_from_body)
+        for part, pixels in pixel_chunks(picture[rows, columns], rows.start, columns.start):
             found = BodyFrameRays.through(pixels, camera, world_from_body)
             directions = torch.from_numpy(found.directions).split(RENDERED_RAYS)
             colors = [self._render_part(cells, found.origin, some).numpy() for some in directions]
@@ -137,3 +140,19 @@ class BaselineSystem:
     def _set_training(self, trains: bool) -> None:
         if isinstance(self.field, nn.Module):
             self.field.train(trains)
+
+
+def _seen_part(
+    cells: OccupiedCells, camera: Camera, world_from_body: Float[np.ndarray, "4 4"]
+) -> tuple[slice, slice]:
+    """Rows and columns of the picture where a body's cells can be seen; all if it is too near."""
+    low, size = cells.low[0].numpy(), cells.shape[0].numpy() * cells.cell_m
+    corners = low + np.array(list(product((0.0, 1.0), repeat=3))) * size
+    corners = corners @ world_from_body[:3, :3].T + world_from_body[:3, 3]
+    view, (width, height) = camera.camera_from_world[2], camera.size_px
+    if (corners @ view[:3] + view[3]).min() <= 0.0 or camera.distortion:
+        return slice(0, height), slice(0, width)
+    pixels = camera.project(corners)
+    first = np.clip(np.floor(pixels.min(axis=0)), 0, (width, height)).astype(int)
+    last = np.clip(np.ceil(pixels.max(axis=0)), first, (width, height)).astype(int)
+    return slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))

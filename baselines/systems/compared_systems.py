@@ -1,6 +1,7 @@
 """The systems by name: the product, and each baseline in a preset."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
@@ -68,13 +69,16 @@ class ProductSystem:
         return render(self._trainer.avatar, observation.pose, observation.camera, shaded=True)
 
 
-def train_config(data: ComparedCapture, seconds: float | None, steps: int | None) -> TrainConfig:
-    """The product's configuration for a budget and this capture."""
+def train_config(
+    data: ComparedCapture, seconds: float | None, steps: int | None, *, seed: int = 0
+) -> TrainConfig:
+    """The product's configuration for a budget and this capture, as ia-ingest makes it."""
     capture = data.capture
-    return TrainConfig.for_budget(
+    config = TrainConfig.for_budget(
         seconds, steps=steps, footprint_m=capture.pixel_footprint_m(),
-        frames=capture.source.frame_count,
+        frames=capture.source.frame_count, seed=seed,
     )  # fmt: skip
+    return replace(config, poses_may_be_exact=not capture.has_estimated_poses)
 
 
 FieldMaker = Callable[[SkinnedPerson, ComparedCapture, MethodSettings, TrainConfig], PosedRadiance]

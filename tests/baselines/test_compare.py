@@ -28,10 +28,14 @@ def test_it_writes_scores_table_and_pictures(compared):
     for each in results:
         assert each["steps"] == 6
         assert [point["steps"] for point in each["curve"]] == [1, 3, 6]
-        assert len(each["novel"]["frames"]) == 12
+        assert each["made_on"]["commit"]
+        assert each["made_on"]["processor"]
+        assert each["poses"] == "exact"
         assert math.isfinite(each["held_out"]["psnr"])
-        pictures = {path.name for path in (out / each["method"] / "novel").glob("*.png")}
-        assert pictures == {f"{index:04d}.png" for index in range(12)}
+        for kind in ("novel", "novel_fitted"):
+            assert len(each[kind]["frames"]) == 12
+            pictures = {path.name for path in (out / each["method"] / kind).glob("*.png")}
+            assert pictures == {f"{index:04d}.png" for index in range(12)}
     assert (out / "pictures.png").stat().st_size > 0
     assert "| ours |" in (out / "table.md").read_text()
 
@@ -49,6 +53,18 @@ def test_overwrite_trains_again(compared, monkeypatch):
     monkeypatch.setattr(compare, "_train_method", lambda name, *_: trained.append(name))
     monkeypatch.setattr(compare, "_write_sheet", lambda *_: None)
     assert compare.main([*compared[1], "--methods", "ours", "ours", "--overwrite"]) == 0
+    assert trained == ["ours"]
+
+
+def test_what_another_commit_trained_is_trained_again_only_if_asked(compared, monkeypatch):
+    trained, scores = [], compared[0] / "out" / "ours" / "scores.json"
+    before = scores.read_text()
+    kept = json.loads(before)
+    scores.write_text(json.dumps({**kept, "made_on": {**kept["made_on"], "commit": "0000000"}}))
+    monkeypatch.setattr(compare, "_train_method", lambda name, *_: trained.append(name))
+    for flags in ([], ["--redo-older"]):
+        assert compare.main([*compared[1], "--methods", "anim-nerf", "ours", *flags]) == 0
+    scores.write_text(before)
     assert trained == ["ours"]
 
 
@@ -98,9 +114,9 @@ def test_a_capture_without_novel_poses_has_a_table():
     none = dict.fromkeys(scores)
     result = {
         "method": "ours", "core_seconds": 60.0, "steps": 100, "conditions": {"steps": None},
-        "held_out": scores, "novel": none,
+        "held_out": scores, "held_out_fitted": scores, "novel": none, "novel_fitted": none,
         "curve": [{"core_seconds": 60.0, "steps": 100, "held_out": np.nan, "novel": None}],
     }  # fmt: skip
     table = comparison_table([result])
-    assert "| ours | 60 | 100 | - | - | - | 30.00 | 22.00 | 0.9800 |" in table
-    assert "held-out frames, PSNR after" in table
+    assert "| ours | 60 | 100 | 600 | - | - | - | - | 30.00 | 30.00 | 22.00 | 0.9800 |" in table
+    assert "held-out frames in fitted poses, PSNR after" in table

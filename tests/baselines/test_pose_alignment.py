@@ -1,0 +1,69 @@
+"""Poses fitted to scored pictures: found again where a renderer is exact, and never worse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from baselines.systems.pose_alignment import align_pose
+from preprocess.fitting.clip_fitting import correct_pose
+from preprocess.fitting.pose_priors import POSE_SIGMA
+from studio.actor import Actor
+
+
+@pytest.fixture(scope="module")
+def actor():
+    return Actor.of(1, 0)
+
+
+@pytest.fixture
+def draws(actor):
+    """An exact renderer, and the poses that it was asked for."""
+    asked = []
+
+    def render(seen):
+        asked.append(seen)
+        color, alpha = actor.render_rgb_alpha(seen.pose, seen.camera)
+        return np.dstack([color * alpha[..., None], alpha]).astype(np.float32)
+
+    return render, asked
+
+
+def joint_error_px(actor, one, other):
+    """Distance of the joints across the view; a single picture does not tell depths."""
+    camera = other.camera
+    places = [camera.project(actor.shaped.with_pose(each.pose).joints()) for each in (one, other)]
+    return float(np.linalg.norm(places[0] - places[1], axis=1).mean())
+
+
+def test_a_wrong_pose_is_found_again(actor, clip, draws):
+    true, noise = clip.novel, 0.5 * POSE_SIGMA * np.random.default_rng(1).standard_normal(75)
+    begin = replace(true, pose=correct_pose(true.pose, noise, true.camera.camera_from_world))
+    render, asked = draws
+    found = align_pose(render, begin, actor.shaped)
+    assert len(asked) == 6
+    assert joint_error_px(actor, found, true) < 0.4 * joint_error_px(actor, begin, true)
+
+
+def test_an_exact_pose_stays(actor, clip, draws):
+    found = align_pose(draws[0], clip.novel, actor.shaped)
+    assert joint_error_px(actor, found, clip.novel) < 0.5
+
+
+def test_a_picture_that_no_pose_changes_keeps_the_pose(actor, clip):
+    width, height = clip.novel.camera.size_px
+    empty = np.zeros((height, width, 4), dtype=np.float32)
+    found = align_pose(lambda _: empty, clip.novel, actor.shaped)
+    assert joint_error_px(actor, found, clip.novel) < 1e-9
+
+
+def test_large_pictures_are_compared_at_a_smaller_size(actor, clip, draws):
+    camera = clip.novel.camera.resize((288, 288))
+    rgb = np.repeat(np.repeat(clip.novel.frame.rgb, 4, axis=0), 4, axis=1)
+    alpha = np.repeat(np.repeat(clip.novel.alpha, 4, axis=0), 4, axis=1)
+    frame = replace(clip.novel.frame, rgb=rgb)
+    large = replace(clip.novel, frame=frame, alpha=alpha, camera=camera)
+    render, asked = draws
+    found = align_pose(render, large, actor.shaped, renderings=2)
+    assert [seen.camera.size_px for seen in asked] == [(128, 128)] * 2
+    assert found.camera is camera
