@@ -67,6 +67,10 @@ class Camera:
             size_px=size_px,
         )
 
+    def scale_focal(self, factor: float) -> "Camera":
+        """The same camera with focal lengths times a factor."""
+        return replace(self, focal_px=(self.focal_px[0] * factor, self.focal_px[1] * factor))
+
     def resize_longer_side(self, longer_px: int) -> "Camera":
         """The same camera for an image with a longer side of `longer_px`."""
         scale = longer_px / max(self.size_px)

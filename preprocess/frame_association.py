@@ -17,6 +17,7 @@ from capture.camera import Camera
 from capture.image_folder import list_images
 from capture.input_error import InputError
 from capture.source import FrameSource
+from preprocess.body.kinematics import rigid_transform
 from preprocess.cameras.named_camera import NamedCamera
 
 NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `time`)"
@@ -290,10 +291,7 @@ def _interpolate_camera(a: Camera, b: Camera, share: float) -> Camera:
     turn = Rotation.from_matrix(b.camera_from_world[:3, :3]) * start.inv()
     rotation = (Rotation.from_rotvec(share * turn.as_rotvec()) * start).as_matrix()
     center = (1.0 - share) * a.center_world + share * b.center_world
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = rotation
-    camera_from_world[:3, 3] = -rotation @ center
-    return replace(a, camera_from_world=camera_from_world)
+    return replace(a, camera_from_world=rigid_transform(rotation, -rotation @ center))
 
 
 def _frame_numbers(names: Sequence[str | None], frames: int) -> list[int] | None:

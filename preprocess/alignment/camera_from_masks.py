@@ -10,8 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.corrections import Correction, shift_principal_point
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
-from preprocess.body.silhouette import soft_iou, splat_silhouette
+from preprocess.alignment.silhouette_objective import (
+    MaskSample,
+    SilhouetteObjective,
+    mean_score,
+    mean_with_missing,
+)
+from preprocess.body.kinematics import rigid_transform
 
 CAMERA_SAMPLES = 6
 """Frames to which a camera is fitted."""
@@ -42,33 +47,24 @@ class _CameraProblem:
     objective: SilhouetteObjective
 
     @cached_property
-    def camera_rows(self) -> list[int]:
-        """Index of the camera of each body."""
-        samples = self.objective.samples
-        return [w.camera_row for w in samples if self.geometry.row_for_frame(w.index) is not None]
-
-    @cached_property
-    def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "_ _"]]]:
-        found = []
-        for sample in self.objective.samples:
-            row = self.geometry.row_for_frame(sample.index)
-            if row is not None:
-                points = self.objective.posed_points(self.geometry.motion, row)
-                found.append((points, sample.alpha))
-        return found
+    def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], MaskSample]]:
+        """The skin in each sample that has a pose, and the sample."""
+        rows = [self.geometry.row_for_frame(sample.index) for sample in self.objective.samples]
+        return [
+            (self.objective.posed_points(self.geometry.motion, row), sample)
+            for row, sample in zip(rows, self.objective.samples, strict=True)
+            if row is not None
+        ]
 
     def mean_iou(self, extrinsic: Float[np.ndarray, "4 4"]) -> float:
         """Mean IoU of bodies and masks seen from this camera."""
         geometry = replace(self.geometry, extrinsics=extrinsic[None])
-        camera = geometry.camera_at(0, self.objective.size_px)
-        return float(np.mean([soft_iou(splat_silhouette(p, camera), a) for p, a in self.bodies]))
+        return mean_score(self.objective.frame_scores(geometry))
 
     def extrinsic_for(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
         """The camera of a given rotation that puts the bodies where the masks are."""
-        extrinsic = np.eye(4)
-        extrinsic[:3, :3] = rotation
-        extrinsic[:3, 3] = -rotation @ np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
-        extrinsic[2, 3] += 4.0
+        middle = np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
+        extrinsic = rigid_transform(rotation, -rotation @ middle + (0.0, 0.0, 4.0))
         for _ in range(4):
             camera = replace(self.geometry, extrinsics=extrinsic[None]).camera_at(
                 0, self.objective.size_px
@@ -76,7 +72,7 @@ class _CameraProblem:
             drawn = np.median(
                 [_point_bounds(camera.project(p[::8])) for p, _ in self.bodies], axis=0
             )
-            wanted = np.median([_mask_bounds(a) for _, a in self.bodies], axis=0)
+            wanted = np.median([_mask_bounds(each.alpha) for _, each in self.bodies], axis=0)
             depth = float(np.mean([(p @ rotation[2]).mean() for p, _ in self.bodies]))
             far = (depth + extrinsic[2, 3]) * (drawn[3] - drawn[1]) / (wanted[3] - wanted[1])
             off = 0.5 * (wanted[:2] + wanted[2:] - drawn[:2] - drawn[2:])
@@ -124,11 +120,13 @@ def fit_principal_point(
     if not problem.bodies:
         return None
     small = np.array(objective.size_px) / np.array(geometry.size_px)
-    wanted = np.stack([_mask_bounds(alpha) for _, alpha in problem.bodies])
+    wanted = np.stack([_mask_bounds(sample.alpha) for _, sample in problem.bodies])
     drawn = np.stack(
         [
-            _point_bounds(geometry.camera_at(row, objective.size_px).project(points[::8]))
-            for (points, _), row in zip(problem.bodies, problem.camera_rows, strict=True)
+            _point_bounds(
+                geometry.camera_at(sample.camera_row, objective.size_px).project(points[::8])
+            )
+            for points, sample in problem.bodies
         ]
     )
     away = np.median(wanted - drawn, axis=0)
@@ -179,10 +177,7 @@ def _refine_extrinsics(
 
     def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
         turn = Rotation.from_rotvec(x[:3]).as_matrix()
-        extrinsic = np.eye(4)
-        extrinsic[:3, :3] = turn @ start[:3, :3]
-        extrinsic[:3, 3] = start[:3, 3] + middle - turn @ middle + x[3:]
-        return extrinsic
+        return rigid_transform(turn @ start[:3, :3], start[:3, 3] + middle - turn @ middle + x[3:])
 
     size = np.diag([FIRST_TURN_RAD] * 3 + [FIRST_SHIFT_M] * 3)
     found = minimize(

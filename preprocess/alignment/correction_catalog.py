@@ -22,7 +22,8 @@ from preprocess.alignment.corrections import (  # fmt: skip
     undo_video_rotation,
 )
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
+from preprocess.body.kinematics import JOINT_NAMES, rigid_transform, rotation_matrices
+from preprocess.cameras.named_camera import OPENCV_FROM_OPENGL
 
 FRAME_OFFSETS = (*range(1, 13), 15, 18, 21, 25, 30, 35, 40, 50, 60)
 """Frames by which poses may be late or early, on the coarse grid."""
@@ -32,8 +33,6 @@ FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 """Frame rates, Hz, that are mistaken for one another."""
 TRANSLATION_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
 """Metres in each unit that translations may wrongly be given in."""
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-"""Rotation between camera axes x right, y up, z back and x right, y down, z forward."""
 AXIS_FLIPS = {
     "y has": (1.0, -1.0, 1.0),
     "z has": (1.0, 1.0, -1.0),
@@ -170,7 +169,7 @@ def _world_frame_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
         return
     in_camera = _moves_cameras(lambda e: np.broadcast_to(np.eye(4), e.shape))
     inverted = _moves_cameras(np.linalg.inv)
-    inverted_opengl = _moves_cameras(lambda e: _transform(OPENCV_FROM_OPENGL) @ np.linalg.inv(e))
+    inverted_opengl = _moves_cameras(lambda e: OPENCV_FROM_OPENGL @ np.linalg.inv(e))
     yield from _corrections(
         "world_frame",
         {
@@ -184,7 +183,7 @@ def _world_frame_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
 
 def _axis_corrections(geometry: CaptureGeometry) -> Iterator[Correction]:
     """OpenGL's axes in place of OpenCV's, in all numbers or in some."""
-    flip = OPENCV_FROM_OPENGL
+    flip = OPENCV_FROM_OPENGL[:3, :3]
     changes: dict[str, GeometryChange] = {
         "camera space has OpenGL's axes (y up, z back), not OpenCV's (y down, z forward)": partial(
             _rotate_camera_space, turn=flip
@@ -304,18 +303,12 @@ def _rotation(axis: str, degrees: int) -> Rotation3:
     return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
 
 
-def _transform(rotation: Rotation3) -> Float[np.ndarray, "4 4"]:
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    return transform
-
-
 def _rotate_camera_space(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
-    return replace(geometry, extrinsics=_transform(turn) @ geometry.extrinsics)
+    return replace(geometry, extrinsics=rigid_transform(turn, np.zeros(3)) @ geometry.extrinsics)
 
 
 def _rotate_world_space(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:
-    return replace(geometry, extrinsics=geometry.extrinsics @ _transform(turn))
+    return replace(geometry, extrinsics=geometry.extrinsics @ rigid_transform(turn, np.zeros(3)))
 
 
 def _rotate_rest_body(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:

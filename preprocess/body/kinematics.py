@@ -31,6 +31,16 @@ def rotation_matrices(
     return np.eye(3) + sine * cross + cosine * (cross @ cross)
 
 
+def rigid_transform(
+    rotation: Float[np.ndarray, "*batch 3 3"], translation: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Transforms x ↦ R x + t as 4x4 matrices."""
+    transform = np.zeros((*translation.shape[:-1], 4, 4))
+    transform[..., :3, :3], transform[..., :3, 3] = rotation, translation
+    transform[..., 3, 3] = 1.0
+    return transform
+
+
 def joint_transforms(
     rest_joints: Float[np.ndarray, "joints 3"],
     parents: Int[np.ndarray, "joints"],
@@ -87,7 +97,5 @@ def world_from_body(
     root_translation: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "4 4"]:
     """The rigid rest of a pose: turn about the rest pelvis J0, then shift (SMPL's convention)."""
-    transform = np.eye(4)
-    transform[:3, :3] = rotation_matrices(root_rotation)
-    transform[:3, 3] = pelvis + root_translation - transform[:3, :3] @ pelvis
-    return transform
+    rotation = rotation_matrices(root_rotation)
+    return rigid_transform(rotation, pelvis + root_translation - rotation @ pelvis)

@@ -1,6 +1,6 @@
 """Cameras of a capture: InstantAvatar's cameras.npz, other programs' files, or none at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +46,11 @@ class CameraTrack:
     def __getitem__(self, frame_index: int) -> Camera:
         """The camera of one frame."""
         return self.cameras[frame_index if self.is_moving else 0]
+
+    def scale_focal(self, factor: float) -> "CameraTrack":
+        """The cameras with focal lengths times a factor."""
+        scaled = tuple(camera.scale_focal(factor) for camera in self.cameras)
+        return replace(self, cameras=scaled)
 
 
 def resolve_camera_path(path: Path) -> Path:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from capture.input_error import InputError
+from preprocess.body.kinematics import rigid_transform
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: y up and z back become y down and z forward."""
@@ -47,10 +48,7 @@ def camera_from_opengl(
 
 def invert_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The inverse of a rotation and shift."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = transform[:3, :3].T
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse
+    return rigid_transform(transform[:3, :3].T, -transform[:3, :3].T @ transform[:3, 3])
 
 
 def parse_rigid_transform(numbers: Any, where: str) -> Float[np.ndarray, "4 4"]:

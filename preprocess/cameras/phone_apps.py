@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from capture.image_folder import natural_sort_key
 from capture.input_error import InputError
+from preprocess.body.kinematics import rigid_transform
 from preprocess.cameras.named_camera import (
     MAX_IMAGE_SIDE_PX,
     NamedCamera,
@@ -61,11 +62,10 @@ def read_record3d(content: dict[str, Any], path: Path) -> list[NamedCamera]:
     own = _per_frame_intrinsics(content, intrinsics, len(poses))
     found = []
     for row, pose in enumerate(poses):
-        world_from_camera = np.eye(4)
-        world_from_camera[:3, :3] = Rotation.from_quat(pose[:4]).as_matrix()
-        world_from_camera[:3, 3] = pose[4:]
-        camera_from_world = camera_from_opengl(world_from_camera)
-        camera = Camera.from_intrinsic(own[row], (width, height), camera_from_world)
+        world_from_camera = rigid_transform(Rotation.from_quat(pose[:4]).as_matrix(), pose[4:])
+        camera = Camera.from_intrinsic(
+            own[row], (width, height), camera_from_opengl(world_from_camera)
+        )
         found.append(NamedCamera(name=None, camera=camera))
     return found
 

@@ -46,12 +46,7 @@ class CaptureFit:
 
     def scale_focal_lengths(self, cameras: CameraTrack) -> CameraTrack:
         """The cameras, with the fitted focal length."""
-        factor = self.focal_factor
-        scaled = tuple(
-            replace(each, focal_px=(each.focal_px[0] * factor, each.focal_px[1] * factor))
-            for each in cameras.cameras
-        )
-        return replace(cameras, cameras=scaled)
+        return cameras.scale_focal(self.focal_factor)
 
     def correct_motion(self, geometry: CaptureGeometry) -> Motion:
         """The motion of the geometry that was fitted, with a correction of each row."""

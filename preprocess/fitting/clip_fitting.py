@@ -129,8 +129,7 @@ class ClipFitter:
 
     def camera(self, index: int) -> Camera:
         """Camera of a frame, with the present focal length."""
-        camera, factor = self.frames[index].camera, float(np.exp(self.log_focal))
-        return replace(camera, focal_px=(camera.focal_px[0] * factor, camera.focal_px[1] * factor))
+        return self.frames[index].camera.scale_focal(float(np.exp(self.log_focal)))
 
     def pose(self, index: int) -> BodyPose:
         """Present pose of a frame."""

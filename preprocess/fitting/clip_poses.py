@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import rigid_transform, rotation_matrices
 from preprocess.body.rotations import axis_angles_from_matrices
 
 
@@ -28,10 +28,9 @@ class PosedJoints(NamedTuple):
         self, rest_joints: Float[np.ndarray, "24 3"]
     ) -> Float[np.ndarray, "frames 24 4 4"]:
         """Transforms that carry points of the rest pose with their joints."""
-        found = np.zeros((*self.places.shape[:2], 4, 4))
-        found[..., :3, :3], found[..., 3, 3] = self.turns, 1.0
-        found[..., :3, 3] = self.places - (self.turns @ rest_joints[..., None])[..., 0]
-        return found
+        return rigid_transform(
+            self.turns, self.places - (self.turns @ rest_joints[..., None])[..., 0]
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -81,11 +81,10 @@ def fit_first_frames(
         fitter.iterate(everything._replace(outlines=False))
     for _ in range(FIRST_ITERATIONS[1]):
         fitter.iterate(everything)
-    factor = float(np.exp(fitter.log_focal))
-    focal_px = (camera.focal_px[0] * factor, camera.focal_px[1] * factor)
     poses = [fitter.pose(index) for index in range(len(seen))]
     motion = _as_motion(seen, poses, space.shaped, camera)
-    return motion, space.shape(fitter.coefficients), replace(camera, focal_px=focal_px)
+    fitted = camera.scale_focal(float(np.exp(fitter.log_focal)))
+    return motion, space.shape(fitter.coefficients), fitted
 
 
 @final

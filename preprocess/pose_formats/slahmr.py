@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import rigid_transform
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 SLAHMR_KEYS = frozenset({"root_orient", "pose_body", "trans"})
@@ -58,10 +59,10 @@ def _slahmr(content: dict[str, Any], number: int) -> Motion:
     )
     if not {"cam_R", "cam_t"} <= content.keys():
         return found
-    cameras = np.tile(np.eye(4), (len(found), 1, 1))
     turns, shifts = (np.asarray(content[key], dtype=np.float64) for key in ("cam_R", "cam_t"))
-    cameras[:, :3, :3] = turns[number] if turns.ndim == 4 else turns
-    cameras[:, :3, 3] = shifts[number] if shifts.ndim == 3 else shifts
+    cameras = rigid_transform(
+        turns[number] if turns.ndim == 4 else turns, shifts[number] if shifts.ndim == 3 else shifts
+    )
     return _with_cameras(found, cameras)
 
 

@@ -14,7 +14,7 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import rigid_transform, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.root_placement import place_in_camera_world, transform_motion
@@ -60,10 +60,8 @@ def to_metric_world(
     axes = upright_axes(floor.normal, centers[0] - person)
     origin = person - floor.normal * float(floor.heights_above(person[None])[0])
     there = scale * (centers - origin) @ axes.T
-    found = np.tile(np.eye(4), (len(centers), 1, 1))
-    found[:, :3, :3] = turned @ axes.T
-    found[:, :3, 3] = -np.einsum("cab,cb->ca", found[:, :3, :3], there)
-    return found
+    rotations = turned @ axes.T
+    return rigid_transform(rotations, -np.einsum("cab,cb->ca", rotations, there))
 
 
 FOOT_JOINTS = (7, 8, 10, 11)

@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from capture.camera import Camera
 from capture.source import FrameSource
+from preprocess.body.kinematics import rigid_transform
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.point_tracking import track_points
 from preprocess.sfm.sfm_keyframes import SfmKeyframe, to_grayscale
@@ -116,9 +117,7 @@ def resect_camera(
         drawn = np.asarray(cv2.projectPoints(points, turn, shift, lens.intrinsic, bend)[0])
         near = np.flatnonzero(np.linalg.norm(drawn[:, 0] - pixels, axis=1) < reach)
         inliers = near if len(near) >= MIN_PNP_POINTS else inliers
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-    return transform
+    return rigid_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift)[:, 0])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
