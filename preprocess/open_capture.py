@@ -15,10 +15,10 @@ from preprocess.alignment.capture_alignment import (
     BodyAlignment,
     align_body,
     align_to_person,
-    detect_body_model,
     estimate_focal_length,
     is_same_person,
     needs_placement,
+    place_motion,
 )
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
@@ -228,9 +228,7 @@ def _open_recorded(
     choice, masks = _open_masks(paths, source, wanted)
     paths = replace(paths, masks=choice.path)
     cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
-    motion = detect_body_model(motion, body, cameras, source, masks, cameras_given=given)
-    shaped = shape_for_motion(body, motion)
-    motion = place_in_camera_world(motion, shaped, cameras, cameras_given=given)
+    motion, shaped = place_motion(motion, body, cameras, source, masks, cameras_given=given)
     if not given and motion.intrinsic is None and motion.assumed_focal is None:
         cameras = estimate_focal_length(cameras, motion, shaped, source, masks)
     fit = fit_person(

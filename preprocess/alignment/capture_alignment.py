@@ -84,15 +84,13 @@ def estimate_focal_length(
     is_better = after >= max(MIN_FOCAL_IOU, before + MIN_FITTED_IOU_GAIN)
     if not is_better or abs(factor - 1.0) < MIN_FITTED_CHANGE:
         return cameras
-    old = cameras[0]
-    focal = old.focal_px[0] * factor, old.focal_px[1] * factor
+    usual = cameras[0].focal_px[0]
     return replace(
-        cameras,
-        cameras=(replace(old, focal_px=focal),),
+        cameras.scale_focal(factor),
         source="focal length found from the masks",
-        note=f"No camera was given; a focal length of {focal[0]:.0f} px was found from the masks: "
-        f"with it they agree with the body by {after:.2f}, with the usual {old.focal_px[0]:.0f} px "
-        f"by {before:.2f}.",
+        note=f"No camera was given; a focal length of {factor * usual:.0f} px was found from the "
+        f"masks: with it they agree with the body by {after:.2f}, with the usual {usual:.0f} px by "
+        f"{before:.2f}.",
     )
 
 
@@ -279,7 +277,7 @@ MIN_SMPL_CONTRAST_RATIO = 1.1
 """Ratio of edge contrasts by which SMPL's body must beat the file's, without masks."""
 
 
-def detect_body_model(
+def place_motion(
     motion_read: Motion,
     body: BodyModel,
     cameras: CameraTrack,
@@ -287,11 +285,12 @@ def detect_body_model(
     masks: Masks | None,
     *,
     cameras_given: bool,
-) -> Motion:
-    """Label a motion as SMPL's if its file does not state the body model and SMPL's fits better.
+) -> tuple[Motion, ShapedBody]:
+    """Place a motion in the cameras' world, and shape the person that it was made for.
 
     InstantAvatar and its successors write SMPL's poses without naming the body model; this project
-    names it. Betas of one body model are meaningless for another.
+    names it. Betas of one body model are meaningless for another. So a motion whose file does not
+    state the body model is labeled as SMPL's if SMPL's body fits better.
 
     Args:
         motion_read: The motion that `read_poses` returns.
@@ -301,72 +300,68 @@ def detect_body_model(
         masks: The masks; None if the images have an alpha channel, or there are none.
         cameras_given: Whether a file states the cameras; see `place_in_camera_world`.
     """
+
+    def placed(motion: Motion) -> tuple[Motion, ShapedBody]:
+        shaped = shape_for_motion(body, motion)
+        there = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
+        return there, shaped
+
+    own = placed(motion_read)
     if motion_read.model_is_stated or body.family == "smpl":
-        return motion_read
+        return own
+    smpl = placed(replace(motion_read, body_model="smpl"))
+    one, other = ((CaptureGeometry.of(each, cameras, source), who) for each, who in (own, smpl))
     if masks is None and not source.has_alpha:
-        return _detect_from_images(motion_read, body, cameras, source, cameras_given=cameras_given)
-    after = {}
-    for model in (motion_read.body_model, "smpl"):
-        motion = replace(motion_read, body_model=model)
-        shaped = shape_for_motion(body, motion)
-        motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
-        objective = silhouette_objective_of(shaped, cameras, source, masks)
-        if objective is None:
-            return motion_read
-        geometry = CaptureGeometry.of(motion, cameras, source)
-        if (
-            model == motion_read.body_model
-            and mean_score(objective.frame_scores(geometry)) >= GOOD_IOU
-        ):
-            return motion_read
-        after[model] = place_body_on_masks(geometry, objective).iou_after
-    if after["smpl"] < after[motion_read.body_model] + MIN_SMPL_IOU_GAIN:
-        return motion_read
-    other = after[motion_read.body_model]
-    return _label_smpl(
-        motion_read, f"whose mean IoU with the masks is {after['smpl']:.2f}, not {other:.2f}"
-    )
-
-
-def _detect_from_images(
-    motion_read: Motion,
-    body: BodyModel,
-    cameras: CameraTrack,
-    source: FrameSource,
-    *,
-    cameras_given: bool,
-) -> Motion:
-    """Detect the body model by the contrast of the images' edges along the body's outline."""
-    contrast = {}
-    for model in (motion_read.body_model, "smpl"):
-        motion = replace(motion_read, body_model=model)
-        shaped = shape_for_motion(body, motion)
-        motion = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
-        geometry, skin = CaptureGeometry.of(motion, cameras, source), SkinPoints.of(shaped)
-        try:
-            images = sample_video(geometry, skin, cameras, source)
-        except InputError:
-            return motion_read
-        if model == motion_read.body_model:
-            contrast[model] = edge_contrast(geometry, skin, images)
-        else:
-            fitted = place_body_on_images(geometry, skin, images)
-            contrast[model] = edge_contrast(replace(geometry, motion=fitted.motion), skin, images)
-    if contrast["smpl"] < MIN_SMPL_CONTRAST_RATIO * max(
-        contrast[motion_read.body_model], MIN_EDGE_CONTRAST
-    ):
-        return motion_read
-    found = (
-        f"across whose outline edges are {contrast['smpl']:.1f} times as strong as beside it, not "
-        f"{contrast[motion_read.body_model]:.1f} times"
-    )
-    return _label_smpl(motion_read, found)
-
-
-def _label_smpl(motion_read: Motion, reason: str) -> Motion:
+        reason = _smpl_fits_images(one, other, cameras, source)
+    else:
+        reason = _smpl_fits_masks(one, other, cameras, source, masks)
+    if reason is None:
+        return own
     words = (
         "The poses' file does not state the body model they were made for (`model`); they are "
         f"taken for SMPL's, {reason}."
     )
     note = words if motion_read.note is None else f"{motion_read.note} {words}"
-    return replace(motion_read, body_model="smpl", note=note)
+    return replace(smpl[0], note=note), smpl[1]
+
+
+PosedPerson = tuple[CaptureGeometry, ShapedBody]
+"""A motion in its geometry, and the person it is for."""
+
+
+def _smpl_fits_masks(
+    own: PosedPerson,
+    smpl: PosedPerson,
+    cameras: CameraTrack,
+    source: FrameSource,
+    masks: Masks | None,
+) -> str | None:
+    """How much better SMPL's body fits the masks than the file's; None if it does not."""
+    objective = silhouette_objective_of(own[1], cameras, source, masks)
+    if objective is None or mean_score(objective.frame_scores(own[0])) >= GOOD_IOU:
+        return None
+    before = place_body_on_masks(own[0], objective).iou_after
+    after = place_body_on_masks(smpl[0], _with_body(objective, smpl[1])).iou_after
+    if after < before + MIN_SMPL_IOU_GAIN:
+        return None
+    return f"whose mean IoU with the masks is {after:.2f}, not {before:.2f}"
+
+
+def _smpl_fits_images(
+    own: PosedPerson, smpl: PosedPerson, cameras: CameraTrack, source: FrameSource
+) -> str | None:
+    """How much stronger edges are across the outline of SMPL's body; None if they are not."""
+    (one, skin), (other, smpl_skin) = ((each, SkinPoints.of(who)) for each, who in (own, smpl))
+    try:
+        before = edge_contrast(one, skin, sample_video(one, skin, cameras, source))
+        images = sample_video(other, smpl_skin, cameras, source)
+    except InputError:
+        return None
+    fitted = place_body_on_images(other, smpl_skin, images)
+    after = edge_contrast(replace(other, motion=fitted.motion), smpl_skin, images)
+    if after < MIN_SMPL_CONTRAST_RATIO * max(before, MIN_EDGE_CONTRAST):
+        return None
+    return (
+        f"across whose outline edges are {after:.1f} times as strong as beside it, not "
+        f"{before:.1f} times"
+    )

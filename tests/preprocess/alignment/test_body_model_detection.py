@@ -9,7 +9,7 @@ from PIL import Image
 
 from capture.camera import Camera
 from capture.source_opening import open_source
-from preprocess.alignment.capture_alignment import detect_body_model
+from preprocess.alignment.capture_alignment import place_motion
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.proportion_space import shape_for_motion
@@ -63,8 +63,9 @@ def filmed(tmp_path):
 def test_masks_determine_an_unstated_body_model(filmed, truth):
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
-    read = unnamed("body24")
-    found = detect_body_model(read, load_body_model(), CAMERAS, source, masks, cameras_given=True)
+    found, _ = place_motion(
+        unnamed("body24"), load_body_model(), CAMERAS, source, masks, cameras_given=True
+    )
     assert found.body_model == truth
     assert (found.note is not None) == (truth == "smpl")
     if truth == "smpl":
@@ -77,8 +78,9 @@ def test_a_stated_model_stays_and_without_masks_images_decide(filmed, truth):
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     stated = replace(unnamed("body24"), model_is_stated=True)
     body = load_body_model()
-    assert detect_body_model(stated, body, CAMERAS, source, masks, cameras_given=True) is stated
+    assert place_motion(stated, body, CAMERAS, source, masks, cameras_given=True)[0] is stated
     read = unnamed("body24")
-    found = detect_body_model(read, body, CAMERAS, source, None, cameras_given=True)
+    found, shaped = place_motion(read, body, CAMERAS, source, None, cameras_given=True)
     assert found.body_model == truth
     assert (found is read) == (truth == "body24")
+    assert np.array_equal(shaped.joints, shape_for_motion(body, found).joints)
