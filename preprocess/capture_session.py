@@ -17,7 +17,7 @@ from capture.live.watched_image_folder import IDLE_TIMEOUT_S
 from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import BodyPlacement
-from preprocess.body.body_pose import Motion
+from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
@@ -159,13 +159,17 @@ class Capture:
             segment=self.segment,
         )  # fmt: skip
 
+    def take_revised_poses(self) -> dict[int, BodyPose]:
+        """Poses of a stream's earlier frames that later ones have improved since the last call."""
+        return self.live.take_revised_poses() if isinstance(self.live, LiveTracking) else {}
+
     def mask_report(self) -> dict[str, str | float | None]:
         """Where the masks come from, and how well estimated ones agree with the posed body."""
         if self.segment is not None:
             agreement = getattr(self.segment, "agreement", None)
             name = getattr(self.segment, "name", type(self.segment).__name__)
             return {"masks": f"estimated by {name}", "mask_agreement": agreement}
-        if isinstance(self.live, LiveTracking):
+        if isinstance(self.live, LiveTracking) and self.live.given_masks is None:
             return {"masks": "tracked", "mask_agreement": None}
         source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
         return {"masks": source, "mask_agreement": None}

@@ -9,11 +9,17 @@ from capture.live.pacing_clock import PacingClock
 from capture.live.realtime_playback import RealtimePlayback
 from capture.source import FrameSource
 from capture.source_opening import open_live_source, open_source
+from preprocess.alignment.capture_alignment import BodyAlignment
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import CapturePaths
+from preprocess.capture_paths import CapturePaths, find_own_masks
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.live.tracked_stream import LiveTracking, TrackedStream
+from preprocess.live.live_masks import LiveMasks, check_mask_folder
+from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStream
+from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_origin import MaskOrigin, choose_mask_origin, make_segmenter
+from preprocess.observe import alpha_channel_mask, associate_masks
+from preprocess.open_capture import describe_capture
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement
 
@@ -28,8 +34,11 @@ def open_tracked_stream(
 ) -> Capture:
     """Open a live source, or a recording that is played at its own speed, and find the person.
 
+    Masks that are named, lie beside the video or are the pictures' alpha channel are learnt from;
+    only without any are the tracker's.
+
     Args:
-        wanted: What the user named; without poses and masks.
+        wanted: What the user named; without poses.
         tracker: Follows the person.
         make_refinement: From the frames' width and height to what makes masks from the tracker's.
         poses: File to which the poses will be written in the end.
@@ -43,8 +52,11 @@ def open_tracked_stream(
             "--cameras solve and --height-cm need the poses of the whole recording. Run ia-track "
             "first, and give its poses; or leave out --realtime."
         )
-    stream = TrackedStream(_open_source(wanted))
-    tracking = LiveTracking(stream, tracker, make_refinement(stream.size_px))
+    pace = PacingClock()
+    source = _open_source(wanted, pace)
+    choice, given = _open_masks(wanted, source, pace)
+    stream = TrackedStream(source)
+    tracking = LiveTracking(stream, tracker, make_refinement(stream.size_px), given)
     shaped = load_body_model(wanted.body).with_shape()
     if avatar_body is not None:
         shaped = read_shaped_body(avatar_body, shaped.body)
@@ -53,21 +65,50 @@ def open_tracked_stream(
         assume_camera(wanted.video, wanted.cameras, stream),
         fixed_body=avatar_body is not None,
     )
+    segment, notes = None, tuple[str, ...]()
+    if not choice.is_fallback:
+        fit = BodyAlignment(shaped=found.shaped, motion=found.motion)
+        notes = tuple(describe_capture(fit, None, found.cameras, choice))
+        if choice.segmenter is not None:
+            segment = make_segmenter(choice.segmenter, found.shaped)
     return Capture(
-        paths=CapturePaths(video=wanted.video, poses=poses, masks=None, cameras=None),
+        paths=CapturePaths(video=wanted.video, poses=poses, masks=choice.path, cameras=None),
         source=stream,
         motion=found.motion,
         masks=None,
         cameras=found.cameras,
         shaped=found.shaped,
         size_px=None,
-        notes=(),
+        notes=notes,
         live=tracking,
+        segment=segment,
     )
 
 
-def _open_source(wanted: CaptureInputs) -> FrameSource:
-    pace, camera = PacingClock(), camera_address(wanted.video)
+def _open_masks(
+    wanted: CaptureInputs, source: FrameSource, pace: PacingClock
+) -> tuple[MaskOrigin, MaskReader | None]:
+    """Which masks are used, and what reads them; a fallback means the tracker's.
+
+    Raises:
+        InputError: If masks that were named cannot be used.
+    """
+    camera = camera_address(wanted.video)
+    found = find_own_masks(wanted.video) if camera is None else None
+    choice = choose_mask_origin(wanted.masks, found, has_alpha=source.has_alpha)
+    source.has_alpha = choice.uses_alpha_channel
+    if choice.path is None:
+        return choice, alpha_channel_mask if choice.uses_alpha_channel else None
+    if wanted.live or camera is not None:
+        check_mask_folder(wanted.masks)
+        return choice, LiveMasks(choice.path, pace, invert=wanted.invert_masks).wait_for_mask
+    stored = open_masks(choice.path, invert=wanted.invert_masks)
+    row = associate_masks(stored, source)
+    return choice, lambda frame, size_px: stored.alpha(row(frame.index), size_px)
+
+
+def _open_source(wanted: CaptureInputs, pace: PacingClock) -> FrameSource:
+    camera = camera_address(wanted.video)
     if wanted.live or camera is not None:
         return open_live_source(wanted.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
     return RealtimePlayback(open_source(wanted.video, frames=wanted.frames), pace)

@@ -43,7 +43,11 @@ from avatar.training.training_frame import TrainingFrame
 from capture.inbox import Inbox
 from capture.live.realtime_playback import RealtimePlayback
 from export.bake.render_targets import PosedView
+from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
+
+REVISED_PER_STEP = 2
+"""Frames whose poses are replaced between two steps; each solves its correspondences again."""
 
 
 def new_trainer(
@@ -114,6 +118,7 @@ class TrainingSession:
             CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
         ]
         self.held_out: list[HeldOutFrame] = []
+        self._revised_poses: dict[int, BodyPose] = {}
         self._checkpoints = CheckpointWriter(run, recording)
         self.meter = StreamMeter(stop, recording.source)
         self.coverage = Coverage(recording.shaped)
@@ -149,6 +154,7 @@ class TrainingSession:
                     for observer in self._observers:
                         observer.on_event(event)
                         observer.between_steps(self)
+                    self._revise_poses()
                     if self._stop.is_set():
                         break
         finally:
@@ -276,6 +282,20 @@ class TrainingSession:
                         self.trainer.add_frame(item, is_restored=True)
                         seen += 1
         return seen
+
+    def _revise_poses(self) -> None:
+        """Bring along the poses of earlier frames that a stream's later frames have improved."""
+        found = self._recording.take_revised_poses()
+        for place, frame in enumerate(self.held_out):
+            pose = found.get(frame.observation.frame.index)
+            if pose is not None:
+                self.held_out[place] = replace(
+                    frame, observation=replace(frame.observation, pose=pose)
+                )
+        self._revised_poses |= found
+        for _ in range(min(REVISED_PER_STEP, len(self._revised_poses))):
+            number = next(iter(self._revised_poses))
+            self.trainer.revise_pose(number, self._revised_poses.pop(number))
 
     def _handle_event(self, event: TrainEvent, progress: ProgressBar) -> None:
         match event:

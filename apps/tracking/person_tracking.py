@@ -94,13 +94,8 @@ def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = N
     """Open a stream without poses with this project's tracker; see `open_tracked_stream`.
 
     Raises:
-        InputError: If it cannot be read, no person is found in it, or masks were named.
+        InputError: If it or masks that were named cannot be read, or no person is found in it.
     """
-    if inputs.masks is not None:
-        raise InputError(
-            "--masks cannot be joined with poses that are tracked while frames come. Leave it out, "
-            "or give --poses too (ia-track writes them)."
-        )
     tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
     return open_tracked_stream(inputs, tracker, MaskRefiner, poses, avatar_body=avatar_body)
 

@@ -162,6 +162,28 @@ class PoseOptimizer:
         self._update_bones(slot)
         self._joints_at_solve[slot] = self._joint_positions(slot)
 
+    def replace_pose(self, slot: int, pose: BodyPose, *, frame: int, step: int) -> bool:
+        """Assigns a better pose of its tracker to a slot's frame, without a correction.
+
+        Args:
+            slot: Slot of the frame.
+            pose: The tracker's pose.
+            frame, step: As in `set_pose`.
+
+        Returns:
+            Whether it is too far from the one before for the roots to follow: the caller is
+            expected to solve the correspondences again then.
+        """
+        before, solved_at = self._joint_positions(slot), self._joints_at_solve[slot].copy()
+        self.set_pose(slot, pose, frame=frame, step=step)
+        moved = np.linalg.norm(self._joint_positions(slot) - [before, solved_at], axis=2).max(
+            axis=1
+        )
+        if (moved > (MAX_JOINT_STEP_M, RESOLVE_DISTANCE_M)).any():
+            return True
+        self._joints_at_solve[slot] = solved_at
+        return False
+
     def pose(self, slot: int) -> BodyPose:
         """The corrected pose."""
         given = self._tracker_poses[slot]

@@ -14,10 +14,11 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 from avatar.deformation.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
+from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.pose.pose_optimizer import RootCorrection
 from avatar.training.frame_stream import view_descriptor
-from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame
+from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame, camera_in_body
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
@@ -155,6 +156,14 @@ class ReplayBuffer:
         self._roots = self._store_rows(self._roots, slot, correspondences.roots)
         self._low[slot] = torch.from_numpy(correspondences.low).to(self.device)
         self._shape[slot] = torch.tensor(correspondences.packed_cells.shape, dtype=torch.int32)
+
+    def set_pose(self, slot: int, pose: BodyPose, rig: Rig) -> None:
+        """Gives a slot's frame another pose; `set_correspondences` and `correct_root` follow."""
+        view = self._poses_and_views[slot][1]
+        self._poses_and_views[slot] = pose, view
+        origin, self._body_from_camera[slot] = camera_in_body(view.camera, pose, rig)
+        self._given_origins[slot] = origin
+        self._update_distances(slot, view_descriptor(origin, pose))
 
     def correct_root(self, slot: int, correction: RootCorrection) -> None:
         """Lets a slot's rays follow its corrected root."""

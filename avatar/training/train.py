@@ -278,12 +278,13 @@ class _EvaluationSchedule:
     def _sample(self, frame: HeldOutFrame) -> PixelSample:
         """The frame's sample, which later evaluations find again; bounded in number."""
         index = frame.observation.frame.index
-        if index not in self._samples:
+        kept = self._samples.pop(index, None)
+        if kept is None or kept.frame is not frame:  # its pose was revised
             while len(self._samples) >= 2 * FRAMES_PER_EVALUATION:
                 del self._samples[next(iter(self._samples))]
-            sample = PixelSample.of(frame).with_correspondences(self._trainer.avatar.rig)
-            self._samples[index] = sample
-        return self._samples[index]
+            kept = PixelSample.of(frame).with_correspondences(self._trainer.avatar.rig)
+        self._samples[index] = kept
+        return kept
 
 
 def _evaluation_times(*, after: float) -> Iterator[float]:

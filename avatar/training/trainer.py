@@ -30,6 +30,7 @@ from avatar.training.training_step import (
     StepResult,
     compute_gradients,
 )
+from preprocess.body.body_pose import BodyPose
 
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
@@ -131,6 +132,21 @@ class Trainer:
         if not is_restored:
             self._discard_old_corrections()
         return slot
+
+    def revise_pose(self, frame: int, pose: BodyPose) -> None:
+        """Gives a frame a better pose of its tracker, from which corrections start again.
+
+        Args:
+            frame: Index of the frame; nothing happens if the replay buffer does not hold it.
+            pose: Its pose.
+        """
+        self.pose_corrections.pop(frame, None)
+        if frame not in self.replay.frame_indices:
+            return
+        slot, rig = self.replay.frame_indices.index(frame), self.avatar.rig
+        self.replay.set_pose(slot, pose, rig)
+        far = self.poses.replace_pose(slot, pose, frame=frame, step=self.steps)
+        move_correspondences(rig, self.backend, self.replay, self.poses, slot, far=far)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -254,11 +270,30 @@ def correct_one_pose(
         The slot of the corrected pose, or None if no pose has enough evidence.
     """
     slot = poses.correct_next(rate=rate)
-    if slot is None:
-        return None
-    if poses.needs_resolve(slot):
-        resolve_correspondences(rig, replay, poses, slot)
-    else:
-        backend.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
-        replay.correct_root(slot, poses.root_correction(slot))
+    if slot is not None:
+        far = poses.needs_resolve(slot)
+        move_correspondences(rig, backend, replay, poses, slot, far=far)
     return slot
+
+
+def move_correspondences(
+    rig: Rig,
+    backend: Backend,
+    replay: ReplayBuffer,
+    poses: PoseOptimizer,
+    slot: int,
+    *,
+    far: bool,
+) -> None:
+    """Lets a frame's correspondences and rays follow its pose.
+
+    Args:
+        rig, backend, replay, poses: See `correct_one_pose`.
+        slot: Slot of the frame.
+        far: Whether the correspondences must be solved again.
+    """
+    if far:
+        resolve_correspondences(rig, replay, poses, slot)
+        return
+    backend.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
+    replay.correct_root(slot, poses.root_correction(slot))

@@ -126,6 +126,16 @@ def rebuild_frame(
     return _assemble_frame(index, pose, view, bits.reshape(height, width) > 0, colors, rig)
 
 
+def camera_in_body(
+    camera: Camera, pose: BodyPose, rig: Rig
+) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "3 3"]]:
+    """Where a camera's rays start in the body frame, metres, and their rotation into it."""
+    world_from_body = rig.world_from_body(pose)
+    camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
+    origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
+    return origin.astype(np.float32), np.ascontiguousarray(camera_from_body.T, dtype=np.float32)
+
+
 def _assemble_frame(
     index: int,
     pose: BodyPose,
@@ -134,18 +144,16 @@ def _assemble_frame(
     colors: UInt8[np.ndarray, "pixels 4"],
     rig: Rig,
 ) -> TrainingFrame:
-    camera, world_from_body = view.camera, rig.world_from_body(pose)
-    camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
-    origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
+    origin, body_from_camera = camera_in_body(view.camera, pose, rig)
     pixels = PixelRuns.of(near, _around(near) & ~near)
     return TrainingFrame(
         index=index,
         pose=pose,
         correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
-        origin=origin.astype(np.float32),
-        body_from_camera=np.ascontiguousarray(camera_from_body.T, dtype=np.float32),
+        origin=origin,
+        body_from_camera=body_from_camera,
         pixels=pixels,
-        head_pixels=_head_pixels(near, camera, world_from_body, pose, rig),
+        head_pixels=_head_pixels(near, view.camera, rig.world_from_body(pose), pose, rig),
         colors=colors[: pixels.near_count],  # earlier versions saved the others' zeros, too
         view=view,
     )

@@ -1,11 +1,13 @@
 """Fits the poses of a stream's frames one by one, to the key points and the mask of each.
 
 The first frames settle proportions and focal length, which stay; each later pose is fitted together
-with those of the last few frames, so that it moves as people do.
+with those of the last few frames, so that it moves as people do. Earlier poses are fitted once more
+with the frames that came after them.
 """
 
 from collections import deque
 from collections.abc import Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -35,6 +37,13 @@ FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
 FRAME_ITERATIONS = (1, 1)
 """The same for each later frame."""
+
+REVISED_FRAMES = 32
+"""New frames after which the poses of all of them are fitted again."""
+OVERLAP_FRAMES = 16
+"""Frames before those whose poses are fitted with them: a second time, with later neighbors."""
+REVISION_ITERATIONS = 2
+"""Iterations over these frames, with outlines; a third wins 0.5 mm."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -130,6 +139,64 @@ class FramePoseFitter:
         """Present pose of one of the last frames, by its number."""
         numbers = [each.number for each in self._seen]
         return self._poses[numbers.index(number)]
+
+
+@final
+class EarlierPoses:
+    """Fits the poses of a stream's earlier frames again, with their later neighbors.
+
+    Fits run on a thread of their own: no method waits for them. What comes while a fit is still
+    going on is left as it is, so that a slow machine does not fall behind.
+    """
+
+    def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
+        """Start without frames.
+
+        Args:
+            shaped: The person.
+            camera: Camera of the frames.
+        """
+        self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="earlier poses")
+        self._fit: Future[None] | None = None
+        self._new: dict[SeenPerson, BodyPose] = {}
+        self._recent: dict[SeenPerson, BodyPose] = {}
+        self._revised: deque[dict[int, BodyPose]] = deque()
+
+    def add(self, seen: SeenPerson, pose: BodyPose) -> None:
+        """Add the next frame and its pose, and fit once there are enough of them."""
+        self._new[seen] = pose
+        if len(self._new) < REVISED_FRAMES:
+            return
+        if self._fit is None or self._fit.done():
+            self.fit_rest()
+        else:
+            self._new = {}
+
+    def fit_rest(self) -> None:
+        """Fit the frames that were added since the last fit."""
+        if self._fit is not None and self._fit.done():
+            self._fit.result()  # raises what it raised
+        if self._new:
+            self._fit = self._pool.submit(self._fit_again, self._new)
+            self._new = {}
+
+    def take(self) -> dict[int, BodyPose]:
+        """Poses that were fitted since the last call, by the numbers of their frames."""
+        found: dict[int, BodyPose] = {}
+        while self._revised:
+            found |= self._revised.popleft()
+        return found
+
+    def _fit_again(self, new: dict[SeenPerson, BodyPose]) -> None:
+        frames = {**self._recent, **new}
+        seen, count = list(frames), len(frames)
+        fitter = _fitter(seen, list(frames.values()), self._model, self._camera, range(count))
+        for _ in range(REVISION_ITERATIONS):
+            fitter.iterate(FitParameters(proportions=False, focal=False))
+        poses = [fitter.pose(row) for row in range(count)]
+        self._recent = dict(zip(seen[-OVERLAP_FRAMES:], poses[-OVERLAP_FRAMES:], strict=True))
+        self._revised.append({each.number: p for each, p in zip(seen, poses, strict=True)})
 
 
 def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "3"]) -> BodyPose:

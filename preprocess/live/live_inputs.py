@@ -12,9 +12,9 @@ from capture.source import FrameSource
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths
 from preprocess.live.live_alignment import LiveAlignment
-from preprocess.live.live_masks import LiveMasks
+from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.live_poses import LivePoses
-from preprocess.masks.mask_origin import MaskOrigin, Segmenter, choose_mask_origin, segmenter_name
+from preprocess.masks.mask_origin import MaskOrigin, Segmenter, choose_mask_origin
 from preprocess.observation import Observation
 from preprocess.observe import (
     DroppedFrame,
@@ -72,12 +72,7 @@ class LiveInputs:
         Raises:
             InputError: If no pose comes, or what --masks names is no folder.
         """
-        named = given_masks if segmenter_name(given_masks) is None else None
-        if named is not None and not named.is_dir():
-            raise InputError(
-                f"There is no folder of masks {named}. Give --masks: the folder to which "
-                "they will be written, or segmenter:grabcut to have them estimated."
-            )
+        check_mask_folder(given_masks)
         poses = LivePoses(
             paths.poses, pace, default_model=family, first_within_s=first_within_s,
             started_at=source.started_at,

@@ -13,6 +13,20 @@ from capture.input_error import InputError
 from capture.live.pacing_clock import PacingClock
 from preprocess.live.live_poses import MAX_WAIT_S, POLL_INTERVAL_S
 from preprocess.masks.mask_files import Masks, read_mask
+from preprocess.masks.mask_origin import segmenter_name
+
+
+def check_mask_folder(named: Path | None) -> None:
+    """Refuse what --masks names for a live source, unless it is a folder or a segmenter.
+
+    Raises:
+        InputError: If it is neither.
+    """
+    if named is not None and segmenter_name(named) is None and not named.is_dir():
+        raise InputError(
+            f"There is no folder of masks {named}. Give --masks: the folder to which "
+            "they will be written, or segmenter:grabcut to have them estimated."
+        )
 
 
 class _InvertedMask(InputError):  # noqa: N818 - a finding, not an error

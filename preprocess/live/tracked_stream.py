@@ -2,8 +2,8 @@
 
 The first frames settle the person's proportions and the focal length. Each later frame is tracked
 when it arrives, and its pose fitted to its key points and its mask together with those of the
-frames around it. Frames that come while another is being tracked are left out, so that tracking
-does not fall behind.
+frames around it; once more when more frames have come after it. Frames that come while another is
+being tracked are left out, so that tracking does not fall behind.
 """
 
 import time
@@ -24,6 +24,7 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
+    EarlierPoses,
     FramePoseFitter,
     SeenPerson,
     fit_first_frames,
@@ -49,6 +50,9 @@ own speed falls behind instead."""
 NOT_FOUND = "person not found"
 """Why a frame without the person is not used."""
 
+MaskReader = Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "rows columns"]]
+"""From a frame, and a width and height, to its given mask at that size; raises InputError."""
+
 
 @final
 class TrackedStream:
@@ -59,6 +63,7 @@ class TrackedStream:
 
     Attributes:
         look: Called with each frame as soon as it is taken.
+        end: Called when the last frame has been used.
     """
 
     def __init__(self, source: FrameSource) -> None:
@@ -72,6 +77,7 @@ class TrackedStream:
         self._waiting: deque[Frame] = deque()
         self._skipped = 0
         self.look: Callable[[Frame], None] = lambda frame: None
+        self.end: Callable[[], None] = lambda: None
         self.path, self.size_px, self.selection = source.path, source.size_px, source.selection
         self.frames_in_file, self.frame_count = source.frames_in_file, source.frame_count
         self.duration_s, self.has_alpha = source.duration_s, source.has_alpha
@@ -107,6 +113,7 @@ class TrackedStream:
             going = self.take_next()
         while self._waiting:
             yield self._waiting.popleft()
+        self.end()
 
     def count_frames(self) -> int:
         """As the source's own."""
@@ -153,10 +160,15 @@ class LiveTracking:
         stream: The frames.
         times_s: Time of each frame that was looked at, by its number.
         lost: Frames in which the person was not found.
+        given_masks: Reads the masks that are learnt from; None if they are the tracker's.
     """
 
     def __init__(
-        self, stream: TrackedStream, tracker: PersonTracker, refine: MaskRefinement
+        self,
+        stream: TrackedStream,
+        tracker: PersonTracker,
+        refine: MaskRefinement,
+        given_masks: MaskReader | None = None,
     ) -> None:
         """Nothing is read yet.
 
@@ -164,14 +176,16 @@ class LiveTracking:
             stream: The frames.
             tracker: Follows the person.
             refine: Makes masks from the tracker's.
+            given_masks: Masks to learn from instead, where there are some.
         """
         self.stream = stream
         self.times_s: dict[int, float] = {}
         self.lost: list[int] = []
-        self._tracker, self._refine = tracker, refine
+        self._tracker, self._refine, self.given_masks = tracker, refine, given_masks
         self._seen: dict[int, SeenPerson] = {}
         self._mask_px: tuple[int, int] | None = None
         self._fitter: FramePoseFitter | None = None
+        self._earlier: EarlierPoses | None = None
         stream.look = self._look
 
     def start(self, shaped: ShapedBody, camera: Camera, *, fixed_body: bool = False) -> StreamStart:
@@ -194,7 +208,8 @@ class LiveTracking:
                 "searched). Tracking needs one person, from head to feet in the picture."
             )
         motion, person, camera = fit_first_frames(seen, shaped, camera, fixed=fixed_body)
-        self._fitter = FramePoseFitter(person, camera)
+        self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
+        self.stream.end = self._earlier.fit_rest
         for row, each in enumerate(seen):
             self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
@@ -218,22 +233,35 @@ class LiveTracking:
             source: The frames.
             cameras: The camera.
             size_px: Longer side of the observations.
-            segment, fit: Not used: masks and poses are tracked.
+            segment: What estimates masks, where the user asked for that.
+            fit: Not used: poses are tracked.
         """
-        assert segment is None
         assert fit is None
         target_px = shrink_to_longer_side(source.size_px, size_px)
+        found = deque[SeenPerson](maxlen=1)  # in the frame whose pose was asked for
 
         def pose_of(frame: Frame) -> BodyPose | str:
             if frame.index not in self._seen:
                 return NOT_FOUND
             assert self._fitter is not None
-            return self._fitter.pose(frame.index)
+            assert self._earlier is not None
+            found.append(self._seen.pop(frame.index))
+            pose = self._fitter.pose(frame.index)
+            self._earlier.add(found[-1], pose)
+            return pose
 
         def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-            return self._refine(frame.rgb, self._seen.pop(frame.index).keypoints.mask, size_px)
+            if self.given_masks is not None:
+                return self.given_masks(frame, size_px)
+            return self._refine(frame.rgb, found[-1].keypoints.mask, size_px)
 
-        return compose_observation_builder(pose_of, alpha_of, lambda index: cameras[0], target_px)
+        return compose_observation_builder(
+            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment
+        )
+
+    def take_revised_poses(self) -> dict[int, BodyPose]:
+        """Poses of earlier frames that were fitted again since the last call, by their numbers."""
+        return {} if self._earlier is None else self._earlier.take()
 
     def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""

@@ -2,19 +2,27 @@
 
 import json
 import signal
+from concurrent.futures import Future
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from apps import ingest
 from apps.cli.console import Console
 from apps.evaluation.evaluation_frames import held_out_frames
 from apps.run.run_folder import RunFolder
 from apps.tracking import person_tracking, tracked_run
+from apps.tracking.person_tracking import open_stream
 from avatar.training import warmup
+from avatar.training.trainer import Trainer
+from capture.input_error import InputError
 from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.capture_session import CaptureInputs
+from preprocess.fitting import tracked_frames
 from preprocess.live import tracked_stream
+from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_file import read_motion
 from tests.apps.conftest import Outcome
 
@@ -32,6 +40,24 @@ def ingest_video(video, tmp_path, capsys, monkeypatch):
         return Outcome(code=code, out=captured.out, err=captured.err), out
 
     return call
+
+
+class AtOnce:
+    """An executor that runs what it is given before it returns."""
+
+    def __init__(self, **named) -> None:
+        pass
+
+    def submit(self, work, *arguments) -> Future:
+        done = Future()
+        done.set_result(work(*arguments))
+        return done
+
+
+@pytest.fixture
+def fits_at_once(monkeypatch):
+    """Earlier poses are fitted again on the thread that asks for it: no race with training."""
+    monkeypatch.setattr(tracked_frames, "ThreadPoolExecutor", AtOnce)
 
 
 @pytest.mark.usefixtures("without_baking")
@@ -117,10 +143,28 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
     assert frames["used"] + frames["held_out"] + frames["near_duplicates"] == 10  # every second
 
 
-def test_masks_cannot_be_joined_with_streamed_tracking(ingest_video, filmed):
-    done, _ = ingest_video("--realtime", "--masks", filmed / "masks")
-    assert done.code == 2
-    assert "--masks cannot be joined" in done.complaint()
+@pytest.mark.usefixtures("without_baking", "fits_at_once")
+def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, filmed, monkeypatch):
+    monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
+    monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
+    monkeypatch.setattr(MaskRefiner, "__call__", None)
+    revised = []
+    monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, pose: revised.append(frame))
+    done, out = ingest_video("--realtime", "--masks", filmed / "masks")
+    assert done.code == 0, done.err
+    assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
+    assert {0, 2, 4, 6} <= set(revised)  # every second frame is taken
+
+
+def test_masks_of_a_live_folder_must_be_one(tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    Image.new("RGB", (96, 128)).save(frames / "0000.png")
+    out = str(tmp_path / "run")
+    with pytest.raises(InputError, match="There is no folder of masks"):
+        open_stream(
+            CaptureInputs(video=frames, live=True, masks=tmp_path / "none"), Path(out) / "poses.npz"
+        )
 
 
 def test_person_must_be_a_number(ingest_video):

@@ -1,19 +1,29 @@
 """Poses lifted from key points, fitted to key points and masks, written and read again."""
 
+import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from preprocess.body.body_file import load_body_model
-from preprocess.body.body_pose import Motion, RelativeFocalLength
+from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
+from preprocess.fitting.tracked_frames import (
+    LAG_FRAMES,
+    EarlierPoses,
+    FramePoseFitter,
+    SeenPerson,
+    fit_first_frames,
+)
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion, write_motion
 from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 from studio.shoot import ShootConfig, film_capture
 
@@ -112,3 +122,41 @@ def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
     alone = fit_capture(replace(lifted, masks=None))
     assert alone.taken
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
+
+
+def see_people(truth: Capture) -> list[SeenPerson]:
+    """The capture's frames as a stream's tracker sees them; key points are not exact."""
+    track, generator = track_points(truth), np.random.default_rng(1)
+    seen = []
+    for row, found in enumerate(truth.observations()):
+        keypoints = PersonKeypoints(
+            image_px=track.image_px[row] + 0.6 * generator.normal(size=(33, 2)),
+            world_m=track.world_m[row], visibility=np.ones(33), presence=1.0,
+            mask=CroppedMask(values=np.zeros((2, 2), np.uint8), image_from_crop=np.eye(3)[:2]),
+        )  # fmt: skip
+        seen.append(SeenPerson(number=row, time_s=row / 8.0, keypoints=keypoints, mask=found.alpha))
+    return seen
+
+
+def test_earlier_poses_of_a_stream_are_brought_along(truth):
+    seen, camera = see_people(truth), replace(truth.cameras[0], camera_from_world=np.eye(4))
+    motion, person, camera = fit_first_frames(seen[:8], load_body_model().with_shape(), camera)
+    window, earlier, given = FramePoseFitter(person, camera), EarlierPoses(person, camera), []
+    for place, each in enumerate(seen):
+        window.add(each, motion[place] if place < 8 else None)
+        if place >= LAG_FRAMES:
+            given.append(window.pose(place - LAG_FRAMES))
+            earlier.add(seen[place - LAG_FRAMES], given[-1])
+    assert earlier.take() == {}  # too few frames yet
+    earlier.fit_rest()
+    while not (revised := earlier.take()):  # on a thread of its own
+        time.sleep(0.01)
+    assert list(revised) == list(range(len(given)))
+
+    def error_m(poses: Iterable[BodyPose]) -> float:
+        ours = np.stack([person.with_pose(pose).joints() for pose in poses])
+        ours, true = ours - ours[:, :1], joints_in_camera(truth)[: len(ours)]
+        ours *= (ours * true).sum() / (ours * ours).sum()
+        return float(np.linalg.norm(ours - true, axis=2).mean())
+
+    assert error_m(revised.values()) < 0.97 * error_m(given)
