@@ -191,10 +191,13 @@ class Capture:
         told = refit.as_json()
         return told if growing is None else {**told, "frames": growing.frame_count}
 
+    def geometry(self) -> CaptureGeometry:
+        """Poses and cameras, as they are."""
+        return CaptureGeometry.of(self.motion, self.cameras, self.source)
+
     def camera_of_pose(self, row: int) -> Camera:
         """The camera that sees one of the poses."""
-        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
-        return self.cameras[int(claim.camera_rows()[row])]
+        return self.cameras[int(self.geometry().camera_rows()[row])]
 
     def in_real_time(self) -> "Capture":
         """The same, its frames coming at their own times."""
@@ -206,7 +209,7 @@ class Capture:
         Raises:
             InputError: If the person is behind the camera.
         """
-        claim = CaptureGeometry.of(self.motion, self.cameras, self.source)
+        claim = self.geometry()
         valid = self.motion.valid
         pelves = self.shaped.joints[0] + self.motion.root_translations[valid]
         forward = claim.extrinsics[claim.camera_rows()[valid], 2]  # of the camera that sees each

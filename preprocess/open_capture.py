@@ -20,8 +20,8 @@ from preprocess.alignment.capture_alignment import (
     needs_placement,
     place_motion,
 )
-from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
+from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
@@ -115,9 +115,7 @@ LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
 def fit_person(
     motion: Motion,
     shaped: ShapedBody,
-    cameras: CameraTrack,
-    source: FrameSource,
-    masks: Masks | None,
+    evidence: CaptureEvidence,
     *,
     avatar_body: Path | None,
     height_m: float | None,
@@ -127,7 +125,7 @@ def fit_person(
     Args:
         motion: In the cameras' world, for the body `shaped`.
         shaped: As the poses' tracker had it in mind.
-        cameras, source, masks: See `align_body`.
+        evidence: Frames, masks and cameras.
         avatar_body: File of a finished avatar's person, if these poses are added to one.
         height_m: Stated height of the person, metres.
 
@@ -137,17 +135,18 @@ def fit_person(
     if avatar_body is not None:
         person = read_shaped_body(avatar_body, shaped.body)
         _check_height(person, height_m)
-        return align_to_person(motion, shaped, person, cameras, source, masks)
-    fit = align_body(motion, shaped, cameras, source, masks)
+        return align_to_person(motion, shaped, person, evidence)
+    fit = align_body(motion, shaped, evidence)
     if height_m is None:
         return fit
+    cameras = evidence.cameras
     if cameras.is_moving:
         raise InputError(
             f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
             "size of its own. Leave one of them out."
         )
     taller = scale_to_height(fit.shaped, height_m)
-    moved = rescale_motion(CaptureGeometry.of(fit.motion, cameras, source), fit.shaped, taller)
+    moved = rescale_motion(evidence.geometry(fit.motion), fit.shaped, taller)
     return replace(fit, shaped=taller, motion=moved)
 
 
@@ -228,12 +227,12 @@ def _open_recorded(
     choice, masks = _open_masks(paths, source, wanted)
     paths = replace(paths, masks=choice.path)
     cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
-    motion, shaped = place_motion(motion, body, cameras, source, masks, cameras_given=given)
+    evidence = CaptureEvidence(source, masks, cameras)
+    motion, shaped = place_motion(motion, body, evidence, cameras_given=given)
     if not given and motion.intrinsic is None and motion.assumed_focal is None:
-        cameras = estimate_focal_length(cameras, motion, shaped, source, masks)
-    fit = fit_person(
-        motion, shaped, cameras, source, masks, avatar_body=avatars, height_m=wanted.height_m
-    )
+        cameras = estimate_focal_length(evidence, motion, shaped)
+        evidence = evidence._replace(cameras=cameras)
+    fit = fit_person(motion, shaped, evidence, avatar_body=avatars, height_m=wanted.height_m)
     return Capture(
         paths=paths,
         source=source,

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from capture.input_error import InputError
-from capture.source import FrameSource
 from preprocess.alignment.camera_from_masks import fit_factor
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
@@ -30,17 +29,15 @@ from preprocess.alignment.mask_alignment import (
     rescale_motion,
 )
 from preprocess.alignment.silhouette_objective import (
+    CaptureEvidence,
     SilhouetteObjective,
     mean_score,
-    sample_masks,
 )
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.body.silhouette import SkinPoints
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.masks.mask_files import Masks
-from preprocess.observe import associate_cameras, associate_masks
 from preprocess.poses.root_placement import place_in_camera_world
 
 FOCAL_SAMPLES = 6
@@ -50,11 +47,7 @@ MIN_FOCAL_IOU = 0.6
 
 
 def estimate_focal_length(
-    cameras: CameraTrack,
-    motion: Motion,
-    shaped: ShapedBody,
-    source: FrameSource,
-    masks: Masks | None,
+    evidence: CaptureEvidence, motion: Motion, shaped: ShapedBody
 ) -> CameraTrack:
     """Fit the focal length of an assumed camera so that the body covers the masks.
 
@@ -62,20 +55,16 @@ def estimate_focal_length(
     and the focal length are ambiguous.
 
     Args:
-        cameras: One camera, whose focal length was assumed (`assume_static_camera`).
+        evidence: With one camera, whose focal length was assumed (`assume_static_camera`); without
+            mask files the camera stays.
         motion: Poses in the camera's world.
         shaped: The person.
-        source: The frames; none is decoded.
-        masks: The masks; None if there are no mask files: then the camera stays.
     """
-    if masks is None or motion.body_model != shaped.body.family:
+    cameras, geometry = evidence.cameras, evidence.geometry(motion)
+    if evidence.masks is None or motion.body_model != shaped.body.family:
         return cameras
-    geometry = CaptureGeometry.of(motion, cameras, source)
-    try:
-        row = associate_masks(masks, source)
-        skin = SkinPoints.of(shaped)
-        objective = sample_masks(source, masks, row, lambda frame: 0, skin, count=FOCAL_SAMPLES)
-    except InputError:  # parts that do not fit are reported elsewhere
+    objective = evidence.silhouettes(SkinPoints.of(shaped), FOCAL_SAMPLES)
+    if objective is None:
         return cameras
     scale = fit_factor(scale_focal_length, geometry, objective)
     factor = scale.factor or 1.0
@@ -126,13 +115,7 @@ def needs_placement(motion: Motion, shaped: ShapedBody) -> bool:
     return shaped.body.family not in ("smpl", motion.body_model)
 
 
-def align_body(
-    motion: Motion,
-    shaped: ShapedBody,
-    cameras: CameraTrack,
-    source: FrameSource,
-    masks: Masks | None,
-) -> BodyAlignment:
+def align_body(motion: Motion, shaped: ShapedBody, evidence: CaptureEvidence) -> BodyAlignment:
     """Align body and motion to the masks, if the poses are of another body model.
 
     The body's own mean proportions are tried beside SMPL's and taken if they fit better by
@@ -141,16 +124,14 @@ def align_body(
     Args:
         motion: Poses in the cameras' world.
         shaped: The body that is used, with SMPL's mean joints (`shape_for_motion`).
-        cameras: Cameras of the frames' size.
-        source: The frames; few are decoded, and none if there are mask files.
-        masks: The masks; None if the images have an alpha channel, or there are none.
+        evidence: Frames, masks and cameras.
     """
     if not needs_placement(motion, shaped):
         return BodyAlignment(shaped=shaped, motion=motion)
-    geometry = CaptureGeometry.of(motion, cameras, source)
-    if masks is None and not source.has_alpha:
-        return _accept(place_from_video(geometry, shaped, cameras, source), shaped, motion)
-    objective = silhouette_objective_of(shaped, cameras, source, masks)
+    geometry = evidence.geometry(motion)
+    if not evidence.has_masks:
+        return _accept(_place_on_images(geometry, shaped, evidence), shaped, motion)
+    objective = evidence.silhouettes(SkinPoints.of(shaped), ALIGNMENT_SAMPLES)
     if objective is None:
         return _accept(None, shaped, motion)
     placement = place_body_on_masks(geometry, objective)
@@ -163,12 +144,7 @@ def align_body(
 
 
 def align_to_person(
-    motion: Motion,
-    shaped: ShapedBody,
-    person: ShapedBody,
-    cameras: CameraTrack,
-    source: FrameSource,
-    masks: Masks | None,
+    motion: Motion, shaped: ShapedBody, person: ShapedBody, evidence: CaptureEvidence
 ) -> BodyAlignment:
     """Align a motion to an avatar's person, whose body stays.
 
@@ -176,25 +152,23 @@ def align_to_person(
         motion: Poses in the cameras' world, for the body `shaped`.
         shaped: The person that the poses were made for.
         person: The avatar's person.
-        cameras: Cameras of the frames' size.
-        source: The frames; few are decoded, and none if there are mask files.
-        masks: The masks; None if the images have an alpha channel, or there are none.
+        evidence: Frames, masks and cameras.
     """
     foreign, same = needs_placement(motion, shaped), is_same_person(person, shaped)
     if same and not foreign:
         return BodyAlignment(shaped=person, motion=motion)
-    masked = masks is not None or source.has_alpha
-    objective = silhouette_objective_of(person, cameras, source, masks) if masked else None
-    geometry = CaptureGeometry.of(motion, cameras, source)
+    objective = None
+    if evidence.has_masks:
+        objective = evidence.silhouettes(SkinPoints.of(person), ALIGNMENT_SAMPLES)
     if not same and not (foreign and objective is not None):
-        motion = rescale_motion(geometry, shaped, person)
-        geometry = CaptureGeometry.of(motion, cameras, source)
+        motion = rescale_motion(evidence.geometry(motion), shaped, person)
+    geometry = evidence.geometry(motion)
     difference = "" if foreign or same else _describe_difference(shaped, person)
     placement = None
     if objective is not None:
         placement = place_body_on_masks(geometry, objective)
-    elif foreign and not masked:
-        placement = place_from_video(geometry, person, cameras, source)
+    elif foreign and not evidence.has_masks:
+        placement = _place_on_images(geometry, person, evidence)
     return _accept(placement, person, motion, difference)
 
 
@@ -236,34 +210,16 @@ def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
     )
 
 
-def place_from_video(
-    geometry: CaptureGeometry, shaped: ShapedBody, cameras: CameraTrack, source: FrameSource
+def _place_on_images(
+    geometry: CaptureGeometry, shaped: ShapedBody, evidence: CaptureEvidence
 ) -> BodyPlacement | None:
     """Align a body to a few images; None where parts do not fit (reported elsewhere)."""
     skin = SkinPoints.of(shaped)
     try:
-        images = sample_video(geometry, skin, cameras, source)
+        images = sample_video(geometry, skin, evidence.cameras, evidence.source)
     except InputError:
         return None
     return place_body_on_images(geometry, skin, images)
-
-
-def silhouette_objective_of(
-    shaped: ShapedBody, cameras: CameraTrack, source: FrameSource, masks: Masks | None
-) -> SilhouetteObjective | None:
-    """The objective of a few masks; None where parts do not fit (reported elsewhere)."""
-    try:
-        rows = associate_masks(masks, source), associate_cameras(cameras, source)
-        return sample_masks(
-            source,
-            masks,
-            *rows,
-            SkinPoints.of(shaped),
-            count=ALIGNMENT_SAMPLES,
-            excluded_frames=cameras.frames_without_camera,
-        )
-    except InputError:
-        return None
 
 
 def _with_body(objective: SilhouetteObjective, shaped: ShapedBody) -> SilhouetteObjective:
@@ -278,13 +234,7 @@ MIN_SMPL_CONTRAST_RATIO = 1.1
 
 
 def place_motion(
-    motion_read: Motion,
-    body: BodyModel,
-    cameras: CameraTrack,
-    source: FrameSource,
-    masks: Masks | None,
-    *,
-    cameras_given: bool,
+    motion_read: Motion, body: BodyModel, evidence: CaptureEvidence, *, cameras_given: bool
 ) -> tuple[Motion, ShapedBody]:
     """Place a motion in the cameras' world, and shape the person that it was made for.
 
@@ -295,26 +245,21 @@ def place_motion(
     Args:
         motion_read: The motion that `read_poses` returns.
         body: The body model that is used.
-        cameras: Cameras of the frames' size.
-        source: The frames; few are decoded, and none if there are mask files.
-        masks: The masks; None if the images have an alpha channel, or there are none.
+        evidence: Frames, masks and cameras.
         cameras_given: Whether a file states the cameras; see `place_in_camera_world`.
     """
 
     def placed(motion: Motion) -> tuple[Motion, ShapedBody]:
         shaped = shape_for_motion(body, motion)
-        there = place_in_camera_world(motion, shaped, cameras, cameras_given=cameras_given)
+        there = place_in_camera_world(motion, shaped, evidence.cameras, cameras_given=cameras_given)
         return there, shaped
 
     own = placed(motion_read)
     if motion_read.model_is_stated or body.family == "smpl":
         return own
     smpl = placed(replace(motion_read, body_model="smpl"))
-    one, other = ((CaptureGeometry.of(each, cameras, source), who) for each, who in (own, smpl))
-    if masks is None and not source.has_alpha:
-        reason = _smpl_fits_images(one, other, cameras, source)
-    else:
-        reason = _smpl_fits_masks(one, other, cameras, source, masks)
+    one, other = ((evidence.geometry(each), who) for each, who in (own, smpl))
+    reason = (_smpl_fits_masks if evidence.has_masks else _smpl_fits_images)(one, other, evidence)
     if reason is None:
         return own
     words = (
@@ -329,15 +274,9 @@ PosedPerson = tuple[CaptureGeometry, ShapedBody]
 """A motion in its geometry, and the person it is for."""
 
 
-def _smpl_fits_masks(
-    own: PosedPerson,
-    smpl: PosedPerson,
-    cameras: CameraTrack,
-    source: FrameSource,
-    masks: Masks | None,
-) -> str | None:
+def _smpl_fits_masks(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvidence) -> str | None:
     """How much better SMPL's body fits the masks than the file's; None if it does not."""
-    objective = silhouette_objective_of(own[1], cameras, source, masks)
+    objective = evidence.silhouettes(SkinPoints.of(own[1]), ALIGNMENT_SAMPLES)
     if objective is None or mean_score(objective.frame_scores(own[0])) >= GOOD_IOU:
         return None
     before = place_body_on_masks(own[0], objective).iou_after
@@ -347,11 +286,10 @@ def _smpl_fits_masks(
     return f"whose mean IoU with the masks is {after:.2f}, not {before:.2f}"
 
 
-def _smpl_fits_images(
-    own: PosedPerson, smpl: PosedPerson, cameras: CameraTrack, source: FrameSource
-) -> str | None:
+def _smpl_fits_images(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvidence) -> str | None:
     """How much stronger edges are across the outline of SMPL's body; None if they are not."""
     (one, skin), (other, smpl_skin) = ((each, SkinPoints.of(who)) for each, who in (own, smpl))
+    cameras, source = evidence.cameras, evidence.source
     try:
         before = edge_contrast(one, skin, sample_video(one, skin, cameras, source))
         images = sample_video(other, smpl_skin, cameras, source)

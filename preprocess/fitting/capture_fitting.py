@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
-from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
@@ -23,7 +22,7 @@ from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, ClipFitter, ClipFra
 from preprocess.fitting.keypoint_rows import ClipKeypoints
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.fitting.pose_priors import HumanPosePrior
-from preprocess.observe import associate_cameras, associate_masks
+from preprocess.observe import associate_cameras
 from preprocess.tracking.keypoint_track import KeypointTrack
 
 KEY_FRAMES = 120
@@ -69,7 +68,7 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     """
     if not fit.taken:
         return replace(capture, fit=fit)
-    geometry = CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
+    geometry = capture.geometry()
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
     shaped = fit.shape(capture.shaped) if fit.fits_body else capture.shaped
     if height_m is None and not cameras.is_moving:
@@ -161,7 +160,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
     has_masks |= capture.source.has_alpha
     if capture.live is not None or not (has_masks or track):
         return None
-    geometry, space = _geometry(capture), ProportionSpace.around(capture.shaped)
+    geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
     count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
     outlines = _read_outlines(capture, geometry, count) if has_masks else {}
     numbers = {*outlines, *([] if track is None else track.frames.tolist())}
@@ -208,7 +207,7 @@ def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
         capture: What was fitted: poses made of key points, for the mean body.
         fit: Its fit.
     """
-    moved = fit.correct_motion(_geometry(capture))
+    moved = fit.correct_motion(capture.geometry())
     betas = SIGMA_BETA * fit.coefficients[: capture.shaped.body.shape_directions.shape[-1]]
     cameras = fit.scale_focal_lengths(capture.cameras)
     intrinsic = None if cameras.is_moving else cameras[0].intrinsic
@@ -222,26 +221,13 @@ def _times_s(track: KeypointTrack, numbers: list[int]) -> Float[np.ndarray, "fra
     return np.interp(numbers, track.frames, track.times_s)
 
 
-def _geometry(capture: Capture) -> CaptureGeometry:
-    return CaptureGeometry.of(capture.motion, capture.cameras, capture.source)
-
-
 def _read_outlines(
     capture: Capture, geometry: CaptureGeometry, count: int
 ) -> dict[int, OutlineDistances]:
     """Outlines of evenly spread masks, by frame."""
-    try:
-        objective = sample_masks(
-            capture.source,
-            capture.masks,
-            associate_masks(capture.masks, capture.source),
-            associate_cameras(capture.cameras, capture.source),
-            SkinPoints.of(capture.shaped, 1),
-            count=count,
-            person_px=OUTLINE_PERSON_PX,
-            excluded_frames=capture.cameras.frames_without_camera,
-        )
-    except InputError:  # parts that do not fit are reported elsewhere
+    evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
+    objective = evidence.silhouettes(SkinPoints.of(capture.shaped, 1), count, OUTLINE_PERSON_PX)
+    if objective is None:
         return {}
     return {
         sample.index: OutlineDistances.of(
@@ -263,5 +249,5 @@ def _interpolate_corrections(
 ) -> Float[np.ndarray, "poses 75"]:
     """A correction for each row of the motion, linear in time between the fitted frames."""
     numbers = np.array([frame.number for frame in fitter.frames])
-    rows = np.nan_to_num(_geometry(capture).row_frames)
+    rows = np.nan_to_num(capture.geometry().row_frames)
     return np.column_stack([np.interp(rows, numbers, each) for each in corrections.T])

@@ -10,6 +10,7 @@ from PIL import Image
 from capture.camera import Camera
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import place_motion
+from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.proportion_space import shape_for_motion
@@ -64,7 +65,10 @@ def test_masks_determine_an_unstated_body_model(filmed, truth):
     folder = filmed(unnamed(truth))
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     found, _ = place_motion(
-        unnamed("body24"), load_body_model(), CAMERAS, source, masks, cameras_given=True
+        unnamed("body24"),
+        load_body_model(),
+        CaptureEvidence(source, masks, CAMERAS),
+        cameras_given=True,
     )
     assert found.body_model == truth
     assert (found.note is not None) == (truth == "smpl")
@@ -78,9 +82,14 @@ def test_a_stated_model_stays_and_without_masks_images_decide(filmed, truth):
     source, masks = open_source(folder / "images"), open_masks(folder / "masks")
     stated = replace(unnamed("body24"), model_is_stated=True)
     body = load_body_model()
-    assert place_motion(stated, body, CAMERAS, source, masks, cameras_given=True)[0] is stated
+    assert (
+        place_motion(stated, body, CaptureEvidence(source, masks, CAMERAS), cameras_given=True)[0]
+        is stated
+    )
     read = unnamed("body24")
-    found, shaped = place_motion(read, body, CAMERAS, source, None, cameras_given=True)
+    found, shaped = place_motion(
+        read, body, CaptureEvidence(source, None, CAMERAS), cameras_given=True
+    )
     assert found.body_model == truth
     assert (found is read) == (truth == "body24")
     assert np.array_equal(shaped.joints, shape_for_motion(body, found).joints)

@@ -11,6 +11,7 @@ from capture.frame import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import BodyAlignment, align_body, align_to_person
 from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
+from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model, read_shaped_body, write_shaped_body
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody
@@ -101,8 +102,8 @@ def test_an_alpha_channel_aligns_as_masks_do(tmp_path, own, strangers):
     person = taller(own, 1.1)
     source, masks = film(tmp_path, person, strangers)
     assert source.has_alpha
-    by_alpha = align_body(strangers, own, CAMERAS, source, None)
-    by_masks = align_body(strangers, own, CAMERAS, source, masks)
+    by_alpha = align_body(strangers, own, CaptureEvidence(source, None, CAMERAS))
+    by_masks = align_body(strangers, own, CaptureEvidence(source, masks, CAMERAS))
     assert by_alpha.placement is not None
     assert by_alpha.placement.distance_divisor == pytest.approx(1.1, rel=0.02)
     np.testing.assert_array_equal(
@@ -114,7 +115,7 @@ def test_an_alpha_channel_aligns_as_masks_do(tmp_path, own, strangers):
 
 def test_without_masks_an_unfitted_body_is_reported(tmp_path, own, strangers):
     Image.new("RGB", SIZE).save(tmp_path / "0.png")
-    fit = align_body(strangers, own, CAMERAS, open_source(tmp_path), None)
+    fit = align_body(strangers, own, CaptureEvidence(open_source(tmp_path), None, CAMERAS))
     assert fit.motion is strangers
     assert "--masks" in fit.description
     assert "--body" in fit.description
@@ -123,7 +124,7 @@ def test_without_masks_an_unfitted_body_is_reported(tmp_path, own, strangers):
 def test_poses_of_the_bodys_own_model_stay(tmp_path, body):
     motion = motion_of("body24")
     source, masks = film(tmp_path, body.with_shape(), motion)
-    fit = align_body(motion, body.with_shape(), CAMERAS, source, masks)
+    fit = align_body(motion, body.with_shape(), CaptureEvidence(source, masks, CAMERAS))
     assert fit.motion is motion
     assert not fit.description
 
@@ -150,7 +151,7 @@ def test_an_added_clip_is_aligned_to_the_avatars_person(tmp_path, body, amount):
     pelves = person.joints[0] + motion.root_translations
     claimed = replace(motion, root_translations=ratio * pelves - other.joints[0])
     for given in (masks, None):  # pictures with alpha channels
-        fit = align_to_person(claimed, other, person, CAMERAS, source, given)
+        fit = align_to_person(claimed, other, person, CaptureEvidence(source, given, CAMERAS))
         assert fit.shaped is person
         assert f"{100 * body_height_m(other):.0f} cm" in fit.description
         assert f"{100 * body_height_m(person):.0f} cm" in fit.description
@@ -164,7 +165,9 @@ def test_without_masks_an_added_clips_distances_follow_the_height(tmp_path, body
     pelves = person.joints[0] + motion.root_translations
     claimed = replace(motion, root_translations=ratio * pelves - other.joints[0])
     Image.new("RGB", SIZE).save(tmp_path / "0.png")
-    fit = align_to_person(claimed, other, person, CAMERAS, open_source(tmp_path), None)
+    fit = align_to_person(
+        claimed, other, person, CaptureEvidence(open_source(tmp_path), None, CAMERAS)
+    )
     np.testing.assert_allclose(fit.motion.root_translations, motion.root_translations, atol=1e-9)
 
 
@@ -173,7 +176,7 @@ def test_an_added_clip_of_smpls_fits_the_avatars_proportions(tmp_path, body, own
     source, masks = film(tmp_path, person, strangers)
     pelves = person.joints[0] + strangers.root_translations
     nearer = replace(strangers, root_translations=pelves / 1.12 - own.joints[0])
-    fit = align_to_person(nearer, own, person, CAMERAS, source, masks)
+    fit = align_to_person(nearer, own, person, CaptureEvidence(source, masks, CAMERAS))
     assert fit.placement is not None
     assert fit.placement.distance_divisor == pytest.approx(1.0 / 1.12, rel=0.02)
     assert pixels_off(fit, person, strangers) < 1.2
@@ -184,7 +187,9 @@ def test_the_same_person_again_changes_nothing(tmp_path, body):
     source, masks = film(tmp_path / "film", body.with_shape(), motion)
     write_shaped_body(tmp_path / "person.npz", body.with_shape())
     person = read_shaped_body(tmp_path / "person.npz", body)
-    fit = align_to_person(motion, body.with_shape(), person, CAMERAS, source, masks)
+    fit = align_to_person(
+        motion, body.with_shape(), person, CaptureEvidence(source, masks, CAMERAS)
+    )
     assert fit.motion is motion
     assert not fit.description
 

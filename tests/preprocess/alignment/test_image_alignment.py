@@ -15,6 +15,7 @@ from preprocess.alignment.capture_alignment import align_body
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.image_alignment import ImageSample, edge_contrast, place_body_on_images
 from preprocess.alignment.mask_alignment import BodyPlacement, move_pelvis
+from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
@@ -143,7 +144,7 @@ def test_a_video_without_masks_is_aligned_by_its_images(tmp_path: Path, own):
     motion, person = turning(), scaled(own, 1.12)
     for row, rgb in enumerate(filmed(person, motion)):
         Image.fromarray(rgb).save(tmp_path / f"{row}.png")
-    fit = align_body(motion, own, CAMERAS, open_source(tmp_path), None)
+    fit = align_body(motion, own, CaptureEvidence(open_source(tmp_path), None, CAMERAS))
     assert fit.placement is not None
     assert fit.placement.edge_contrast is not None
     assert fit.placement.distance_divisor == pytest.approx(1.12, rel=0.03)
