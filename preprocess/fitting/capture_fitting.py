@@ -19,11 +19,8 @@ from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, ClipFitter, ClipFrame, FitParameters
-from preprocess.fitting.keypoint_rows import ClipKeypoints
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
-from preprocess.fitting.pose_priors import HumanPosePrior
 from preprocess.observe import associate_cameras
-from preprocess.tracking.keypoint_track import KeypointTrack
 
 KEY_FRAMES = 120
 """Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""
@@ -41,8 +38,6 @@ TRACKED_ITERATIONS = (4, 5)
 """Fewest and most iterations with outlines after that."""
 SIGMA_LOG_ASSUMED_FOCAL = 0.3
 """Prior standard deviation of the logarithm of a focal length that is merely assumed."""
-USUAL_FPS = 30.0
-"""Frames per second of a film that does not say."""
 PROPORTION_ITERATIONS = 4
 """Iterations that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
@@ -177,14 +172,11 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         return None
     if track is None:
         return ClipFitter(capture.motion, space, frames)
-    cameras, used = [frame.camera for frame in frames], [int(frame.number) for frame in frames]
-    rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
     return ClipFitter(
         capture.motion,
         space,
         frames,
-        keypoints=ClipKeypoints.of(track, used, cameras, capture.shaped.joints),
-        prior=HumanPosePrior(rotations, _times_s(track, used)),
+        track=track,
         sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
         frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
     )
@@ -212,13 +204,6 @@ def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
     cameras = fit.scale_focal_lengths(capture.cameras)
     intrinsic = None if cameras.is_moving else cameras[0].intrinsic
     return replace(moved, betas=betas, proportions=fit.coefficients, intrinsic=intrinsic)
-
-
-def _times_s(track: KeypointTrack, numbers: list[int]) -> Float[np.ndarray, "frames"]:
-    """Times of frames, of which each may lie between those of the key points."""
-    if track.times_s is None:
-        return np.array(numbers) / USUAL_FPS
-    return np.interp(numbers, track.frames, track.times_s)
 
 
 def _read_outlines(

@@ -21,7 +21,8 @@ from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, KeypointModel
 from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
-from preprocess.fitting.pose_priors import POSE_SIGMA, ClipPrior, GivenPosePrior
+from preprocess.fitting.pose_priors import POSE_SIGMA, GivenPosePrior, HumanPosePrior
+from preprocess.tracking.keypoint_track import KeypointTrack
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""
@@ -37,6 +38,8 @@ MAX_PLACE_STEP_M = 0.5
 """Largest change of the root's place in one iteration, metres."""
 MAX_LOG_FOCAL_STEP = 0.1
 """Largest change of the logarithm of the focal length in one iteration."""
+USUAL_FPS = 30.0
+"""Frames per second of a film that does not say."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
@@ -89,8 +92,8 @@ class ClipFitter:
         space: ProportionSpace,
         frames: Sequence[ClipFrame],
         *,
-        prior: ClipPrior | None = None,
-        keypoints: ClipKeypoints | None = None,
+        track: KeypointTrack | None = None,
+        settled: bool = False,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
         frames_per_prior: float = FRAMES_PER_PRIOR,
         model: OutlineModel | None = None,
@@ -101,8 +104,9 @@ class ClipFitter:
             motion: The poses to start from.
             space: Proportions around the present person.
             frames: The frames to fit, in time order.
-            prior: What is known of the poses; if None, that they are near the motion's.
-            keypoints: Key points of these frames, as further evidence.
+            track: Key points, as further evidence. With them the poses are merely human; without,
+                they are near the motion's.
+            settled: Whether these poses were fitted to key points before.
             sigma_log_focal: How uncertain the focal length is.
             frames_per_prior: Frames that count as one for the proportions.
             model: The person at the space's origin, where several clips share it.
@@ -110,7 +114,6 @@ class ClipFitter:
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
-        self._keypoints = keypoints
         self._frames_per_prior = frames_per_prior
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
@@ -118,7 +121,14 @@ class ClipFitter:
         self.poses = self._given
         self._turns = np.stack([each.camera.camera_from_world[:3, :3] for each in self.frames])
         numbers = np.array([frame.number for frame in self.frames])
-        self._prior = prior or GivenPosePrior(self._given, self._turns, numbers)
+        self._keypoints: ClipKeypoints | None = None
+        if track is None:
+            self._prior = GivenPosePrior(self._given, self._turns, numbers)
+        else:
+            cameras = [frame.camera for frame in self.frames]
+            used = [int(frame.number) for frame in self.frames]
+            self._keypoints = ClipKeypoints.of(track, used, cameras, space.shaped.joints)
+            self._prior = HumanPosePrior(self._turns, _times_s(track, numbers), settled=settled)
 
     @property
     def corrections(self) -> Float[np.ndarray, "frames 75"]:
@@ -221,6 +231,15 @@ class ClipFitter:
         held[:-1] = 0.0 if fitted.proportions else HELD_PRECISION
         held[-1] = 0.0 if fitted.focal else HELD_PRECISION
         equations.hold(held, 0.0 if fitted.poses else HELD_PRECISION)
+
+
+def _times_s(
+    track: KeypointTrack, numbers: Float[np.ndarray, "frames"]
+) -> Float[np.ndarray, "frames"]:
+    """Times of frames, of which each may lie between those of the key points."""
+    if track.times_s is None:
+        return numbers / USUAL_FPS
+    return np.interp(numbers, track.frames, track.times_s)
 
 
 def correct_pose(

@@ -1,6 +1,6 @@
 """What is known of a clip's poses before any picture: near those given, or merely human."""
 
-from typing import Protocol, final, runtime_checkable
+from typing import final
 
 import numpy as np
 from jaxtyping import Float
@@ -75,15 +75,6 @@ FIRST_FAST_CHANGE = 100.0
 drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
 
 
-@runtime_checkable
-class ClipPrior(Protocol):
-    """What is known of the poses of a clip."""
-
-    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
-        ...
-
-
 @final
 class GivenPosePrior:
     """The poses are near given ones, and the corrections of neighboring frames are alike."""
@@ -100,7 +91,7 @@ class GivenPosePrior:
         self._links = np.repeat(links[:, None], 75, axis=1)
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        """See `ClipPrior`."""
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
         equations.add_chain(poses.steps_from(self._given, self._cameras) / POSE_SIGMA, self._links)
 
 
@@ -133,7 +124,7 @@ class HumanPosePrior:
         self._fast_change = FAST_CHANGE if settled else FIRST_FAST_CHANGE
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        """See `ClipPrior`."""
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
         vectors = rotation_vectors(poses.rotations)
         by_step = _inverse_right_jacobian(vectors)
         heavy = by_step / _SIGMA[..., None] ** 2

@@ -19,9 +19,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
-from preprocess.fitting.keypoint_rows import ClipKeypoints
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
-from preprocess.fitting.pose_priors import HumanPosePrior
 from preprocess.observe import shrink_to_longer_side
 from preprocess.tracking.keypoint_track import KeypointTrack
 from preprocess.tracking.keypoints import PersonKeypoints
@@ -242,15 +240,9 @@ def _fitter(
         )
         for row, each in enumerate(seen)
     ]
-    cameras = [small] * len(frames)
-    keypoints = ClipKeypoints.of(
-        _track(seen, camera), [each.number for each in seen], cameras, shaped.joints
-    )
-    rotations = np.stack([each.camera_from_world[:3, :3] for each in cameras])
-    times = np.array([each.time_s for each in seen])
     return ClipFitter(
-        motion, model.space, frames, model=model, keypoints=keypoints,
-        prior=HumanPosePrior(rotations, times, settled=poses is not None),
+        motion, model.space, frames, model=model, track=_track(seen, camera),
+        settled=poses is not None,
         sigma_log_focal=SIGMA_LOG_ASSUMED_FOCAL,
     )  # fmt: skip
 
