@@ -41,7 +41,11 @@ from preprocess.masks.mask_origin import (
     segmenter_name,
 )
 from preprocess.pose_formats.pose_format_registry import read_poses
-from preprocess.poses.plausibility import plausibility_warnings, require_plausible
+from preprocess.poses.plausibility import (
+    lost_pose_warnings,
+    plausibility_warnings,
+    require_plausible,
+)
 from preprocess.poses.root_placement import place_in_camera_world
 
 
@@ -97,12 +101,7 @@ def describe_capture(
         )
     elif fit.description:
         yield fit.description
-    lost = len(motion) - int(motion.valid.sum())
-    if lost:
-        yield (
-            f"{lost} of {len(motion)} poses are NaN or marked as not valid; their frames are left "
-            "out."
-        )
+    yield from lost_pose_warnings(motion)
 
 
 HEIGHT_TOLERANCE_CM = 1.5

@@ -2,14 +2,19 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.corrections import CAUSES, Correction
-from preprocess.alignment.silhouette_objective import mean_score, mean_with_missing
+from preprocess.alignment.edge_objective import EdgeObjective
+from preprocess.alignment.silhouette_objective import (
+    SilhouetteObjective,
+    mean_score,
+    mean_with_missing,
+)
 
 MIN_STANDARD_ERRORS = 3.0
 """Standard errors, over the frames, by which a gain must exceed 0."""
@@ -25,17 +30,8 @@ TIE_SCORE = 0.004
 """Scores this close are equal; then the cause that stands first in `CAUSES` is named."""
 
 
-@runtime_checkable
-class Objective(Protocol):
-    """Scores how well a geometry fits each of a few frames, in [0, 1]."""
-
-    def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "samples"]:
-        """The score of each frame; NaN where nothing can be compared."""
-        ...
-
-    def subset(self, count: int) -> "Objective":
-        """At most `count` of the frames."""
-        ...
+Objective = SilhouetteObjective | EdgeObjective
+"""Scores how well a geometry fits each of a few frames, in [0, 1]; NaN where it cannot."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from preprocess.alignment.capture_geometry import CaptureGeometry, frame_step
 from preprocess.alignment.silhouette_objective import SilhouetteObjective
-from preprocess.poses.plausibility import plausibility_warnings
+from preprocess.poses.plausibility import lost_pose_warnings, plausibility_warnings
 
 MIN_JUMP_M = 0.25
 """Least step of the root between frames that is a jump, metres."""
@@ -68,15 +68,9 @@ def view_coverage(geometry: CaptureGeometry) -> float:
 
 
 def _missing_pose_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    valid = geometry.motion.valid
-    lost = int((~valid).sum())
-    if lost:
-        yield (
-            f"{lost} of {len(valid)} poses are NaN or marked as not valid; their frames are left "
-            "out."
-        )
+    yield from lost_pose_warnings(geometry.motion)
     bare = [frame for frame in frames if geometry.row_for_frame(frame) is None]
-    if len(bare) > lost:
+    if len(bare) > int((~geometry.motion.valid).sum()):
         yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
 
 

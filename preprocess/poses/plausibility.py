@@ -89,6 +89,16 @@ def implausibility_reason(motion: Motion) -> str | None:
     return None
 
 
+def lost_pose_warnings(motion: Motion) -> Iterator[str]:
+    """Yield a sentence about poses that are not valid, if there are any."""
+    lost = len(motion) - int(motion.valid.sum())
+    if lost:
+        yield (
+            f"{lost} of {len(motion)} poses are NaN or marked as not valid; their frames are left "
+            "out."
+        )
+
+
 def plausibility_warnings(motion: Motion) -> Iterator[str]:
     """Yield sentences about numbers that are possible but hardly meant; none of impossible ones."""
     if implausibility_reason(motion) is not None:
