@@ -157,16 +157,21 @@ def _zip(data: bytes) -> Any:
     return load_pickle(data)
 
 
+def read_npy_header(stream: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether columns come first, and type of the array in an .npy.
+
+    Raises:
+        Exception: Of any kind, if it is damaged: numpy reads headers as Python.
+    """
+    header = np.lib.format
+    is_first = header.read_magic(stream) == (1, 0)
+    return (header.read_array_header_1_0 if is_first else header.read_array_header_2_0)(stream)
+
+
 def _npy(data: bytes) -> Any:
     """An array of numbers or texts; objects are unpickled."""
     stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, by_columns, kind = read(stream)
+    shape, by_columns, kind = read_npy_header(stream)
     if kind.hasobject:
         return load_pickle(data[stream.tell() :])
     if kind.names or kind.subdtype:

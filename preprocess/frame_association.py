@@ -186,11 +186,8 @@ def _unique_numbers(names: Sequence[str]) -> list[int] | None:
 
 def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
     """The last number in each name; the place in order where a name has none, or two have one."""
-    listed = list(names)
-    found = [re.findall(r"\d+", name.rsplit(".", 1)[0].rsplit("/", 1)[-1]) for name in listed]
-    if not all(found) or len({int(numbers[-1]) for numbers in found}) < len(listed):
-        return list(range(len(listed)))
-    return [int(numbers[-1]) for numbers in found]
+    stems = [name.rsplit(".", 1)[0].rsplit("/", 1)[-1] for name in names]
+    return _unique_numbers(stems) or list(range(len(stems)))
 
 
 MAX_INTERPOLATED_FRAMES = 12
@@ -299,13 +296,12 @@ def _frame_numbers(names: Sequence[str | None], frames: int) -> list[int] | None
 
     Numbers without a gap that end long before the video does are the count of a few chosen frames.
     """
-    parsed = [re.findall(r"\d+", name or "") for name in names]
-    if not all(parsed):
+    numbers = _unique_numbers([name or "" for name in names])
+    if numbers is None:
         return None
-    numbers = [int(digits[-1]) for digits in parsed]
     first = 0 if min(numbers) == 0 else 1
     numbers = [number - first for number in numbers]
-    if len(set(numbers)) < len(numbers) or max(numbers) >= frames:
+    if max(numbers) >= frames:
         return None
     chosen = len(numbers) == max(numbers) + 1 and len(numbers) < MIN_NUMBERED_COVERAGE * frames
     return None if chosen else numbers

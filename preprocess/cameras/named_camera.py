@@ -1,4 +1,4 @@
-"""A camera and the picture it belongs to, before anybody knows which frame that is."""
+"""The camera of one picture, by the picture's name: its frame is found later."""
 
 from dataclasses import dataclass
 from pathlib import PurePosixPath

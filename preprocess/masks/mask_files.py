@@ -22,7 +22,7 @@ from capture.image_folder import (
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.video import VIDEO_SUFFIXES
-from preprocess.file_content import read_npz, read_untrusted_file
+from preprocess.file_content import read_npy_header, read_npz, read_untrusted_file
 from preprocess.masks.encoded_masks import is_phalp_tracks, open_mask_video, open_rle_masks
 
 MAX_PERSON_FRACTION = 0.5
@@ -285,13 +285,10 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
 
 def _is_numeric_npy(path: Path) -> bool:
     """Whether an .npy holds no objects; a damaged file counts as numeric and fails when read."""
-    header = np.lib.format
     try:
         with path.open("rb") as file:
-            is_first = header.read_magic(file) == (1, 0)
-            read = header.read_array_header_1_0 if is_first else header.read_array_header_2_0
-            return not read(file)[2].hasobject
-    except Exception:  # numpy parses headers as Python: damaged ones fail in any way
+            return not read_npy_header(file)[2].hasobject
+    except Exception:  # whatever a damaged header raises
         return True
 
 
