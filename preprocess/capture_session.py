@@ -200,7 +200,7 @@ class Capture:
         return self.cameras[int(self.geometry().camera_rows()[row])]
 
     def in_real_time(self) -> "Capture":
-        """The same, its frames coming at their own times."""
+        """Replay the capture: each frame comes at its own time."""
         return replace(self, source=RealtimePlayback(self.source, PacingClock()))
 
     def pixel_footprint_m(self) -> float:

@@ -81,7 +81,7 @@ CHUNK_BYTES = 1 << 20
 """Bytes that are unpacked at a time."""
 
 MAX_FOLDER_FILES = 100_000
-"""Of a folder: more files are no poses, a file a frame."""
+"""Most files of a folder that holds one pose file per frame."""
 
 
 def read_untrusted_file(path: Path) -> Any:

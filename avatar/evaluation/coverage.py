@@ -117,7 +117,7 @@ class Coverage:
         return found
 
     def to_state(self) -> dict[str, Any]:
-        """All of it as text, for a checkpoint."""
+        """Encode cosines and stages as text, for a checkpoint."""
         steps = np.round(self.cosines * 255.0).astype(np.uint8)
         return {
             "cosines": base64.b64encode(steps.tobytes()).decode("ascii"),

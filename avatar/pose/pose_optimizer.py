@@ -36,7 +36,7 @@ EVIDENCE_EMA_DECAY = 0.95
 MAX_CORRECTION_INTERVAL = 8
 """Steps between pose gradients where poses are exact."""
 MAX_ESTIMATED_INTERVAL = 4
-"""The same of estimated poses, when steps are short."""
+"""Most steps between pose gradients of estimated poses, when steps are short."""
 MAX_JOINT_STEP_M = 0.04
 """Largest motion of a joint in one correction, metres; the roots must be able to follow it."""
 RESOLVE_DISTANCE_M = 0.08

@@ -286,7 +286,7 @@ class ReplayBuffer:
         self._descriptor_distances[slot, :held] = self._descriptor_distances[:held, slot] = gap
 
     def _most_redundant_slot(self) -> int:
-        """Of the two most similar frames, the one that is closer to a third."""
+        """The slot, of the two most similar frames', that is closer to a third."""
         first, second = np.unravel_index(
             self._descriptor_distances.argmin(), self._descriptor_distances.shape
         )

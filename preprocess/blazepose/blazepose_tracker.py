@@ -93,8 +93,8 @@ OVERLAPPING = 0.3
 MAX_COLOR_DISTANCE = 8.0
 """Largest difference of a person's colors, in units of CIELAB, if the others' are not known."""
 MAX_UNSEEN_COLOR_DISTANCE = 12.0
-"""The same for a place where the detector finds no person: past it the networks hold on to a thing
-that the person passed."""
+"""Largest difference of colors where the detector finds no person, in units of CIELAB: past it the
+networks hold on to a thing that the person passed."""
 CROWD_MEMORY = 20
 """Frames after which another person who was near and is not seen any more does not count."""
 

@@ -32,7 +32,7 @@ def axis_angles_from_matrices(
 
 
 def stack_axis_angles(parts: list[Any]) -> Float[np.ndarray, "poses 24 3"]:
-    """All of a pose's rotations one after the other, root first, as 24 axis-angles.
+    """Join the parts of a pose's rotations, root first, into 24 axis-angles.
 
     Each part holds axis-angles (… or …x3) or matrices (…x3x3) with one row a pose. Of SMPL+H and
     SMPL-X (52 and 55 joints) the first 22 are taken: they are SMPL's; its two hands rest. So do

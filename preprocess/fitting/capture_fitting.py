@@ -29,7 +29,7 @@ MIN_ITERATIONS = 6
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 60
-"""The same for poses that were made of key points, which tell the poses between them."""
+"""Frames whose masks are fitted where key points tell the poses between them."""
 TRACKED_FRAMES_PER_PRIOR = 30.0
 """Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5

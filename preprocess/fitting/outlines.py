@@ -239,7 +239,7 @@ class OutlineModel:
         turns: Float[np.ndarray, "24 3 3"],
         in_world: Float[np.ndarray, "rows 3"],
     ) -> Float[np.ndarray, "rows coefficients"]:
-        """Of the distances by the proportions: the skin moves, and so do the joints above it."""
+        """Derivatives of the distances by the proportions, which move the skin and its joints."""
         parents, moved = self.space.shaped.body.parents, self.space.joint_directions
         # where a joint goes, minus what its own bone does to it
         offset = np.zeros_like(moved)

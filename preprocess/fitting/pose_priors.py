@@ -71,8 +71,8 @@ FAST_CHANGE = 6.0
 """Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
 people move fast at times."""
 FIRST_FAST_CHANGE = 100.0
-"""The same in the first iteration, halved from one to the next: a frame that a tracker got wrong is
-drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
+"""`FAST_CHANGE` in the first iteration, halved from one to the next: a frame that a tracker got
+wrong is drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
 
 
 @final

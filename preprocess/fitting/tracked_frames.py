@@ -34,7 +34,7 @@ SIGMA_LOG_ASSUMED_FOCAL = 0.2
 FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
 FRAME_ITERATIONS = (1, 1)
-"""The same for each later frame."""
+"""Iterations for each later frame, with key points alone and then with outlines."""
 
 REVISED_FRAMES = 32
 """New frames after which the poses of all of them are fitted again."""

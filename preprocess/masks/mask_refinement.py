@@ -34,12 +34,12 @@ MARGIN = 2.0
 SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
 """Probability, and distance from the border, of pixels that teach the person's colors."""
 SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
-"""The same of pixels that teach the background's colors."""
+"""Probability, and distance from the border, of pixels that teach the background's colors."""
 
 LOCAL_SIGMA = 3.0
 """Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
 UNSEEN_BACKGROUND = 0.00025
-"""The same where the background is known."""
+"""Least density of a color where the background is known (`color_density`)."""
 SHADOW_GAIN = 0.6, 1.05
 """Range of the factors by which the person's shadow and reflected light change the background."""
 SHADOW_PROBABILITY = 0.1

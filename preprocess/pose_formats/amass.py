@@ -15,7 +15,7 @@ from jaxtyping import Float
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 
 AIST_FPS = 60.0
-"""Of all AIST++ motions, by their documentation."""
+"""Poses per second of all AIST++ motions, by their documentation."""
 SMPLX_ROW_SIZE = 165
 """Numbers a row that only SMPL-X has: 55 joints."""
 

@@ -78,7 +78,7 @@ def describe_unknown_content(content: Any) -> str:
 
 
 def _keys(content: Any) -> list[str]:
-    """Of the file, or of the first of its items."""
+    """Keys of a file, or of the first of its items."""
     if isinstance(content, (list, tuple)):
         return _keys(content[0]) if content else []
     if not isinstance(content, dict):

@@ -69,7 +69,7 @@ class SparseModel:
         return np.flatnonzero(self.observation_camera == row)
 
     def without_cameras(self, doubtful: Bool[np.ndarray, "cameras"]) -> "SparseModel":
-        """The same without some of the cameras, and what only they saw."""
+        """The model without some of its cameras and their observations."""
         kept = ~doubtful[self.observation_camera]
         row_of = np.cumsum(~doubtful) - 1
         return replace(

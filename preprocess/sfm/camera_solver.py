@@ -292,7 +292,7 @@ def _tracking_gate(between: ResectionResult, keys: int) -> QualityGate:
 
 
 def _drop_small_distortion(model: SparseModel) -> SparseModel:
-    """The same with a straight lens, if it bends too little to be told from one."""
+    """The model without distortion, where that moves the corners by less than can be measured."""
     corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
     bends = abs(model.radial_distortion) * corner**3 * model.focal_px
     return replace(model, radial_distortion=0.0) if bends < MAX_IGNORED_DISTORTION_PX else model

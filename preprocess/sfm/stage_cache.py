@@ -71,7 +71,7 @@ class StageCache:
         write_text_atomically(self._notes, json.dumps(self.costs, indent=1))
 
     def totals(self) -> dict[str, Any]:
-        """Of all stages, for the report."""
+        """Time and memory of all stages together, for the report."""
         return {
             "wall_seconds": sum(cost["wall_seconds"] for cost in self.costs.values()),
             "cpu_seconds": sum(cost["cpu_seconds"] for cost in self.costs.values()),
