@@ -168,7 +168,6 @@ class ClipFitter:
             self.coefficients += np.clip(step[:-1], -1.0, 1.0)
             self.model.set_proportions(self.coefficients)
         self.log_focal += zoomed
-        self.model.set_proportions(self.coefficients)
         return error
 
     def _depths_m(self) -> Float[np.ndarray, "frames"]:
@@ -177,11 +176,7 @@ class ClipFitter:
         places = self.model.joints[0] + self.poses.translations
         return (views[:, :3] * places).sum(axis=1) + views[:, 3]
 
-    def error_px(self) -> float:
-        """Root mean square distance of the outlines, px of the reduced masks."""
-        return self._linearise()[1]
-
-    def _linearise(self, outlines: bool = True) -> tuple[ChainEquations, float]:
+    def _linearise(self, outlines: bool) -> tuple[ChainEquations, float]:
         """The evidence's equations in prior standard deviations; the outlines' error, px."""
         equations = ChainEquations.empty(len(self.frames), 75, len(self.coefficients) + 1)
         squares = total = 0.0

@@ -10,13 +10,12 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
 from capture.camera import Camera
-from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.kinematics import descendant_matrix, joint_transforms, rotation_matrices
+from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.body.silhouette import SkinPoints, signed_distance_px, splat_silhouette
 
@@ -121,7 +120,7 @@ class OutlineModel:
         """Residuals of a pose before a mask; None where the silhouette cannot be compared.
 
         Args:
-            transforms: The pose, as `world_from_rest` gives it.
+            transforms: World from rest of each joint, for the present proportions.
             mask: Outline of the mask.
         """
         points, normals = self._posed(transforms)
@@ -130,10 +129,6 @@ class OutlineModel:
             return None
         rows = chosen[matched.index]
         return self._linearise(points[rows], rows, transforms, mask.camera, matched)
-
-    def silhouette(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
-        """The pixels that the person covers."""
-        return splat_silhouette(self._posed(self.world_from_rest(pose))[0], camera)
 
     def _posed(
         self, transforms: Float[np.ndarray, "24 4 4"]
@@ -146,15 +141,6 @@ class OutlineModel:
             points += blended[:, :, axis] * self._rest[:, axis, None]
             normals += blended[:, :, axis] * self._normals[:, axis, None]
         return points, normals
-
-    def world_from_rest(self, pose: BodyPose) -> Float[np.ndarray, "24 4 4"]:
-        """Joint transforms of a pose, for the present proportions."""
-        turns = np.concatenate([pose.root_rotation[None], pose.joint_rotations])
-        found = joint_transforms(
-            self.joints, self.space.shaped.body.parents, rotation_matrices(turns)
-        )
-        found[:, :3, 3] += pose.root_translation
-        return found
 
     def _match(
         self,

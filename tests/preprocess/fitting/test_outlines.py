@@ -10,8 +10,9 @@ from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
+from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.fitting.clip_fitting import correct_pose
-from preprocess.fitting.outlines import OutlineDistances, OutlineModel
+from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances, OutlineModel
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEW[2, 3] = 2.6
@@ -38,7 +39,14 @@ def model() -> OutlineModel:
 
 
 def mask_of(model: OutlineModel, pose: BodyPose) -> OutlineDistances:
-    return OutlineDistances.of(model.silhouette(pose, CAMERA).astype(np.float32), CAMERA)
+    skin = SkinPoints.of(model.space.shaped, OUTLINE_SKIN_POINTS)
+    alpha = splat_silhouette(skin.posed(pose), CAMERA).astype(np.float32)
+    return OutlineDistances.of(alpha, CAMERA)
+
+
+def world_from_rest(model: OutlineModel, pose: BodyPose) -> np.ndarray:
+    """The joints' transforms, while the model has the proportions of its space's origin."""
+    return model.space.shaped.with_pose(pose).world_from_rest()
 
 
 def project_rows(model, rows, weights, rest, pose, camera) -> np.ndarray:
@@ -52,7 +60,7 @@ def project_rows(model, rows, weights, rest, pose, camera) -> np.ndarray:
 
 
 def test_a_body_fits_its_own_outline_within_a_pixel(model):
-    seen = model.compare(model.world_from_rest(a_pose()), mask_of(model, a_pose()))
+    seen = model.compare(world_from_rest(model, a_pose()), mask_of(model, a_pose()))
     assert np.abs(np.median(seen.residuals)) < 0.5
     assert np.percentile(np.abs(seen.residuals), 90) < 1.5
 
@@ -62,7 +70,7 @@ def test_a_shift_across_the_view_shows_in_the_residuals(model):
     moved = replace(
         a_pose(), root_translation=a_pose().root_translation + np.array([shift_m, 0.0, 0.0])
     )
-    seen = model.compare(model.world_from_rest(moved), mask)
+    seen = model.compare(world_from_rest(model, moved), mask)
     found = np.linalg.lstsq(
         seen.pose_jacobian[:, 72:73] * seen.weights[:, None],
         seen.residuals * seen.weights,
@@ -94,7 +102,7 @@ def test_the_jacobian_of_a_pose_is_that_of_projected_skin(model, parameter):
 def linearise_at(model, pose, chosen, normals):
     from preprocess.fitting.outlines import _Matches
 
-    transforms = model.world_from_rest(pose)
+    transforms = world_from_rest(model, pose)
     blended = np.einsum("rj,jab->rab", model._weights[chosen], transforms[:, :3])
     points = np.einsum("rab,rb->ra", blended[:, :, :3], model._rest[chosen]) + blended[:, :, 3]
     matches = _Matches(np.arange(len(chosen)), np.zeros(len(chosen)), normals)
