@@ -13,7 +13,6 @@ from export.graph.graph_skinning import (
 )
 from export.graph.onnx_builder import GraphBuilder, GraphValue
 from export.package.player_tables import BRICK_NODES, BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
-from export.package.render_settings import MAX_FOLLOWED_COMPRESSION
 
 VOXEL_STRIDES = (BRICK_NODES * BRICK_NODES, BRICK_NODES, 1)
 """Steps along x, y and z between addresses inside a brick."""
@@ -317,7 +316,7 @@ def composite_samples(
 def _newton_step(
     context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
 ) -> SegmentValues:
-    """Move canonical positions onto their camera rays where these follow the inverse."""
+    """Move canonical positions onto their camera rays where skinning is invertible."""
     graph, settings = context.graph, context.settings
     camera, derivative = skin_points(
         context, posed, locate_skinning_cell(context, segment.start_canonical)
@@ -326,9 +325,7 @@ def _newton_step(
     off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
     shift = inverse.apply(off)
     length = (dot(shift, shift) + 1e-20).sqrt()
-    before, after = (dot(d, d) for d in (segment.direction_canonical, inverse.ray))
-    followed = inverse.trusted & (after < before.maximum(1.0) * MAX_FOLLOWED_COMPRESSION**2)
-    share = graph.where(followed, (settings.max_correction_m / length).minimum(1.0), 0.0)
+    share = graph.where(inverse.trusted, (settings.max_correction_m / length).minimum(1.0), 0.0)
     return SegmentValues(
         direction_camera=segment.direction_camera,
         begin=segment.begin,
@@ -337,7 +334,7 @@ def _newton_step(
             p + s * share for p, s in zip(segment.start_canonical, shift, strict=True)
         ],
         direction_canonical=[
-            graph.where(followed, a, b)
+            graph.where(inverse.trusted, a, b)
             for a, b in zip(inverse.ray, segment.direction_canonical, strict=True)
         ],
     )

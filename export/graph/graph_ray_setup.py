@@ -18,21 +18,15 @@ from export.graph.graph_ray_march import (
     march_segments,
 )
 from export.graph.graph_skinning import (
-    InverseJacobian,
     PosedNodeValues,
     PosedSurfels,
     SkinningCell,
     invert_jacobian,
     skin_points,
 )
-from export.graph.graph_zbuffer import EMPTY_KEY, NUM_AROUND, KeysAround, SplatWindow
+from export.graph.graph_zbuffer import SplatWindow
 from export.graph.onnx_builder import GraphValue
 from export.package.player_tables import SURFEL_MASK
-from export.package.render_settings import (
-    MAX_FOLLOWED_COMPRESSION,
-    MAX_GRAZING_COSINE,
-    NEIGHBOR_REACH_M,
-)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,6 +41,7 @@ class DepthLayer:
         transmittance: In [0, 1].
         enter: Distance at which the ray enters the surface, metres.
         end: Distance at which it ends, metres.
+        doubtful: Whether the surfel is folded or seen from behind.
     """
 
     ray: VectorValue
@@ -57,6 +52,7 @@ class DepthLayer:
     transmittance: GraphValue
     enter: GraphValue
     end: GraphValue
+    doubtful: GraphValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,20 +80,19 @@ def trace_depth_layer(
     surface: PosedProxySurface,
     keys: GraphValue,
     ray: VectorValue,
-    front: "DepthLayer | KeysAround",
+    front: DepthLayer | None,
 ) -> DepthLayer:
     """Trace rays through one depth layer.
 
     Skinning is linearized about the surfel that a ray sees: the inverse Jacobian carries the ray to
-    where it enters the surface. Where the skin is folded, look along its normal at the mean of the
-    surfels about the pixel.
+    where it enters the surface. Where the skin is folded, look along its normal.
 
     Args:
         context: Tables, settings and inputs.
         surface: In its pose.
         keys: Z-buffer key of each ray.
         ray: Unit directions in the camera's frame.
-        front: The layer in front of the same rays; for the first layer the z-buffer about them.
+        front: The layer in front of the same rays; None for the first layer.
     """
     graph, surfel = context.graph, keys.bitwise_and(SURFEL_MASK)
     cells = surface.surfels.cell
@@ -107,25 +102,23 @@ def trace_depth_layer(
     camera, derivative = skin_points(context, surface.posed, cell)
     inverse = invert_jacobian(context, derivative, ray)
     normal = gather_vector(_vector_table(context, "normal"), surfel)
-    followed = _follows_inverse(context, inverse, normal)
-    direction = [graph.where(followed, d, -n) for d, n in zip(inverse.ray, normal, strict=True)]
+    trusted = inverse.trusted
+    direction = [graph.where(trusted, d, -n) for d, n in zip(inverse.ray, normal, strict=True)]
     along = dot(camera, ray)
     beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
-    beside = [graph.where(followed, b, 0.0) for b in beside]
+    beside = [graph.where(trusted, b, 0.0) for b in beside]
     thickness = context.table_values["thickness"].gather(surfel)
     enter, begin, end = _segment_bounds(context, normal, thickness, direction, beside, along)
     canonical = gather_vector(_vector_table(context, "position"), surfel)
-    if isinstance(front, DepthLayer):
+    if front is not None:
         begin = _begin_behind_front_layer(context, front, canonical, camera, begin, end)
-    else:
-        beside = _move_to_mean_of_neighbors(context, front, surfel, followed, beside)
     way = begin - along
     start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
     segment = SegmentValues(
         direction_camera=ray, begin=begin, end=end,
         start_canonical=start, direction_canonical=direction,
     )  # fmt: skip
-    if isinstance(front, DepthLayer):
+    if front is not None:
         color, light = _composite_in_one_block(context, segment)
     else:
         color, light = march_segments(context, surface.posed, segment)
@@ -138,18 +131,8 @@ def trace_depth_layer(
         transmittance=light,
         enter=enter,
         end=end,
+        doubtful=trusted.logical_not() | (dot(normal, direction) > 0.0),
     )
-
-
-def _follows_inverse(
-    context: GraphContext, inverse: InverseJacobian, normal: VectorValue
-) -> GraphValue:
-    """Tell which rays follow the inverse: compressed ones only where they graze the surface."""
-    posed, falling = inverse.apply_transposed(normal), dot(normal, inverse.ray)
-    grazing = falling * falling < dot(posed, posed) * MAX_GRAZING_COSINE**2
-    anything = context.graph.constant(np.float32(1e30))
-    limit = context.graph.where(grazing, anything, MAX_FOLLOWED_COMPRESSION**2)
-    return inverse.trusted & (dot(inverse.ray, inverse.ray) < limit)
 
 
 def _vector_table(context: GraphContext, name: str) -> VectorValue:
@@ -226,30 +209,3 @@ def _begin_behind_front_layer(
     )
     later = begin.maximum(before.end).minimum(end)
     return context.graph.where(one_sheet, later, begin)
-
-
-def _move_to_mean_of_neighbors(
-    context: GraphContext,
-    around: KeysAround,
-    surfel: GraphValue,
-    followed: GraphValue,
-    beside: VectorValue,
-) -> VectorValue:
-    """Move rays that do not follow the inverse to the mean of the surfels about their pixels.
-
-    Surfels farther away than `NEIGHBOR_REACH_M` in canonical space do not count.
-    """
-    graph = context.graph
-    folded = graph.range(graph.size(surfel).cast(np.int32)).compress(followed.logical_not())
-    own = surfel.gather(folded).reshape(1, -1)
-    key = around.keys_of(folded)
-    neighbor = graph.where(key < EMPTY_KEY, key.bitwise_and(SURFEL_MASK), own)
-    own, neighbor = (own + neighbor * 0).reshape(-1), neighbor.reshape(-1)
-    positions = _vector_table(context, "position")
-    apart = [column.gather(neighbor) - column.gather(own) for column in positions]
-    near = (dot(apart, apart) < NEIGHBOR_REACH_M**2).cast(np.float32)
-    times = (near.reshape(NUM_AROUND, -1).reduce_sum(0) + 1.0).reciprocal()
-    return [
-        b.scatter(folded, (part * near).reshape(NUM_AROUND, -1).reduce_sum(0) * times)
-        for b, part in zip(beside, apart, strict=True)
-    ]

@@ -136,11 +136,6 @@ class InverseJacobian:
         """Multiply vectors by the inverse."""
         return _apply_inverse(self.cofactors, self.scale, vector)
 
-    def apply_transposed(self, vector: VectorValue) -> VectorValue:
-        """Multiply vectors by the transpose of the inverse."""
-        scaled = [part * factor for part, factor in zip(vector, self.scale, strict=True)]
-        return [dot(column, scaled) for column in zip(*self.cofactors, strict=True)]
-
 
 def _apply_inverse(cofactors: MatrixValue, scale: VectorValue, vector: VectorValue) -> VectorValue:
     return [dot(row, vector) * factor for row, factor in zip(cofactors, scale, strict=True)]
@@ -170,15 +165,12 @@ class PosedSurfels:
         rows: Rows of the four nodes of each surfel's tetrahedron, the same in all poses.
         normal: Normals per step along the edges of these, the same in all poses.
         camera_positions: Positions in the camera's frame, linear in tetrahedra.
-        folded: Whether the posed tetrahedron has less than `fold_volume_ratio` of its canonical
-            volume, which is negative inside out.
     """
 
     cell: SkinningCell
     rows: list[GraphValue]
     normal: VectorValue
     camera_positions: VectorValue
-    folded: GraphValue
 
 
 def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
@@ -188,18 +180,13 @@ def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
     """
     columns = context.table_values
     place = locate_skinning_cell(context, [columns[f"position_{letter}"] for letter in "xyz"])
-    rows, shares, normal, handed = _surfel_tetrahedra(context, place)
+    rows, shares, normal = _surfel_tetrahedra(context, place)
     corners = [gather_vector(posed.camera_positions, row) for row in rows]
     camera = []
     for axis in range(3):
         parts = [corner[axis] * share for corner, share in zip(corners, shares, strict=True)]
         camera.append(parts[0] + parts[1] + parts[2] + parts[3])
-    edges = _tetrahedron_edges(corners)
-    volume = dot(edges[0], cross(edges[1], edges[2])) * handed
-    least = context.settings.fold_volume_ratio / float(np.prod(skinning_nodes_per_m(context)))
-    return PosedSurfels(
-        cell=place, rows=rows, normal=normal, camera_positions=camera, folded=volume < least
-    )
+    return PosedSurfels(cell=place, rows=rows, normal=normal, camera_positions=camera)
 
 
 def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
@@ -226,12 +213,12 @@ def faces_camera(
 
 def _surfel_tetrahedra(
     context: GraphContext, place: SkinningCell
-) -> tuple[list[GraphValue], list[GraphValue], VectorValue, GraphValue]:
+) -> tuple[list[GraphValue], list[GraphValue], VectorValue]:
     """Find the tetrahedra about surfels, walked as in `BrickTetrahedra`.
 
     Returns:
-        Rows of the four nodes, their weights in a surfel's position, its normal along their edges,
-        and 1 where these edges are right-handed in canonical space, -1 elsewhere.
+        Rows of the four nodes, their weights in a surfel's position, and its normal along their
+        edges.
     """
     graph, (x, y, z) = context.graph, place.fraction
     low, along_y, along_x, along_both = place.rows
@@ -254,10 +241,4 @@ def _surfel_tetrahedra(
     one = graph.where(x_over_y, graph.where(x_over_z, nx, nz), graph.where(y_over_z, ny, nz))
     three = graph.where(x_over_y, graph.where(y_over_z, nz, ny), graph.where(x_over_z, nz, nx))
     normal = [one, (nx + ny + nz) - one - three, three]
-    right, left = (graph.constant(np.float32(sign)) for sign in (1.0, -1.0))
-    handed = graph.where(
-        x_over_y,
-        graph.where(x_over_z, graph.where(y_over_z, right, left), right),
-        graph.where(y_over_z, graph.where(x_over_z, left, right), left),
-    )
-    return [low, first, second, along_both + 1], shares, normal, handed
+    return [low, first, second, along_both + 1], shares, normal

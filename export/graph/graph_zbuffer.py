@@ -11,10 +11,6 @@ from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK
 
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
-AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-"""Rows and columns, in halves of a footprint, from a pixel to the places around it."""
-NUM_AROUND = len(AROUND)
-"""Number of these places."""
 INFINITE_DEPTH_M = 1e6
 """Depth beyond all surfels, metres."""
 
@@ -87,8 +83,7 @@ def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplat
         window=window,
         footprint_px=side,
         cell=graph.where(seen, cell, window.cells.cast(np.int32)),
-        key=_offset_folded(context, _depth_code(context, depth), surfels) * (1 << SURFEL_BITS)
-        + number,
+        key=_depth_code(context, depth) * (1 << SURFEL_BITS) + number,
         depth=depth,
     )
 
@@ -129,16 +124,6 @@ def _depth_code(context: GraphContext, depth: GraphValue) -> GraphValue:
     return steps.clip(0.0, DEPTH_CODES - 1.0).cast(np.int32)
 
 
-def _offset_folded(context: GraphContext, code: GraphValue, surfels: PosedSurfels) -> GraphValue:
-    """Move the depth codes of folded surfels behind those of their neighbors."""
-    settings = context.settings
-    if settings.fold_depth_offset_m == 0.0:
-        return code
-    steps = int(settings.fold_depth_offset_m / (2.0 * context.tables.reach_m) * DEPTH_CODES)
-    behind = (code + steps).minimum(DEPTH_CODES - 1)
-    return context.graph.where(surfels.folded, behind, code)
-
-
 def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
     """Return the edge of every footprint, pixels, an int64 scalar of at least 2.
 
@@ -150,28 +135,8 @@ def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
     return side.clip(2.0, float(settings.max_footprint_px)).cast(np.int64)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class KeysAround:
-    """The z-buffer around some pixels: values of the graph.
-
-    Attributes:
-        buffer: The least key of every cell from the border's first one on, holes not filled.
-        cell: The buffer's cell of each pixel.
-        steps: Cells from a pixel to each of the `NUM_AROUND` places around it, int32.
-    """
-
-    buffer: GraphValue
-    cell: GraphValue
-    steps: GraphValue
-
-    def keys_of(self, number: GraphValue) -> GraphValue:
-        """Return the keys around some of the pixels, one row for each place."""
-        places = self.cell.gather(number).reshape(1, -1) + self.steps.reshape(-1, 1)
-        return self.buffer.gather(places.reshape(-1)).reshape(NUM_AROUND, -1)
-
-
-def nearest_keys(context: GraphContext, splats: SurfelSplats) -> tuple[GraphValue, GraphValue]:
-    """Return the least key of each of the window's pixels, row after row, and the whole buffer.
+def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
+    """Return the least key of each of the window's pixels, row after row.
 
     Where the skin is stretched, surfels lie farther apart than a footprint is wide: a pixel that
     two opposite ones, a footprint away, overtop by far is a hole, and filled.
@@ -194,29 +159,7 @@ def nearest_keys(context: GraphContext, splats: SurfelSplats) -> tuple[GraphValu
     hole = (keys - (steps << SURFEL_BITS)) > neighbors
     keys = context.graph.where(hole, neighbors, keys)
     rows = keys.reshape(-1, window.stride)
-    return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1), buffer
-
-
-def keys_around(
-    context: GraphContext, splats: SurfelSplats, buffer: GraphValue, cell: GraphValue
-) -> KeysAround:
-    """Look around pixels.
-
-    Args:
-        context: Tables, settings and inputs.
-        splats: All surfels.
-        buffer: From `nearest_keys`, holes not filled.
-        cell: Cells of the pixels, as of `depth_limits`.
-    """
-    side, stride = splats.footprint_px, splats.window.stride
-    rows, columns = (
-        context.graph.constant(np.array(steps, dtype=np.int64))
-        for steps in zip(*AROUND, strict=True)
-    )
-    half = side // 2
-    # footprints lie to the lower right of their cells
-    steps = (stride + 1) * (1 - side) + (rows * stride + columns) * half
-    return KeysAround(buffer=buffer, cell=cell, steps=steps.cast(np.int32))
+    return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1)
 
 
 def _scatter_keys(

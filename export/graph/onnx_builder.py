@@ -93,6 +93,10 @@ class GraphValue:
         """Both, of truth values."""
         return self._with("And", other)
 
+    def __or__(self, other: "GraphValue") -> "GraphValue":
+        """Either, of truth values."""
+        return self._with("Or", other)
+
     def logical_not(self) -> "GraphValue":
         """Not, of truth values."""
         return self._with("Not")

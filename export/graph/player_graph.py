@@ -13,13 +13,13 @@ from export.graph.graph_ray_setup import (
     trace_depth_layer,
 )
 from export.graph.graph_skinning import pose_nodes, pose_surfels
+from export.graph.graph_speck_filter import filter_specks
 from export.graph.graph_zbuffer import (
     EMPTY_KEY,
     SplatWindow,
     SurfelSplats,
     depth_limits,
     hidden_splats,
-    keys_around,
     keys_behind_limits,
     nearest_keys,
     project_surfels,
@@ -55,21 +55,21 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
 
 
 def _draw_picture(context: GraphContext) -> GraphValue:
-    """Splat, trace all layers, pack."""
+    """Splat, trace all layers, filter specks, pack."""
     graph = context.graph
     posed = pose_nodes(context)
     surface = PosedProxySurface(surfels=pose_surfels(context, posed), posed=posed)
     splats = project_surfels(context, surface.surfels)
     window = splats.window
-    keys, buffer = nearest_keys(context, splats)
+    keys = nearest_keys(context, splats)
     covered = keys < EMPTY_KEY
     pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
     ray = pixel_rays(context.camera, window, pixel)
-    around = keys_around(context, splats, buffer, _window_cells(window, pixel))
-    first = trace_depth_layer(context, surface, keys.gather(pixel), ray, around)
+    first = trace_depth_layer(context, surface, keys.gather(pixel), ray, None)
     channels = [*first.color, first.transmittance]
     if context.settings.layers > 1:
         channels = _add_further_layers(context, surface, splats, pixel, first)
+    channels = filter_specks(context, splats, _window_cells(window, pixel), first, channels)
     return _pack_rgba(context, window, pixel, channels)
 
 
@@ -118,6 +118,7 @@ def _add_further_layers(
             transmittance=before.transmittance.gather(kept),
             enter=before.enter,
             end=before.end.gather(kept),
+            doubtful=before.doubtful,
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         color = [

@@ -14,7 +14,7 @@ from export.package.render_settings import RenderSettings
 from export.package.table_codec import TableLayout
 from preprocess.body.body_pose import BodyPose
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Version of the package format; readers refuse all others."""
 MAX_GOLDEN_PX = 128
 """Longest side of a golden frame, pixels."""

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, replace
 
-MAX_FOLLOWED_COMPRESSION = 3.0
-"""Canonical metres per metre along a ray above which inverse skinning is not followed: a footprint
-would span centimetres of cloth, over which skinning is far from linear."""
-MAX_GRAZING_COSINE = 0.7
-"""Cosine between ray and posed normal below which it is followed all the same, to the outline."""
-NEIGHBOR_REACH_M = 0.03
-"""Canonical distance up to which neighbors of a surfel belong to the same patch of skin, metres."""
+MIN_FOOTPRINT_PX = 3
+"""Edge of a surfel's footprint below which specks are kept: pixels are as coarse as they are, and
+the texture is, too."""
+MIN_MEDIAN_ALPHA = 0.9
+"""Least alpha of the median about a pixel that counts as the inside of the avatar."""
+MAX_MEDIAN_DIFFERENCE = 0.15
+"""Difference of any channel from that median, in [0, 1], above which the pixel is a speck."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,15 +69,8 @@ class RenderSettings:
 
     # Folded skin
     max_volume_ratio: float = 10.0
-    """Where the Jacobian's determinant is outside (1 / ratio, ratio), or canonical space is
-    compressed by more than `MAX_FOLLOWED_COMPRESSION` along a ray that does not graze the surface,
-    do not invert it: look along the surfel's normal at the mean of the surfels about the pixel, and
-    leave the path uncorrected."""
-    fold_volume_ratio: float = 0.3
-    """Posed over canonical volume below which a surfel counts as folded; negative is inside out."""
-    fold_depth_offset_m: float = 0.0
-    """Put folded surfels this much deeper into the z-buffer, metres, so that a neighbor with a
-    better conditioned inverse is drawn instead; 0 disables it."""
+    """Where the Jacobian's determinant is outside (1 / ratio, ratio), do not invert it: look along
+    the surfel's normal, and leave the path uncorrected."""
 
     # Layers after the first
     layer_gap_m: float = 0.01
@@ -97,9 +90,7 @@ class RenderSettings:
     """Least transmittance for which a further layer is drawn."""
 
 
-HQ_SETTINGS = RenderSettings(
-    layers=3, other_sheet_gap_m=-0.015, max_compression=1.0, fold_depth_offset_m=0.02
-)
+HQ_SETTINGS = RenderSettings(layers=3, other_sheet_gap_m=-0.015, max_compression=1.0)
 """Settings of the tier that every package has."""
 QUALITY_TIERS = {
     "hq": HQ_SETTINGS,

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from export.package.graph_tables import skinning_nodes
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables, SurfelTable
+from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables
 from export.package.render_settings import (
-    MAX_FOLLOWED_COMPRESSION,
-    MAX_GRAZING_COSINE,
-    NEIGHBOR_REACH_M,
+    MAX_MEDIAN_DIFFERENCE,
+    MIN_FOOTPRINT_PX,
+    MIN_MEDIAN_ALPHA,
     RenderSettings,
 )
 from export.reference.compositor import VoxelCodes, composite_segments
@@ -35,7 +35,6 @@ from export.reference.reference_zbuffer import (
     EMPTY_PIXEL_KEY,
     SurfelFootprints,
     fill_holes,
-    keys_around,
     surfel_of_key,
     z_buffer,
 )
@@ -65,10 +64,16 @@ class TracedPicture(NamedTuple):
     Attributes:
         pixel: Numbers of the covered pixels, ascending.
         segments: Their rays, through all layers.
+        doubtful: Whether the surfel that the pixel sees is folded or seen from behind.
+        passed: Whether light passes the first layer, so that others are looked for.
+        footprint_px: Edge of a surfel's footprint.
     """
 
     pixel: Int64[np.ndarray, "pixels"]
     segments: RaySegments
+    doubtful: Bool[np.ndarray, "pixels"]
+    passed: Bool[np.ndarray, "pixels"]
+    footprint_px: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,13 +84,11 @@ class _PosedSurface:
         nodes: Posed nodes of the skinning grid.
         positions: Surfels in the camera's frame, metres.
         facing: Canonical ray to each surfel times its normal; negative where it faces the camera.
-        volume: Posed over canonical volume, negative where it is inside out.
     """
 
     nodes: PosedNodes
     positions: Float32[np.ndarray, "surfels 3"]
     facing: Float32[np.ndarray, "surfels"]
-    volume: Float32[np.ndarray, "surfels"]
 
 
 @dataclass(eq=False, kw_only=True)
@@ -123,7 +126,29 @@ def draw_reference(
     traced = trace_picture(tables, codes, settings, inputs)
     picture = np.zeros((width * height, 4), dtype=np.float32)
     picture[traced.pixel] = composite_segments(traced.segments, settings, tables.bricks, codes)
-    return picture.reshape(height, width, 4)
+    return filter_specks(picture.reshape(height, width, 4), traced)
+
+
+def filter_specks(
+    picture: Float32[np.ndarray, "height width 4"], traced: TracedPicture
+) -> Float32[np.ndarray, "height width 4"]:
+    """Take the median of nine pixels, half a footprint apart, where the picture is unreliable.
+
+    It replaces doubtful pixels, and those inside of the avatar whose ray passed the first layer and
+    that differ from it: specks where sheets of skin cross.
+    """
+    half = traced.footprint_px // 2
+    filtered, pixel = picture.reshape(-1, 4).copy(), traced.pixel
+    bordered = np.pad(picture, ((half, half), (half, half), (0, 0)))
+    row, column = np.divmod(pixel, picture.shape[1])
+    steps = [(i * half, j * half) for i in range(3) for j in range(3)]
+    median = np.median([bordered[row + i, column + j] for i, j in steps], axis=0)
+    inside = median[:, 3] > MIN_MEDIAN_ALPHA
+    differs = np.abs(median - filtered[pixel]).max(axis=1) > MAX_MEDIAN_DIFFERENCE
+    speck = traced.passed & inside & differs & (traced.footprint_px >= MIN_FOOTPRINT_PX)
+    chosen = traced.doubtful | speck
+    filtered[pixel[chosen]] = median[chosen]
+    return filtered.reshape(picture.shape)
 
 
 def trace_picture(
@@ -143,8 +168,7 @@ def trace_picture(
     filled = fill_holes(buffer, tables, settings, splats.side).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
-    keys = np.column_stack([key, keys_around(inputs.size_px, buffer, splats.side, covered)])
-    rays, depth = _ray_entries(tables, settings, inputs, posed, covered, keys, None)
+    rays, depth, doubtful = _ray_entries(tables, settings, inputs, posed, covered, key, None)
     segments = RaySegments.of_first_layer(
         rays, posed.nodes, tables.bricks, settings, inputs.samples
     )
@@ -152,14 +176,15 @@ def trace_picture(
     front = _FrontLayer(
         transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=surfel_of_key(key)
     )
+    passed = front.transmittance > settings.layer_min_transmittance
     alive = np.arange(len(covered))
     for layer in range(1, settings.layers):
         alive = alive[front.transmittance[alive] > settings.layer_min_transmittance]
         key = _keys_behind(tables, settings, inputs, posed, splats, covered[alive], front.of(alive))
         key = key[covered]
         alive = np.flatnonzero(key < EMPTY_PIXEL_KEY)
-        rays, depth = _ray_entries(
-            tables, settings, inputs, posed, covered[alive], key[alive, None], front.of(alive)
+        rays, depth, _ = _ray_entries(
+            tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive)
         )
         behind = RaySegments.of_further_layer(
             rays, alive, len(covered), tables.bricks, (settings.further_layer_samples, layer)
@@ -169,7 +194,7 @@ def trace_picture(
         front.depth[alive], front.end[alive] = depth, rays.end
         front.surfel[alive] = surfel_of_key(key[alive])
         segments = segments.append_layer(behind)
-    return TracedPicture(covered, segments)
+    return TracedPicture(covered, segments, doubtful, passed, splats.side)
 
 
 def _keys_behind(
@@ -229,31 +254,7 @@ def _pose_surface(
         nodes=there,
         positions=splatted,
         facing=np.where(flat, 0.0, facing).astype(np.float32),
-        volume=volume,
     )
-
-
-def _inverse_skinning(
-    settings: RenderSettings,
-    posed: _PosedSurface,
-    points: Float32[np.ndarray, "points 3"],
-    ray: Float32[np.ndarray, "points 3"],
-    normal: Float32[np.ndarray, "points 3"],
-) -> tuple[
-    Float32[np.ndarray, "points 3"],
-    Float32[np.ndarray, "points 3 3"],
-    Bool[np.ndarray, "points"],
-]:
-    """Return positions in the camera's frame, the inverse Jacobian, and where rays follow it."""
-    camera, derivative = skin_trilinear(posed.nodes, points)
-    inverse, sound = invert_jacobians(settings, derivative)
-    direction = np.einsum("nij,nj->ni", inverse, ray)
-    upward = np.einsum("nij,ni->nj", inverse, normal)
-    grazing = (normal * direction).sum(axis=1) ** 2 < MAX_GRAZING_COSINE**2 * (upward**2).sum(
-        axis=1
-    )
-    near = (direction**2).sum(axis=1) < MAX_FOLLOWED_COMPRESSION**2
-    return camera, inverse, sound & (near | grazing)
 
 
 def _project_surfels(
@@ -292,9 +293,6 @@ def _splat_surfels(
     near = inputs.bones[0, 2, :3] @ tables.pelvis + inputs.bones[0, 2, 3] - tables.reach_m
     code = (depth - near) / (2.0 * tables.reach_m) * (DEPTH_CODES - 1)
     code = np.clip(code, 0, DEPTH_CODES - 1).astype(np.int64)
-    steps = int(settings.fold_depth_offset_m / (2.0 * tables.reach_m) * DEPTH_CODES)
-    folded = posed.volume[surfel] < settings.fold_volume_ratio
-    code = np.where(folded, np.minimum(code + steps, DEPTH_CODES - 1), code)
     key = (code << SURFEL_BITS) | surfel
     deep_enough = np.where(faces, depth, np.float32(0.0))
 
@@ -314,30 +312,27 @@ def _ray_entries(
     inputs: PlayerInputs,
     posed: _PosedSurface,
     pixel: Int64[np.ndarray, "pixels"],
-    keys: Int64[np.ndarray, "pixels _"],
+    key: Int64[np.ndarray, "pixels"],
     front: _FrontLayer | None,
-) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"]]:
-    """Return the canonical rays of covered pixels, and the depths at which they enter.
-
-    The first key is a pixel's own, the others lie around it.
-    """
-    surfels, surfel = tables.surfels, surfel_of_key(keys[:, 0])
+) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"], Bool[np.ndarray, "pixels"]]:
+    """Return canonical rays of covered pixels, where they enter (depth), and which are doubtful."""
+    surfels, surfel = tables.surfels, surfel_of_key(key)
     row, column = np.divmod(pixel, inputs.size_px[0])
     plane = (np.stack([column, row], axis=1) + 0.5 - inputs.center) / inputs.focal
     ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     ray = (ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32)
 
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
-    camera, inverse, sound = _inverse_skinning(
-        settings, posed, surfels.positions[surfel], ray, normal
-    )
+    camera, derivative = skin_trilinear(posed.nodes, surfels.positions[surfel])
+    inverse, sound = invert_jacobians(settings, derivative)
     along = (camera * ray).sum(axis=1)
-    # where the skin is folded, look along its normal at the mean of the surfels about the pixel
+    # where the skin is folded, look along its normal
     direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
     nearest = ray * along[:, None] - camera
     beside = np.einsum("nij,nj->ni", inverse, nearest)  # from the surfel to the ray
     beside = np.where(sound[:, None], beside, np.float32(0.0))
     falling = (normal * direction).sum(axis=1)
+    doubtful = ~sound | (falling > 0.0)
     shallow = np.float32(-0.5 * settings.min_cosine)
     hit = -(normal * beside).sum(axis=1) / np.minimum(falling, shallow)
     hit = np.where(falling < shallow, hit, 0.0)
@@ -359,21 +354,6 @@ def _ray_entries(
         one_sheet = apart < in_camera * settings.same_sheet_ratio + settings.same_sheet_m
         later = np.minimum(np.maximum(begin, front.end), end)
         begin = np.where(one_sheet, later, begin)
-    beside[~sound] = _mean_of_neighbors(surfels, keys[~sound])
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = CanonicalRays(*(part.astype(np.float32) for part in (ray, begin, end, start, direction)))
-    return rays, (enter * ray[:, 2]).astype(np.float32)
-
-
-def _mean_of_neighbors(
-    surfels: SurfelTable, keys: Int64[np.ndarray, "pixels keys"]
-) -> Float32[np.ndarray, "pixels 3"]:
-    """Return where the mean of surfels lies in canonical space as seen from the first of them.
-
-    Surfels farther away than `NEIGHBOR_REACH_M` belong to another patch and do not count.
-    """
-    surfel = surfel_of_key(np.where(keys < EMPTY_PIXEL_KEY, keys, keys[:, :1]))
-    apart = surfels.positions[surfel] - surfels.positions[surfel[:, :1]]
-    near = (apart**2).sum(axis=2) < NEIGHBOR_REACH_M**2
-    total = (apart * near[..., None]).sum(axis=1)
-    return (total / near.sum(axis=1, keepdims=True)).astype(np.float32)
+    return rays, (enter * ray[:, 2]).astype(np.float32), doubtful

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from export.package.graph_tables import SkinningNodes
-from export.package.render_settings import MAX_FOLLOWED_COMPRESSION, RenderSettings
+from export.package.render_settings import RenderSettings
 
 
 class PosedNodes(NamedTuple):
@@ -132,8 +132,6 @@ def newton_correction(
     camera, jacobian = skin_trilinear(posed, rays.start_canonical)
     inverse, sound = invert_jacobians(settings, jacobian)
     turned = np.einsum("nij,nj->ni", inverse, rays.direction_camera)
-    before, after = ((d**2).sum(axis=1) for d in (rays.direction_canonical, turned))
-    sound &= after < np.maximum(before, 1.0) * MAX_FOLLOWED_COMPRESSION**2
     inverse = inverse[sound]
     off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
     shift = np.einsum("nij,nj->ni", inverse, off)

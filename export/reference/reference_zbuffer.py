@@ -59,16 +59,3 @@ def fill_holes(
     neighbors, keys = np.minimum(across, along), keys[here, here]
     steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
     return np.where(keys - (steps << SURFEL_BITS) > neighbors, neighbors, keys)
-
-
-def keys_around(
-    size_px: tuple[int, int],
-    buffer: Int64[np.ndarray, "rows columns"],
-    side: int,
-    pixel: Int64[np.ndarray, "pixels"],
-) -> Int64[np.ndarray, "pixels 8"]:
-    """Return the keys half a footprint to the sides of pixels and at the four corners."""
-    row, column = np.divmod(pixel[:, None], size_px[0])
-    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    down, right = np.array(steps).T * (side // 2) + side
-    return buffer[row + down, column + right]

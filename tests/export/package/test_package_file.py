@@ -159,7 +159,7 @@ def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported,
     ("change", "message"),
     [
         ({"format": 3}, "format 3.*Export the avatar again"),
-        ({"format": 5}, "x.iavatar: .*format 5.*Update instant-avatar-stream"),
+        ({"format": 6}, "x.iavatar: .*format 6.*Update instant-avatar-stream"),
         ({"tiers": {"hq": {}}}, "x.iavatar: .*damaged: it has no 'layout'"),
         ({"rest_joints": [[0.0]]}, "damaged"),
         ({"rest_joints": [[float("nan")] * 3] * 24}, "damaged"),
