@@ -18,7 +18,13 @@ from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
 from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
-from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.clip_fitting import (
+    SIGMA_LOG_ASSUMED_FOCAL,
+    SIGMA_LOG_FOCAL,
+    ClipFitter,
+    ClipFrame,
+    FitParameters,
+)
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.observe import associate_cameras
 
@@ -36,8 +42,6 @@ KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = (4, 5)
 """Fewest and most iterations with outlines after that."""
-SIGMA_LOG_ASSUMED_FOCAL = 0.3
-"""Prior standard deviation of the logarithm of a focal length that is merely assumed."""
 PROPORTION_ITERATIONS = 4
 """Iterations that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01

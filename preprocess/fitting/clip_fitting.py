@@ -32,6 +32,8 @@ FRAMES_PER_PRIOR = 10.0
 """Frames of one person that count as one for the proportions: their clothes err alike."""
 SIGMA_LOG_FOCAL = 0.08
 """Prior standard deviation of the logarithm of a stated focal length."""
+SIGMA_LOG_ASSUMED_FOCAL = 0.3
+"""The same of one that is merely assumed, in a recording or in the first frames of a stream."""
 MAX_TURN_STEP_RAD = 0.25
 """Largest change of a rotation's component in one iteration, radians."""
 MAX_PLACE_STEP_M = 0.5

@@ -18,7 +18,12 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.clip_fitting import (
+    SIGMA_LOG_ASSUMED_FOCAL,
+    ClipFitter,
+    ClipFrame,
+    FitParameters,
+)
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
 from preprocess.observe import shrink_to_longer_side
 from preprocess.tracking.keypoint_track import KeypointTrack
@@ -29,8 +34,6 @@ WINDOW_FRAMES = 10
 """Frames whose poses are fitted together while a stream runs."""
 LAG_FRAMES = 4
 """Later frames that a frame's pose waits for: without any, poses jitter three times as much."""
-SIGMA_LOG_ASSUMED_FOCAL = 0.2
-"""Prior standard deviation of the logarithm of an assumed focal length."""
 FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
 FRAME_ITERATIONS = (1, 1)
