@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
 from urllib.parse import quote
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from apps.batching.batch_folder import AttemptRecord, BatchFolder
 from apps.batching.ingest_attempt import LOG_NAME, TURNING_NAME, folder_of
 from apps.batching.live_table import CaptureState
+from apps.report.html_page import html_page, html_table
 from apps.report.report_schema import format_psnr
 from capture.input_error import InputError
 
@@ -197,17 +197,13 @@ def summary_csv(summary: BatchSummary) -> str:
 
 def summary_page(summary: BatchSummary, title: str) -> str:
     """Return the page; its pictures lie beside it, in the folders of the captures."""
-    style = (files("apps") / "report" / "page.css").read_text(encoding="utf-8") + STYLE
     cards = "\n".join(_card(state, place) for place, state in enumerate(summary.states))
     verdicts = {str(record.figures.get("verdict")) for record in summary.done()}
     options = "".join(
         f"<option>{escape(value)}</option>"
         for value in [*reversed(STATUS_ORDER), *sorted(verdicts - {"None", "failed"})]
     )
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}: avatars</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
+    body = (
         f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(summary.headline())}</p>\n'
         f'<div class="card">{_tails_table(summary)}</div>\n'
         '<p class="filters"><input id="words" type="search" placeholder="name or cause">'
@@ -217,8 +213,9 @@ def summary_page(summary: BatchSummary, title: str) -> str:
         '<option value="name">by name</option></select><span id="shown"></span></p>\n'
         f"<main>\n{cards}\n</main>\n<footer>Written by ia-batch of instant-avatar-stream. The same "
         f"as a table: summary.csv; every attempt: results.jsonl.</footer>\n"
-        f"<script>{SCRIPT}</script>\n</body>\n</html>\n"
+        f"<script>{SCRIPT}</script>"
     )
+    return html_page(f"{title}: avatars", body, style=STYLE)
 
 
 def _tails_table(summary: BatchSummary) -> str:
@@ -232,15 +229,13 @@ def _tails_table(summary: BatchSummary) -> str:
         ("peak memory, MB", [r.peak_memory_mb for r in done], ".0f"),
         ("package, MB", package_mb, ".2f"),
     )
-    heads = "".join(f"<th>{percent} %</th>" for percent in PERCENTILES)
-    rows = ""
-    for name, values, digits in quantities:
-        if values:
-            cells = "".join(
-                f"<td>{each:{digits}}</td>" for each in np.percentile(values, PERCENTILES)
-            )
-            rows += f"<tr><td>{name}</td>{cells}</tr>"
-    return f"<table><tr><th>percentiles over the avatars</th>{heads}</tr>{rows}</table>"
+    lines = [
+        [name, *(f"{each:{digits}}" for each in np.percentile(values, PERCENTILES))]
+        for name, values, digits in quantities
+        if values
+    ]
+    heads = [f"{percent} %" for percent in PERCENTILES]
+    return html_table([["percentiles over the avatars", *heads], *lines])
 
 
 def _card(state: CaptureState, place: int) -> str:

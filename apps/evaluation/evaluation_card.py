@@ -17,7 +17,7 @@ from apps.evaluation.score_table import (
 )
 from apps.evaluation.shown_frames import LARGEST_SHOWN_ERROR, choose_shown
 from apps.report.hardware import Hardware
-from apps.report.html_page import html_page, html_section, html_table
+from apps.report.html_page import html_note, html_page, html_section, html_table
 from apps.report.learning_curve import CurvePoint, curve_svg, psnr_at
 from apps.report.report_schema import format_psnr
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
@@ -97,14 +97,11 @@ def card_markdown(evaluations: Sequence[AvatarEvaluation], conditions: dict[str,
 
 def card_page(evaluations: Sequence[AvatarEvaluation], conditions: dict[str, str]) -> str:
     """Return the card as a self-contained page."""
-    listed = "".join(
-        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
-        for name, value in conditions.items()
-    )
-    sections = [html_section("Conditions", f'<div class="card"><table>{listed}</table></div>')]
+    listed = html_table(list(conditions.items()), header=False)
+    sections = [html_section("Conditions", f'<div class="card">{listed}</div>')]
     for heading, table, note in _tables(evaluations):
-        under = f'<p class="legend">{escape(note)}</p>' if note else ""
-        sections.append(html_section(heading, html_table(table) + under))
+        shown = f'<div class="card scores">{html_table(table)}</div>{html_note(note)}'
+        sections.append(html_section(heading, shown))
         if heading == "Quality by time":
             sections += [_curve(each) for each in evaluations]
     sections += [_pictures(each) for each in evaluations] + [_dances(each) for each in evaluations]
@@ -234,10 +231,9 @@ def _pictures(evaluation: AvatarEvaluation) -> str:
         for shown in choose_shown(evaluation.shown)
     )
     heading = f"Truth, avatar, error: {escape(evaluation.name)}"
-    note = (
-        '<p class="legend">From the worst to the best frame in the mask, at the resolution of the '
-        "scores where the page is wide enough. Error: mean over RGB, brightest from "
-        f"{LARGEST_SHOWN_ERROR:.2f} of 1.</p>"
+    note = html_note(
+        "From the worst to the best frame in the mask, at the resolution of the scores where the "
+        f"page is wide enough. Error: mean over RGB, brightest from {LARGEST_SHOWN_ERROR:.2f} of 1."
     )
     return html_section(heading, f'<div class="shown">{figures}</div>{note}' if figures else "")
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from apps.evaluation.frame_scoring import BACKGROUNDS, FrameScore, PremultipliedImage
-from apps.report.webp import to_uint8, webp_data_uri
+from apps.report.html_page import to_uint8, webp_data_uri
 from avatar.evaluation.image_metrics import composite_over, ground_truth_over, silhouette_of
 from preprocess.observation import Observation
 

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from html import escape
 from typing import Any
 
-from apps.report.html_page import html_page, html_section
+from apps.report.html_page import html_note, html_page, html_section, html_table
 from apps.report.learning_curve import CurvePoint, curve_svg, largest_drops
 from apps.report.report_schema import Report, format_percent, format_psnr
 
@@ -111,7 +111,7 @@ def _earlier_videos(report: Report) -> str:
             f"before this video, {earlier.psnr_after:.2f} dB now (largest drop "
             f"{earlier.largest_drop:.2f} dB)."
         )
-    return f'<p class="legend">{escape(text)}</p>'
+    return html_note(text)
 
 
 def _tiles(report: Report) -> str:
@@ -192,7 +192,7 @@ def _cameras(report: Report, present: Collection[str]) -> str:
         )
         if {"cameras.npz", "poses.npz"} <= set(present):
             text += " cameras.npz and poses.npz hold the cameras and the poses in their world."
-    return f'<p class="legend">{escape(text)}</p>'
+    return html_note(text)
 
 
 def _tracking(report: Report) -> str:
@@ -200,14 +200,11 @@ def _tracking(report: Report) -> str:
     found = report.tracking
     if found is None:
         return ""
-    rows = "".join(
-        f"<tr><td>{each['start_s']:.1f} to {each['end_s']:.1f} s</td>"
-        f"<td>{escape(each['reason'])}</td></tr>"
+    lines = [
+        (f"{each['start_s']:.1f} to {each['end_s']:.1f} s", each["reason"])
         for each in found["doubtful"]
-    )
-    return f'<p class="legend">{escape(found["summary"])}</p>' + (
-        f"<table><tr><th>doubtful</th><th>why</th></tr>{rows}</table>" if rows else ""
-    )
+    ]
+    return html_note(found["summary"]) + html_table([("doubtful", "why"), *lines])
 
 
 def _coverage(report: Report, body_map: str) -> str:
@@ -215,18 +212,17 @@ def _coverage(report: Report, body_map: str) -> str:
     note = report.coverage
     if note is None:
         return ""
-    rows = "".join(
-        f"<tr><td>{escape(part)}</td><td>{format_percent(shares['seen'])}</td>"
-        f"<td>{_by_side(shares)}</td></tr>"
+    lines = [
+        (part, format_percent(shares["seen"]), _by_side(shares))
         for part, shares in note.parts.items()
-    )
+    ]
     return (
         f'<div class="card"><p class="advice">{escape(note.advice)}</p>{body_map}'
         f'<p class="legend">{format_percent(note.seen)} of the skin seen'
         '<i style="background:var(--whole)"></i>frontal'
         '<i style="background:var(--whole);opacity:0.4"></i>grazing'
         '<i style="background:var(--masked)"></i>unseen. Left and right are the person\'s.</p>'
-        f"<details><summary>By body part</summary><table>{rows}</table></details></div>"
+        f"<details><summary>By body part</summary>{html_table(lines, header=False)}</details></div>"
     )
 
 
@@ -244,7 +240,7 @@ def _pairs(pairs: Sequence[ComparisonPair]) -> str:
         f"{escape(format_psnr(pair.psnr, pair.verdict))}</figcaption></figure>"
         for pair in pairs
     )
-    told = '<p class="legend">Click a pair to enlarge it, and beside it to go back.</p>'
+    told = html_note("Click a pair to enlarge it, and beside it to go back.")
     return f'<div class="pairs">{"".join(figures)}</div>{told}' if pairs else ""
 
 
@@ -271,18 +267,14 @@ def _warnings(report: Report, warnings: Sequence[str]) -> str:
 def _all_values(report: Report) -> str:
     content = asdict(report)
     shown = ("frames", "training", "held_out", "stream", "package", "machine")
-    tables = [f'<div class="card"><table>{_rows({key: content[key] for key in shown})}</table>']
+    parts = [_values({key: content[key] for key in shown})]
     for key, heading in (("recipe", "Configuration"), ("command", "Command")):
-        rows = _rows(content[key])
-        tables.append(f"<details><summary>{heading}</summary><table>{rows}</table></details>")
-    return "".join(tables) + "</div>"
+        parts.append(f"<details><summary>{heading}</summary>{_values(content[key])}</details>")
+    return f'<div class="card">{"".join(parts)}</div>'
 
 
-def _rows(content: Mapping[str, Any]) -> str:
-    return "".join(
-        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>"
-        for name, value in _flatten(content)
-    )
+def _values(content: Mapping[str, Any]) -> str:
+    return html_table(list(_flatten(content)), header=False)
 
 
 def _flatten(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:

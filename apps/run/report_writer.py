@@ -22,7 +22,7 @@ from apps.report.report_schema import (
     TrainingStats,
     format_psnr,
 )
-from apps.report.webp import animated_webp_data_uri, to_uint8, webp_data_uri
+from apps.report.html_page import animated_webp_data_uri, to_uint8, webp_data_uri
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
