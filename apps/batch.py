@@ -5,14 +5,14 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from apps.batching.batch_folder import BatchFolder
 from apps.batching.batch_scheduler import FIRST_NEED_MB, BatchLimits, BatchScheduler, plan_captures
@@ -24,6 +24,7 @@ from apps.batching.node_resources import LOCK_NAME, usable_cores
 from apps.batching.ray_executor import RAY_LOCAL, RayExecutor
 from apps.batching.remote_files import RemoteFileError, is_url
 from apps.batching.summary_page import BatchSummary, CorePrice, write_summary
+from apps.cli.capture_options import Flag
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console, StderrConsole
 from apps.cli.exit_codes import (
@@ -34,7 +35,7 @@ from apps.cli.exit_codes import (
     CommandExit,
     run_command,
 )
-from apps.cli.interrupt import stop_on_interrupt
+from apps.cli.interrupt import handle_signals, stop_on_interrupt
 from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file, check_writable
 from apps.run.ingest_arguments import IngestArguments
 from capture.input_error import InputError
@@ -42,7 +43,6 @@ from capture.input_error import InputError
 PROGRAM = "ia-batch"
 DEFAULT_CORES = 2
 """Cores per capture; the figures of the README are for two."""
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,13 +253,16 @@ def _learn(
     folder: BatchFolder,
     rich: StderrConsole,
 ) -> tuple[list[CaptureState], bool]:
-    """Learn what waits; return the states afterwards, and whether it was stopped."""
+    """Learn what waits; return the states afterwards, and whether it was stopped.
+
+    SIGTERM stops at once: Slurm and Kubernetes grant a few seconds only.
+    """
     limits, kill = arguments.limits(), threading.Event()
     executor = _open_executor(arguments, limits.job)
     with (
         closing(executor),
         stop_on_interrupt(Console(rich), "captures that run are finished first") as stop,
-        _kill_on_termination(stop, kill),
+        handle_signals({signal.SIGTERM: lambda *_: (stop.set(), kill.set())}),
         LiveTable(rich) as table,
     ):
         scheduler = BatchScheduler(states, folder, executor, limits, table)
@@ -277,21 +280,6 @@ def _open_executor(arguments: BatchArguments, job: IngestJob) -> AttemptExecutor
     if arguments.ray is None:
         return LocalExecutor()
     return RayExecutor(arguments.ray, replace(job, memory_mb=job.limit_mb or FIRST_NEED_MB))
-
-
-@contextmanager
-def _kill_on_termination(stop: threading.Event, kill: threading.Event) -> Iterator[None]:
-    """Stop at once on SIGTERM: Slurm and Kubernetes grant a few seconds only."""
-
-    def leave(signal_number: int, frame: object) -> None:
-        stop.set()
-        kill.set()
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _sum_up(

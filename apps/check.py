@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import arg
 
 from apps.checks.capture_validation import (
     GOOD_EDGE_RATIO,
@@ -19,7 +19,7 @@ from apps.checks.capture_validation import (
 from apps.checks.contact_sheet import write_contact_sheet
 from apps.checks.corrected_capture import check_new_or_empty, write_corrected_capture
 from apps.checks.preflight_check import check_command
-from apps.cli.capture_options import mask_inversion, parse_frame_range
+from apps.cli.capture_options import CaptureArguments, Flag, capture_name
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import BAD_INPUT, DONE, run_command
@@ -39,11 +39,9 @@ from preprocess.capture_session import CaptureInputs
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """Formats of the contact sheet that --sheet names."""
 
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
-
 
 @dataclass(frozen=True, kw_only=True)
-class CheckArguments:
+class CheckArguments(CaptureArguments):
     """Diagnose a capture in seconds and suggest corrections. Nothing is trained.
 
     The body is projected with the given poses and camera and compared with the masks. If they
@@ -67,24 +65,6 @@ class CheckArguments:
     unreadable; 3 disk full; 130 Ctrl-C.
     """
 
-    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
-    """Video file, folder of images, or capture folder."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """SMPL poses, as ia-ingest takes them; without them the person is tracked, as by ia-track."""
-    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Masks, as ia-ingest takes them."""
-    mask_invert: Flag = False
-    """Masks are dark where the person is (default: detected automatically)."""
-    no_mask_invert: Flag = False
-    """Masks are bright where the person is (default: detected automatically)."""
-    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Cameras, as ia-ingest takes them."""
-    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Your own SMPL body (default: the embedded body)."""
-    frames: str = "::"
-    """Frames to use: START:STOP:STEP, counted from 0."""
-    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
-    """Person ID in the pose file (default: the longest track)."""
     fix: Annotated[Path | None, arg(metavar="OUT", help_behavior_hint="")] = None
     """Write a corrected copy of the capture to this folder."""
     sheet: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
@@ -102,18 +82,7 @@ class CheckArguments:
         """
         if camera_address(self.video) is not None:
             raise InputError(f"{self.video} is a camera, but ia-check needs a recording.")
-        return CaptureInputs(
-            video=self.video,
-            poses=self.poses,
-            masks=self.masks,
-            cameras=self.cameras,
-            body=self.body,
-            frames=parse_frame_range(self.frames),
-            invert_masks=mask_inversion(
-                person_dark=self.mask_invert, person_bright=self.no_mask_invert
-            ),
-            person=self.person,
-        )
+        return super().capture_inputs()
 
     def check_outputs(self) -> None:
         """Check that the outputs can be written.
@@ -135,9 +104,7 @@ class CheckArguments:
 
     def sheet_path(self) -> Path:
         """Return the path of the contact sheet."""
-        name = self.video.resolve()
-        own = name.name if name.is_dir() else name.stem
-        return self.sheet or Path("runs") / f"{own}-check.png"
+        return self.sheet or Path("runs") / f"{capture_name(self.video)}-check.png"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

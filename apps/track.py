@@ -11,9 +11,15 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from apps.cli.capture_options import format_frame_range, parse_frame_range
+from apps.cli.capture_options import (
+    Flag,
+    capture_name,
+    format_frame_range,
+    option_words,
+    parse_frame_range,
+)
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
@@ -32,7 +38,6 @@ from preprocess.capture_session import CaptureInputs
 PROGRAM = "ia-track"
 NOT_GOOD_ENOUGH = 1
 """Exit code of poses that were written, but are not good enough for an avatar."""
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +91,7 @@ class TrackArguments:
 
     def poses_path(self) -> Path:
         """Return the path of the poses."""
-        name = self.video.resolve()
-        own = name.name if name.is_dir() else name.stem
-        return self.out or Path("runs") / f"{own}-tracked" / "poses.npz"
+        return self.out or Path("runs") / f"{capture_name(self.video)}-tracked" / "poses.npz"
 
     def capture_inputs(self) -> CaptureInputs:
         """Return the inputs to open.
@@ -173,10 +176,11 @@ def _is_written_by_track(path: Path) -> bool:
 
 def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
     """Return the command that trains on what was tracked in some frames."""
-    named = {"--masks": arguments.masks, "--cameras": arguments.cameras, "--body": arguments.body}
-    words = ["ia-ingest", str(arguments.video), "--poses", str(arguments.poses_path())]
-    words += [str(each) for pair in named.items() if pair[1] is not None for each in pair]
-    return words if frames is None else [*words, "--frames", format_frame_range(frames)]
+    named = {
+        "poses": arguments.poses_path(), "masks": arguments.masks, "cameras": arguments.cameras,
+        "body": arguments.body, "frames": None if frames is None else format_frame_range(frames),
+    }  # fmt: skip
+    return ["ia-ingest", str(arguments.video), *option_words(named)]
 
 
 @contextmanager

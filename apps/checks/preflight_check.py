@@ -1,5 +1,6 @@
 """Check of a capture before a run starts, with the ia-check command line that corrects it."""
 
+import os
 import shlex
 from pathlib import Path
 
@@ -9,7 +10,9 @@ from apps.checks.capture_validation import (
     check_opened_capture,
     passes_quick_check,
 )
+from apps.cli.capture_options import capture_name, format_frame_range, option_words
 from apps.cli.console import Console
+from apps.cli.output_paths import unused_path
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
 from preprocess.alignment.correction_search import GOOD_IOU
@@ -24,30 +27,17 @@ def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
         fix: Whether to write a corrected copy to a new folder.
     """
     words = ["ia-check", str(inputs.video)]
-    named = {
-        "--poses": inputs.poses, "--masks": inputs.masks, "--cameras": inputs.cameras,
-        "--body": inputs.body, "--person": inputs.person,
-    }  # fmt: skip
-    for option, value in named.items():
-        words += [] if value is None else [option, str(value)]
+    named = ("poses", "masks", "cameras", "body", "person")
+    words += option_words({name: getattr(inputs, name) for name in named})
     if inputs.invert_masks is not None:
         words.append("--mask-invert" if inputs.invert_masks else "--no-mask-invert")
     if inputs.frames is not None and inputs.frames != slice(None):
-        chosen = (inputs.frames.start, inputs.frames.stop, inputs.frames.step)
-        words.append("--frames=" + ":".join("" if n is None else str(n) for n in chosen))
-    words += ["--fix", str(unused_corrected_folder(inputs.video))] if fix else []
+        words.append(f"--frames={format_frame_range(inputs.frames)}")
+    if fix:
+        beside = Path(os.path.abspath(inputs.video)) if not inputs.video.name else inputs.video
+        free = unused_path(beside.with_name(f"{capture_name(beside)}-corrected"))
+        words += ["--fix", str(free)]
     return shlex.join(words)
-
-
-def unused_corrected_folder(video: Path) -> Path:
-    """Return an unused folder next to a capture, named after it."""
-    place = video if video.name else video.resolve()
-    stem = place.name if place.is_dir() else place.stem
-    number, folder = 1, place.parent / f"{stem}-corrected"
-    while folder.exists():
-        number += 1
-        folder = place.parent / f"{stem}-corrected-{number}"
-    return folder
 
 
 def preflight_check(

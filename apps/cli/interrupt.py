@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from apps.cli.console import Console
 
@@ -13,32 +14,40 @@ INTERRUPTED = 130
 
 
 @contextmanager
+def handle_signals(handlers: dict[signal.Signals, Callable[[int, Any], object]]) -> Iterator[None]:
+    """Handle signals by functions during a block; they reach the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def stop_on_interrupt(
     console: Console, saving_message: str = "saving the checkpoint"
 ) -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C sets; the second raises KeyboardInterrupt.
 
-    Signals reach the main thread only; on other threads the event is never set.
+    On other threads than the main one the event is never set.
 
     Args:
         console: Shows that the work is stopping.
         saving_message: What happens to the work done.
     """
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
 
     def first(signal_number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop.set()
         console.info(f"Stopping; {saving_message}. Press Ctrl-C again to quit immediately.")
 
-    before = signal.signal(signal.SIGINT, first)
-    try:
+    with handle_signals({signal.SIGINT: first}):
         yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -61,14 +70,8 @@ def exit_on_interrupt(
         console.info_before_exit(f"{program}: stopped by Ctrl-C.")
         os._exit(INTERRUPTED)
 
-    if threading.current_thread() is not threading.main_thread():
+    with handle_signals({signal.SIGINT: leave}):
         yield
-        return
-    before = signal.signal(signal.SIGINT, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -79,21 +82,14 @@ def record_interrupt() -> Iterator[threading.Event]:
     SIGTERM is treated like Ctrl-C. On other threads than the main one the event is never set.
     """
     came = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield came
-        return
 
     def note(signal_number: int, frame: object) -> None:
         came.set()
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note)
-    before_term = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    try:
+    ends = {signal.SIGINT: note, signal.SIGTERM: lambda *_: signal.raise_signal(signal.SIGINT)}
+    with handle_signals(ends):
         yield came
-    finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGTERM, before_term)
 
 
 @contextmanager
@@ -104,11 +100,5 @@ def interrupt_event() -> Iterator[threading.Event]:
     than the main one the event is never set.
     """
     ended = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    with handle_signals({signal.SIGINT: lambda *_: ended.set()}):
         yield ended
-        return
-    before = signal.signal(signal.SIGINT, lambda *_: ended.set())
-    try:
-        yield ended
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
-from apps.cli.capture_options import mask_inversion, parse_frame_range
+from apps.cli.capture_options import CaptureArguments, Flag, capture_name
 from apps.cli.output_paths import check_output_file
 from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
@@ -36,11 +36,9 @@ MIN_SECONDS = 0.1
 VIEW_PORT = 8008
 """Port of the live viewer where --view names none."""
 
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
-
 
 @dataclass(frozen=True, kw_only=True)
-class IngestArguments:
+class IngestArguments(CaptureArguments):
     """Train an avatar from a video of one person while the video is being read.
 
     Try it:
@@ -65,35 +63,12 @@ class IngestArguments:
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of images, or capture folder; camera:0 for a camera, or the address of a
     stream, as in camera:rtsp://…"""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """SMPL poses: an .npz with global_orient, body_pose, transl (or poses, trans), or the output of
-    4D-Humans, WHAM, VIBE, GVHMR, TRAM, PromptHMR, ROMP, BEV or EasyMocap (a file, or a folder of
-    files); see docs/formats.md. Pickles are read without executing them. Default: tracked in the
-    video."""
-    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
-    """Person ID in the pose file (default: the longest track); without poses, which person to
-    track: 1 is the leftmost (default: the one in front)."""
     tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Another installed tracker to use where no --poses are given (default: blazepose, the built-in
     one; docs/formats.md)."""
-    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Masks, one per frame, 255 where the person is: a folder of images, a video, an .npz, or COCO
-    run-length codes. Default: tracked with the poses, or estimated from images and given poses
-    (segmenter:grabcut); segmenter:NAME selects another installed segmenter."""
-    mask_invert: Flag = False
-    """Masks are dark where the person is (default: detected automatically)."""
-    no_mask_invert: Flag = False
-    """Masks are bright where the person is (default: detected automatically)."""
-    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """A cameras.npz (intrinsic, extrinsic: one, or one per frame), a COLMAP model, a
-    transforms.json, or an export of Record3D or Polycam; `static`: fixed camera with unknown focal
-    length; or `solve`: moving camera, solved from the images (a minute or two, with pycolmap;
-    docs/cameras.md). Poses are then relative to the camera of each frame."""
     height_cm: Annotated[float | None, arg(metavar="CM", help_behavior_hint="")] = None
     """Height of the person, barefoot. Sets the metric scale of the body, its distance and solved
     cameras, which images alone cannot determine."""
-    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Your own SMPL body, .npz or .pkl (nothing in it is executed; default: the embedded body)."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the run (default: runs/NAME, named after the video)."""
     resume: Flag = False
@@ -123,8 +98,6 @@ class IngestArguments:
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
     to the square root of --seconds)."""
-    frames: str = "::"
-    """Frames to use: START:STOP:STEP, counted from 0."""
     hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
     """Hold out every Nth frame for evaluation; 0 trains on all frames."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
@@ -180,14 +153,9 @@ class IngestArguments:
             raise InputError(f"--hold-out is {self.hold_out}, but must be 0, or at least 2.")
         if self.seed < 0:
             raise InputError(f"--seed is {self.seed}, but must be at least 0.")
+        inputs = self.capture_inputs().input_paths()
         if self.json is not None:
-            check_output_file(
-                self.json,
-                "--json",
-                self.capture_inputs().input_paths(),
-                overwrite=self.may_replace_json,
-            )
-        mask_inversion(person_dark=self.mask_invert, person_bright=self.no_mask_invert)
+            check_output_file(self.json, "--json", inputs, overwrite=self.may_replace_json)
         if self.view is not None and not 0 <= self.view < 1 << 16:
             raise InputError(f"--view is {self.view}, but must be a port from 0 to 65535.")
         if self.view is not None and importlib.util.find_spec("viser") is None:
@@ -204,26 +172,16 @@ class IngestArguments:
 
     def run_folder(self) -> RunFolder:
         """Return the folder of the run."""
-        name = self.video.resolve()
-        own = name.name if name.is_dir() else name.stem
+        own = capture_name(self.video)
         if camera_address(self.video) is not None:
             own = re.sub(r"\W+", "-", str(self.video)).strip("-")
         return RunFolder(path=self.out or Path("runs") / own)
 
     def capture_inputs(self) -> CaptureInputs:
         """Return the inputs to open."""
-        return CaptureInputs(
-            video=self.video,
-            poses=self.poses,
-            masks=self.masks,
-            cameras=self.cameras,
-            body=self.body,
-            frames=parse_frame_range(self.frames),
-            invert_masks=mask_inversion(
-                person_dark=self.mask_invert, person_bright=self.no_mask_invert
-            ),
+        return replace(
+            super().capture_inputs(),
             live=self.live,
-            person=self.person,
             tracker=self.tracker,
             idle_s=self.idle_seconds,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,

@@ -8,9 +8,11 @@ from typing import Any
 
 from apps.animation.driving_motion import ResampledMotion, demo_motion
 from apps.animation.following_camera import FollowingCamera
+from apps.cli.capture_options import option_words
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit
 from apps.report.coverage_map import CoverageMap
+from apps.report.html_page import animated_webp_data_uri, to_uint8, webp_data_uri
 from apps.report.report_page import ComparisonPair, report_page
 from apps.report.report_schema import (
     CoverageStats,
@@ -22,7 +24,6 @@ from apps.report.report_schema import (
     TrainingStats,
     format_psnr,
 )
-from apps.report.html_page import animated_webp_data_uri, to_uint8, webp_data_uri
 from apps.run.run_folder import RunFolder
 from apps.run.training_result import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
@@ -73,11 +74,9 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     video = str(command.get("video"))
     if camera_address(Path(video)) is not None:
         return "."
-    words = ["ia-check", video]
-    for name in CHECK_OPTIONS:
-        if command.get(name) not in (None, "solve"):
-            words += [f"--{name}", str(command[name])]
-    return f", and check poses and masks: {shlex.join(words)}"
+    named = {name: command.get(name) for name in CHECK_OPTIONS if command.get(name) != "solve"}
+    words = shlex.join(["ia-check", video, *option_words(named)])
+    return f", and check poses and masks: {words}"
 
 
 ANIMATION_PX = 480
