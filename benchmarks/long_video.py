@@ -87,7 +87,8 @@ def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
     import torch
 
-    from apps.run.training_session import TrainingSession, new_trainer
+    from apps.run.session_start import new_trainer
+    from apps.run.training_session import TrainingSession
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
     recording, device = open_sample(capture), torch.device("cpu")

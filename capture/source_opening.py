@@ -5,7 +5,7 @@ from pathlib import Path
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.input_error import InputError
 from capture.live.camera_device import CameraDevice
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.live.watched_image_folder import WatchedImageFolder
 from capture.source import FrameSelection, FrameSource
 from capture.video import VIDEO_SUFFIXES, VideoFile

@@ -11,8 +11,7 @@ from capture.camera import Camera
 from capture.frame import Frame
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
-from capture.live.pacing_clock import PacingClock
-from capture.live.realtime_playback import RealtimePlayback
+from capture.live.realtime_playback import PacingClock, RealtimePlayback
 from capture.live.watched_image_folder import IDLE_TIMEOUT_S
 from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from capture.input_error import InputError
 from capture.live.camera_device import camera_address
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.source import FrameSource, TransposedSource
 from capture.source_opening import open_live_source, open_source
 from capture.video import VideoFile

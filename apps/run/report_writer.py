@@ -25,7 +25,7 @@ from apps.report.report_schema import (
     format_psnr,
 )
 from apps.run.run_folder import RunFolder
-from apps.run.training_result import TrainingResult
+from apps.run.training_session import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
 from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
 from capture.atomic_files import write_text_atomically

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from apps.cli.console import Console, format_duration
 from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
 from apps.evaluation.final_scoring import SCORING_LIMIT_S
@@ -11,8 +13,9 @@ from apps.run.continual_learning import EarlierVideos
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
 from apps.run.time_estimate import expected_held_out, post_training_seconds
-from apps.run.training_session import new_trainer
 from avatar.backends import backend_for
+from avatar.config import HELD_OUT_STRIDE, TrainConfig
+from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import MAX_HELD_OUT
 from avatar.training import checkpoint, warmup
 from avatar.training.trainer import Trainer
@@ -83,6 +86,33 @@ def open_viewer(
     from apps.view.live_viewer import LiveViewer
 
     return LiveViewer(capture, run, console, arguments.view)
+
+
+def new_trainer(
+    recording: Capture,
+    *,
+    seconds: float,
+    steps: int | None = None,
+    seed: int,
+    refine_poses: bool,
+    hold_every: int = HELD_OUT_STRIDE,
+    device: torch.device,
+) -> Trainer:
+    """Build an untrained trainer for the person, the training budget and the image size."""
+    config = TrainConfig.for_budget(
+        seconds,
+        steps=steps,
+        footprint_m=recording.pixel_footprint_m(),
+        frames=recording.source.frame_count,
+        held_out_stride=hold_every,
+        seed=seed,
+    )
+    config = replace(
+        config,
+        refine_poses=refine_poses,
+        poses_may_be_exact=not recording.has_estimated_poses,
+    )
+    return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
 
 
 def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:

@@ -4,17 +4,15 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, final
-
-import torch
 
 from apps.cli.console import Console, ProgressBar, format_duration
 from apps.cli.exit_codes import BAD_INPUT, INTERRUPTED, CommandExit
-from apps.evaluation.final_scoring import SCORING_LIMIT_S, score_finally
+from apps.evaluation.final_scoring import SCORING_LIMIT_S, FinalScores, score_finally
 from apps.report.cpu_contention import CpuContentionMeter, CpuTime
 from apps.report.learning_curve import CurvePoint
-from apps.report.report_schema import finite_mean, format_percent, format_psnr
+from apps.report.report_schema import ForgettingStats, finite_mean, format_percent, format_psnr
 from apps.report.stream_meter import StreamMeter
 from apps.run.checkpoint_writer import CheckpointWriter
 from apps.run.continual_learning import EarlierVideos, earlier_video_names
@@ -28,9 +26,6 @@ from apps.run.package_snapshot import (
 from apps.run.run_folder import RunFolder
 from apps.run.time_estimate import describe_position, post_training_seconds
 from apps.run.training_observer import TrainingObserver, notify_observers
-from apps.run.training_result import TrainingResult
-from avatar.config import HELD_OUT_STRIDE, TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
@@ -50,31 +45,40 @@ REVISED_PER_STEP = 2
 """Frames whose poses are replaced between two steps; each solves its correspondences again."""
 
 
-def new_trainer(
-    recording: Capture,
-    *,
-    seconds: float,
-    steps: int | None = None,
-    seed: int,
-    refine_poses: bool,
-    hold_every: int = HELD_OUT_STRIDE,
-    device: torch.device,
-) -> Trainer:
-    """Build an untrained trainer for the person, the training budget and the image size."""
-    config = TrainConfig.for_budget(
-        seconds,
-        steps=steps,
-        footprint_m=recording.pixel_footprint_m(),
-        frames=recording.source.frame_count,
-        held_out_stride=hold_every,
-        seed=seed,
-    )
-    config = replace(
-        config,
-        refine_poses=refine_poses,
-        poses_may_be_exact=not recording.has_estimated_poses,
-    )
-    return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainingResult:
+    """A trained avatar and how it was trained.
+
+    Attributes:
+        trainer: Holds the avatar.
+        held_out: Held-out frames that have arrived.
+        curve: Learning curve, up to the final scores.
+        meter: Timing and counts of the frame stream.
+        coverage: Skin that the training frames show.
+        frames_added: Frames of this capture that were trained on.
+        interrupted: Whether Ctrl-C ended training.
+        cpu_time: CPU time used, and lost to other programs.
+        package: Outcome of packaging; None before `TrainingSession.bake`.
+        scores: Final scores of the held-out frames; empty before `bake`.
+        earlier_videos: Forgetting of earlier videos, if there were any.
+    """
+
+    trainer: Trainer
+    held_out: list[HeldOutFrame]
+    curve: tuple[CurvePoint, ...]
+    meter: StreamMeter
+    coverage: Coverage
+    frames_added: int
+    interrupted: bool
+    cpu_time: CpuTime
+    package: PackageSnapshot | None = None
+    scores: FinalScores = field(default_factory=FinalScores)
+    earlier_videos: ForgettingStats | None = None
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether any step was made on any frame."""
+        return self.trainer.steps > 0 and self.frames_added > 0
 
 
 @final

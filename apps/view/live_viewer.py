@@ -15,11 +15,13 @@ from apps.run.package_snapshot import validation_views, write_package_snapshot
 from apps.run.run_folder import RunFolder
 from apps.run.training_observer import ObservableSession
 from apps.view.preview_poses import DANCE, FILMED, NEWEST, PreviewPoses
-from apps.view.preview_render import BrowserCamera, render_preview
-from apps.view.viser_page import FRAME_PX, ViserPage
+from apps.view.viser_page import BACKGROUND_RGB, FRAME_PX, BrowserCamera, ViserPage
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.events import Evaluated, Finished, TrainEvent
+from avatar.field.avatar_model import Avatar
+from avatar.render import render
+from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
@@ -239,6 +241,24 @@ class LiveViewer:
             cells = CorrespondenceGrid.solve(session.trainer.avatar.rig, pose.joint_rotations)
             self._cells, self._posed_at = (pose, cells), now
         return self._cells[1]
+
+
+def render_preview(
+    avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Render the avatar in its current state over the page's background.
+
+    Args:
+        avatar: The avatar.
+        pose: Pose in the camera's world.
+        camera: Also defines the image size.
+        cells: Correspondence grid of the pose.
+    """
+    rgba = render(avatar, pose, camera, cells=cells)
+    mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(
+        BACKGROUND_RGB, dtype=np.float32
+    )
+    return np.clip(mixed + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
 def _letterbox(rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -5,16 +5,17 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from typing import TYPE_CHECKING, final
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from apps.report.learning_curve import CurvePoint
 from apps.view.preview_poses import NEWEST, POSE_CHOICES
-from apps.view.preview_render import BACKGROUND_RGB, BrowserCamera
+from capture.camera import Camera
 
 if TYPE_CHECKING:  # an optional extra, loaded when the page is opened
     import viser  # pyright: ignore[reportMissingImports]
@@ -25,6 +26,8 @@ PANEL_PX = 380
 """Width of the panel."""
 FRAME_PX = (720, 440)
 """Largest width and height of a frame in the panel, which shows it at half the size."""
+BACKGROUND_RGB = (251, 250, 247)
+"""Background color of the page, as in report.html."""
 TEAL, ORANGE = "#1f6f8b", "#c8742b"
 """Colors of the curves: whole image, and inside the mask."""
 CURVE_TITLE = (
@@ -37,6 +40,39 @@ INITIAL_FOV_RAD, INITIAL_DISTANCE_M = 0.6, 3.7
 """Initial field of view and distance: a standing person fills 80 % of the image height."""
 CENTER_ABOVE_PELVIS_M = -0.08
 """Height of a person's center above the pelvis."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrowserCamera:
+    """Camera of a browser, as viser reports it (OpenCV axes).
+
+    Attributes:
+        world_from_camera: Rotation.
+        position: Position in the world, meters.
+        fov: Vertical field of view, radians.
+        aspect: Width over height.
+        moved_at: Time of its last motion, on `time.perf_counter`'s clock.
+    """
+
+    world_from_camera: Float[np.ndarray, "3 3"]
+    position: Float[np.ndarray, "3"]
+    fov: float
+    aspect: float
+    moved_at: float
+
+    def to_camera(self, height_px: int) -> Camera:
+        """Convert to a camera with this image height."""
+        width_px = max(1, round(height_px * self.aspect))
+        focal = 0.5 * height_px / np.tan(0.5 * self.fov)
+        camera_from_world = np.eye(4)
+        camera_from_world[:3, :3] = self.world_from_camera.T
+        camera_from_world[:3, 3] = -self.world_from_camera.T @ self.position
+        return Camera(
+            focal_px=(float(focal), float(focal)),
+            center_px=(width_px / 2.0, height_px / 2.0),
+            size_px=(width_px, height_px),
+            camera_from_world=camera_from_world,
+        )
 
 
 @final

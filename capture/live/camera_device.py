@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from capture.frame import Frame
 from capture.image_folder import silence_opencv
 from capture.input_error import InputError
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.source import FrameSelection
 
 CAMERA_PREFIX = "camera:"

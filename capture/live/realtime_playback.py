@@ -1,12 +1,62 @@
-"""A recording played as a live capture: each frame comes at its own time."""
+"""Frames at times of their own: the clock of their source, and a recording that is played."""
 
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import final
 
 from capture.frame import Frame
-from capture.live.pacing_clock import PacingClock
 from capture.source import FrameSource
+
+Clock = Callable[[], float]
+Wait = Callable[[float], object]
+
+
+@final
+class PacingClock:
+    """The clock of a source whose frames come at times of their own.
+
+    Attributes:
+        waited_s: How long it has been waited for frames, in all.
+    """
+
+    def __init__(self, *, clock: Clock = time.perf_counter, wait: Wait | None = None) -> None:
+        """Start a clock that was not stopped.
+
+        Args:
+            clock: Seconds; another one in tests.
+            wait: Sleeps for the given seconds, or until the clock is stopped.
+        """
+        self._ended = threading.Event()
+        self._clock = clock
+        self._wait: Wait = self._ended.wait if wait is None else wait
+        self.waited_s = 0.0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called: every wait returns at once."""
+        return self._ended.is_set()
+
+    def now(self) -> float:
+        """Seconds on the clock."""
+        return self._clock()
+
+    def stop(self) -> None:
+        """Ends every wait, the present one too; from any thread."""
+        self._ended.set()
+
+    def wait_until(self, moment: float) -> bool:
+        """Waits for a moment on the clock; does not if it has gone by.
+
+        Returns:
+            Whether to go on: False after `stop`.
+        """
+        began = self._clock()
+        if moment > began and not self.stopped:
+            self._wait(moment - began)
+            self.waited_s += self._clock() - began
+        return not self.stopped
 
 
 @final

@@ -18,7 +18,7 @@ from capture.image_folder import (
     read_image,
 )
 from capture.input_error import InputError
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.source import FrameSelection
 
 DONE_FILE_NAME = "DONE"

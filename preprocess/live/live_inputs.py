@@ -7,7 +7,7 @@ from pathlib import Path
 from capture.frame import Frame
 from capture.image_folder import has_cutout_alpha
 from capture.input_error import InputError
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.source import FrameSource
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths

@@ -8,7 +8,7 @@ import numpy as np
 
 from capture.frame import Frame
 from capture.input_error import InputError
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.plausibility import invalidate_implausible_rows, require_plausible

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from apps import ingest, play
-from apps.run import package_snapshot, report_writer, training_session
+from apps.run import package_snapshot, report_writer, session_start
 from avatar.deformation.rig import Rig
 from avatar.training import held_out_pose_fitting, warmup
 from capture.atomic_files import write_text_atomically
@@ -101,7 +101,7 @@ def capture(film, tmp_path) -> Path:
 @pytest.fixture
 def call_ingest(capsys, monkeypatch, rig) -> Command:
     """Runs ia-ingest, for a few steps unless the test says otherwise."""
-    monkeypatch.setattr(training_session.Rig, "from_shaped_body", lambda shaped: rig)
+    monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
     monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:

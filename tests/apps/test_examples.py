@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.run import training_session
+from apps.run import session_start
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -46,7 +46,7 @@ def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(
         example, "film_capture", lambda out, config, overwrite: shutil.copytree(film, out)
     )
-    monkeypatch.setattr(training_session.Rig, "from_shaped_body", lambda shaped: rig)
+    monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
     example.main(tmp_path)
     said = capsys.readouterr().out
     assert (tmp_path / "avatar.iavatar").exists()

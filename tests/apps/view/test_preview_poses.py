@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from apps.run.training_observer import notify_observers
+from apps.view.live_viewer import render_preview
 from apps.view.preview_poses import DANCE, FILMED, NEWEST, POSE_CHOICES, STANDING, PreviewPoses
-from apps.view.preview_render import BACKGROUND_RGB, BrowserCamera, render_preview
+from apps.view.viser_page import BACKGROUND_RGB, BrowserCamera
 from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import Coverage

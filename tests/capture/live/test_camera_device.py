@@ -11,7 +11,7 @@ import pytest
 from capture.input_error import InputError
 from capture.live import camera_device
 from capture.live.camera_device import MAX_QUEUED_FRAMES, CameraDevice, camera_address
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.source import FrameSelection
 
 

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from capture.frame import Frame
-from capture.live.pacing_clock import PacingClock
-from capture.live.realtime_playback import RealtimePlayback
+from capture.live.realtime_playback import PacingClock, RealtimePlayback
 from capture.source import FrameSelection
 from capture.source_opening import open_source
 

@@ -10,7 +10,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.live import watched_image_folder
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from capture.live.watched_image_folder import WatchedImageFolder
 from capture.source import FrameSelection
 

@@ -10,7 +10,7 @@ import pytest
 
 from capture.frame import Frame
 from capture.input_error import InputError
-from capture.live.pacing_clock import PacingClock
+from capture.live.realtime_playback import PacingClock
 from preprocess.body.body_pose import Motion
 from preprocess.live.live_masks import LiveMasks
 from preprocess.live.live_poses import LivePoses
