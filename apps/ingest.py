@@ -3,31 +3,23 @@
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
-from typing import Any
 
 from apps.checks.preflight_check import correction_hint, preflight_check
 from apps.cli.command_line import fill_optional_port, parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import BAD_INPUT, DONE, CommandExit, run_command
-from apps.cli.interrupt import exit_on_interrupt, stop_on_interrupt
-from apps.run.camera_solving import CameraSolving, start_camera_solving
-from apps.run.ingest_arguments import VIEW_PORT, IngestArguments
+from apps.cli.interrupt import exit_on_interrupt
+from apps.run.camera_solving import start_camera_solving
+from apps.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from apps.run.run_folder import RunFolder
-from apps.tracking.tracked_run import (
-    read_tracking_report,
-    remove_unused_tracking,
-    track_missing_poses,
-)
+from apps.tracking.tracked_run import read_tracking_report, track_missing_poses
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
-
-PROGRAM = "ia-ingest"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def ingest(arguments: IngestArguments, console: Console) -> int:
-    """Open, align, stream, train, bake, report.
+    """Open, track, align, stream, train, bake, report.
 
     Raises:
         InputError: If the input cannot be used; nothing was written then.
@@ -52,20 +44,53 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
     run, inputs = arguments.run_folder(), arguments.capture_inputs().input_paths()
     run.check_usable(inputs, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
-        asked, arguments = arguments, track_missing_poses(arguments, run, console)
+        command, arguments = arguments.as_json(), track_missing_poses(arguments, run, console)
         threads = None
         if arguments.tracks_stream:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console)
-        capture = _open_aligned(arguments, run, console)
+        capture = _open_checked(arguments, run, console)
+        capture = _fit_to_masks(arguments, capture, run, console)
         with start_camera_solving(arguments.solve_job(capture), capture, run) as solving:
-            return _train_and_report(
-                arguments, capture, run, console, solving, started_at,
-                command=asked.as_json(), threads=threads,
-            )  # fmt: skip
+            threads = threads or _load_trainer_code(arguments, run, console)
+            from apps.run.report_writer import print_results, write_report
+            from apps.run.session_start import start_session
+
+            capture = solving.wait_before_training(capture, console)
+            with (
+                start_session(arguments, capture, run, console) as session,
+                solving.save_on_exit(capture, run, console),
+            ):
+                result = session.bake(session.train())
+                capture = solving.wait_after_training(capture, run, console, session.stop)
+                report = write_report(
+                    result, capture, run, console, command=command, threads=threads,
+                    startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
+                )  # fmt: skip
+                if arguments.json is not None:
+                    write_text_atomically(
+                        arguments.json, report.to_json(), replace=arguments.may_replace_json
+                    )
+                code = print_results(
+                    report, result, run, console, interrupted=session.stop_requested
+                )
+            if code == DONE and solving.refused is not None:
+                raise CommandExit(
+                    f"{solving.refused} The avatar was trained without solved cameras.", BAD_INPUT
+                )
+            return code
 
 
-def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) -> Capture:
-    """Open the capture with poses, masks and cameras aligned, and check that they agree."""
+def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
+    """Import torch and load the compiled kernels; return the number of threads."""
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        with console.status("loading torch"):
+            from apps.run import report_writer, training_session  # noqa: F401
+            from apps.run.session_start import load_kernels
+        return load_kernels(arguments, console)
+
+
+def _open_checked(arguments: IngestArguments, run: RunFolder, console: Console) -> Capture:
+    """Open the capture, and check that poses, masks and cameras agree."""
     try:
         with console.status("opening video and poses"):
             capture = arguments.open_capture()
@@ -80,7 +105,7 @@ def _open_aligned(arguments: IngestArguments, run: RunFolder, console: Console) 
         console.warning(note)
     if not (arguments.resume and run.has_checkpoint()):
         preflight_check(capture, arguments.capture_inputs(), console, force=arguments.force)
-    return _fit_to_masks(arguments, capture, run, console)
+    return capture
 
 
 def _fit_to_masks(
@@ -110,75 +135,6 @@ def _describe_capture(capture: Capture) -> str:
         f"{capture.paths.video}: {count} of {width}x{height} px, {len(capture.motion)} poses, "
         f"body {capture.shaped.body.family}, camera: {capture.cameras.source}"
     )
-
-
-def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
-    """Import torch and load the compiled kernels; return the number of threads."""
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        with console.status("loading torch"):
-            from apps.run import report_writer, training_session  # noqa: F401
-            from apps.run.session_start import load_kernels
-        return load_kernels(arguments, console)
-
-
-def _train_and_report(
-    arguments: IngestArguments,
-    capture: Capture,
-    run: RunFolder,
-    console: Console,
-    solving: CameraSolving | None,
-    started_at: float,
-    *,
-    command: dict[str, Any],
-    threads: int | None,
-) -> int:
-    """Train on an aligned capture, bake its package and write the report."""
-    if threads is None:
-        threads = _load_trainer_code(arguments, run, console)
-    from apps.run.report_writer import print_results, write_report
-    from apps.run.session_start import open_viewer, prepare_trainer
-    from apps.run.training_session import TrainingSession
-
-    if solving is not None:
-        capture = solving.wait_before_training(capture, console)
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        start = prepare_trainer(arguments, capture, run, console)
-        viewer = open_viewer(arguments, capture, run, console)
-    run.start_run(resume=arguments.resume)
-    remove_unused_tracking(arguments, run)
-    try:
-        kept = nullcontext() if solving is None else solving.save_on_exit(capture, run, console)
-        with kept, stop_on_interrupt(console) as stop:
-            session = TrainingSession(
-                start.trainer, capture, run, console, stop, start.notes,
-                observers=() if viewer is None else (viewer,),
-            )  # fmt: skip
-            result = session.bake(session.train(restore_count=start.restore_count))
-            if solving is not None:
-                capture = solving.wait_after_training(capture, run, console, stop)
-            report = write_report(
-                result, capture, run, console, command=command, threads=threads,
-                startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
-            )  # fmt: skip
-            if arguments.json is not None:
-                write_text_atomically(
-                    arguments.json, report.to_json(), replace=arguments.may_replace_json
-                )
-            code = print_results(report, result, run, console, interrupted=stop.is_set())
-        if viewer is not None and code == DONE:
-            console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
-            viewer.serve_until_interrupt(session)
-        if code == DONE and solving is not None and solving.refused is not None:
-            raise CommandExit(
-                f"{solving.refused} The avatar was trained without solved cameras.", BAD_INPUT
-            )
-        return code
-    except (OSError, KeyboardInterrupt) as error:
-        error.add_note(run.describe_remaining_files())
-        raise
-    finally:
-        if viewer is not None:
-            viewer.close()
 
 
 if __name__ == "__main__":

@@ -95,8 +95,8 @@ class CameraSolving:
         refused: Why there are no cameras, if the run was trained without them.
     """
 
-    def __init__(self, solving: SolverProcess, *, beside: bool) -> None:
-        """Take over a process that has begun."""
+    def __init__(self, solving: SolverProcess | None, *, beside: bool) -> None:
+        """Take over a process that has begun; None where nothing is to be solved."""
         self._solving, self.beside = solving, beside
         self.refused: str | None = None
         self._asked = False
@@ -107,7 +107,7 @@ class CameraSolving:
         Raises:
             InputError: If the cameras cannot be solved with certainty.
         """
-        if self.beside:
+        if self.beside or self._solving is None:
             return recording
         try:
             solved = self._solving.wait(console)
@@ -130,7 +130,7 @@ class CameraSolving:
         Raises:
             OSError: If the cameras cannot be written.
         """
-        if not self.beside:
+        if not self.beside or self._solving is None:
             return recording
         self._asked = True
         try:
@@ -188,7 +188,7 @@ class CameraSolving:
 @contextmanager
 def start_camera_solving(
     job: SolveJob | None, recording: Capture, run: RunFolder
-) -> Iterator[CameraSolving | None]:
+) -> Iterator[CameraSolving]:
     """Start solving, if there is a job; it does not outlive the block.
 
     Args:
@@ -200,7 +200,7 @@ def start_camera_solving(
         InputError: If pycolmap is missing.
     """
     if job is None:
-        yield None
+        yield CameraSolving(None, beside=False)
         return
     beside = recording.motion.intrinsic is not None and recording.segment is None
     with SolverProcess(job, run.path, gently=beside) as solving:

@@ -24,6 +24,9 @@ from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.masks.mask_origin import segmenter_name
 from preprocess.open_capture import open_capture
 
+PROGRAM = "ia-ingest"
+"""Name of the command."""
+
 REFERENCE_LONGER_SIDE_PX = 540
 """Longer side of the images whose detail can be learned in `DEFAULT_SECONDS`, pixels."""
 

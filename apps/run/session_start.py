@@ -1,6 +1,8 @@
 """Start of a training session: kernels, a new, resumed or extended trainer, the viewer."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -8,11 +10,14 @@ import torch
 
 from apps.cli.console import Console, format_duration
 from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
+from apps.cli.interrupt import exit_on_interrupt, stop_on_interrupt
 from apps.evaluation.final_scoring import SCORING_LIMIT_S
 from apps.run.continual_learning import EarlierVideos
-from apps.run.ingest_arguments import IngestArguments
+from apps.run.ingest_arguments import PROGRAM, IngestArguments
 from apps.run.run_folder import RunFolder
 from apps.run.time_estimate import expected_held_out, post_training_seconds
+from apps.run.training_session import TrainingSession
+from apps.tracking.tracked_run import remove_unused_tracking
 from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.deformation.rig import Rig
@@ -77,7 +82,41 @@ def prepare_trainer(
     return prepared
 
 
-def open_viewer(
+@contextmanager
+def start_session(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> Iterator[TrainingSession]:
+    """Prepare trainer and viewer, start the run, and yield its session.
+
+    Ctrl-C asks the session to stop. A viewer stays open after the block until Ctrl-C.
+
+    Raises:
+        InputError: If the checkpoint cannot be read, or belongs to another body.
+    """
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        start = prepare_trainer(arguments, capture, run, console)
+        viewer = _open_viewer(arguments, capture, run, console)
+    run.start_run(resume=arguments.resume)
+    remove_unused_tracking(arguments, run)
+    try:
+        with stop_on_interrupt(console) as stop:
+            session = TrainingSession(
+                start.trainer, capture, run, console, stop, start.notes,
+                observers=() if viewer is None else (viewer,), restore_count=start.restore_count,
+            )  # fmt: skip
+            yield session
+        if viewer is not None and not stop.is_set():
+            console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
+            viewer.serve_until_interrupt(session)
+    except (OSError, KeyboardInterrupt) as error:
+        error.add_note(run.describe_remaining_files())
+        raise
+    finally:
+        if viewer is not None:
+            viewer.close()
+
+
+def _open_viewer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> "LiveViewer | None":
     """Open the live viewer if --view asks for it."""

@@ -91,6 +91,7 @@ class TrainingSession:
         curve: Learning curve up to now.
         coverage: Skin that the training frames have shown.
         meter: Timing and counts of the frame stream.
+        stop: Ends training as soon as it is set.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class TrainingSession:
         notes: dict[str, Any],
         *,
         observers: Sequence[TrainingObserver] = (),
+        restore_count: int = 0,
     ) -> None:
         """Prepare the session; `train` starts it.
 
@@ -114,10 +116,12 @@ class TrainingSession:
             stop: Ends training as soon as it is set.
             notes: Stored with each checkpoint.
             observers: Notified of frames and training events.
+            restore_count: Frames of this video that the trainer was trained on before; they are
+                read back into its replay buffer before the clock starts.
         """
         self.trainer, self._recording, self._run = trainer, recording, run
-        self._console, self._stop, self._notes = console, stop, notes
-        self._observers = observers
+        self._console, self.stop, self._notes = console, stop, notes
+        self._observers, self._restore_count = observers, restore_count
         self.curve: list[CurvePoint] = [
             CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
         ]
@@ -132,23 +136,19 @@ class TrainingSession:
     @property
     def stop_requested(self) -> bool:
         """Whether the user has asked to stop."""
-        return self._stop.is_set()
+        return self.stop.is_set()
 
-    def train(self, *, restore_count: int = 0) -> TrainingResult:
+    def train(self) -> TrainingResult:
         """Train until the budget is used or the user stops; `bake` packages and scores.
-
-        Args:
-            restore_count: Frames of this video that the trainer was trained on before; they are
-                read back into its replay buffer before the clock starts.
 
         Raises:
             OSError: If a checkpoint cannot be written; the previous one is kept.
         """
         source = self._recording.source
-        self._set_unpaced(restore_count > 0)
+        self._set_unpaced(self._restore_count > 0)
         self._inbox = inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live)
         try:
-            added = self._restore_frames(inbox, restore_count) - self.trainer.frames_seen
+            added = self._restore_frames(inbox, self._restore_count) - self.trainer.frames_seen
             self._set_unpaced(False)
             self._checkpoints.restart_interval()
             waited = CpuContentionMeter(self.trainer)
@@ -159,14 +159,14 @@ class TrainingSession:
                         observer.on_event(event)
                         observer.between_steps(self)
                     self._revise_poses()
-                    if self._stop.is_set():
+                    if self.stop.is_set():
                         break
         finally:
             source.close()
             inbox.close()
             self._checkpoints.settle()
         self.meter.inbox_dropped, cpu = inbox.dropped, waited.measure()
-        interrupted = self._stop.is_set()
+        interrupted = self.stop.is_set()
         late = [*self.meter.lateness_warnings(), *filter(None, [cpu.warning()])]
         for warning in [*source.warnings, *late, *self._recording.final_notes()]:
             self._console.warning(warning)
@@ -277,7 +277,7 @@ class TrainingSession:
         if not count:
             return seen
         with self._console.status(f"reading back {count} frames"):
-            while seen < count and not (inbox.finished or self._stop.is_set()):
+            while seen < count and not (inbox.finished or self.stop.is_set()):
                 for item in inbox.take(timeout_s=0.1):
                     if isinstance(item, HeldOutFrame):
                         add_held_out(self.held_out, item)
