@@ -20,7 +20,7 @@ from apps.batching.capture_discovery import BATCH_OPTIONS, find_captures, resolv
 from apps.batching.ingest_attempt import IngestJob
 from apps.batching.live_table import CaptureState, LiveTable
 from apps.batching.local_executor import AttemptExecutor, LocalExecutor
-from apps.batching.node_resources import LOCK_NAME, usable_cores
+from apps.batching.node_resources import LOCK_NAME
 from apps.batching.ray_executor import RAY_LOCAL, RayExecutor
 from apps.batching.remote_files import RemoteFileError, is_url
 from apps.batching.summary_page import BatchSummary, CorePrice, write_summary
@@ -37,6 +37,7 @@ from apps.cli.exit_codes import (
 )
 from apps.cli.interrupt import handle_signals, stop_on_interrupt
 from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file, check_writable
+from apps.report.hardware import usable_cores
 from apps.run.ingest_arguments import IngestArguments
 from capture.input_error import InputError
 

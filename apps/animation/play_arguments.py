@@ -1,6 +1,5 @@
 """Arguments of ia-play; the text under each field is its --help."""
 
-import os
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from apps.animation.viewpoint import CLOSE_UP_ZOOM, Viewpoint
 from apps.cli.output_paths import check_output_file
+from apps.report.hardware import usable_cores
 from capture.input_error import InputError
 
 WEB_PORT = 8010
@@ -184,10 +184,7 @@ class PlayArguments:
     @property
     def worker_count(self) -> int:
         """Number of frames rendered in parallel."""
-        if self.workers is not None:
-            return self.workers
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(cores or 1, MAX_WORKERS)
+        return self.workers or min(usable_cores(), MAX_WORKERS)
 
     @property
     def output_path(self) -> Path:

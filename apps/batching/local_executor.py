@@ -11,7 +11,8 @@ from os import getpid
 from typing import Protocol, final, runtime_checkable
 
 from apps.batching.ingest_attempt import AttemptOutcome, IngestJob, run_attempt
-from apps.batching.node_resources import available_memory_mb, tree_memory_mb, usable_cores
+from apps.batching.node_resources import available_memory_mb, tree_memory_mb
+from apps.report.hardware import usable_cores
 
 
 @dataclass(frozen=True, kw_only=True)

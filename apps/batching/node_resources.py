@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from apps.report.hardware import CGROUP, processor_name, usable_cores
 from capture.input_error import InputError
 
 try:
@@ -17,8 +18,6 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-CGROUP = Path("/sys/fs/cgroup")
-"""Limits of a container (Linux, version 2)."""
 PAGE_MB = 4096 / 1e6 if sys.platform == "win32" else os.sysconf("SC_PAGE_SIZE") / 1e6
 """Size of a memory page, MB."""
 WORK_PREFIX = "ia-batch-"
@@ -29,16 +28,6 @@ LOCK_NAME = "in-use"
 """File in a work folder: locked as long as its process lives; holds the bytes it has reserved."""
 POLL_S = 0.5
 """Interval at which a full disk budget is looked at again, seconds."""
-
-
-def usable_cores() -> int:
-    """Return the cores that this process may use: affinity, and the quota of a container."""
-    affine = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
-    with suppress(OSError, ValueError):
-        quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()
-        cores = min(cores, max(1, int(quota) // int(period)))
-    return cores
 
 
 def total_memory_mb() -> float:
@@ -80,13 +69,9 @@ def tree_memory_mb(process: int) -> float:
 
 def describe_machine() -> dict[str, object]:
     """Return host name, processor, cores and memory of this machine."""
-    processor = ""
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        processor = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     return {
         "host": socket.gethostname(),
-        "processor": processor,
+        "processor": processor_name(),
         "cores": usable_cores(),
         "memory_mb": round(total_memory_mb()),
     }

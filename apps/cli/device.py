@@ -1,10 +1,9 @@
 """Device and threads for training and rendering."""
 
-import os
-
 import numba
 import torch
 
+from apps.report.hardware import usable_cores
 from capture.input_error import InputError
 
 CUDA_SLOW_WARNING = (
@@ -38,8 +37,7 @@ def set_threads(requested: int | None) -> int:
     Returns:
         The number of threads; numba cannot exceed the number it started with.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    threads = max(1, min(requested or cores or 1, numba.get_num_threads()))
+    threads = max(1, min(requested or usable_cores(), numba.get_num_threads()))
     torch.set_num_threads(threads)
     numba.set_num_threads(threads)
     return threads

@@ -3,6 +3,7 @@
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -10,6 +11,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = ("numpy", "numba", "torch", "onnxruntime")
+CGROUP = Path("/sys/fs/cgroup")
+"""Limits of a container (Linux, version 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +45,8 @@ class Hardware:
         return cls(
             commit=_commit(),
             date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            processor=_processor(),
-            cores=_cores(),
+            processor=processor_name(),
+            cores=usable_cores(),
             load=round(os.getloadavg()[0], 1),
             memory_gb=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
             software=", ".join([f"Python {platform.python_version()}", *libraries]),
@@ -70,15 +73,19 @@ def _commit() -> str:
     return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
 
 
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # not everywhere
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def usable_cores() -> int:
+    """Return the cores that this process may use: affinity, and the quota of a container."""
+    affine = hasattr(os, "sched_getaffinity")  # not everywhere
+    cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
+    with suppress(OSError, ValueError):
+        quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return cores
 
 
-def _processor() -> str:
-    told = Path("/proc/cpuinfo")
-    for line in told.read_text().splitlines() if told.exists() else ():
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
+def processor_name() -> str:
+    """Return what the machine calls its processor."""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     return platform.processor() or platform.machine()

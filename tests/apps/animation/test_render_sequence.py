@@ -3,6 +3,7 @@
 import os
 import pickle
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from apps.animation import play_arguments
 from apps.animation.driving_motion import demo_motion
 from apps.animation.following_camera import FollowingCamera, canonical_pose_of
 from apps.animation.viewpoint import Viewpoint
+from apps.report import hardware
 from export.player import Player
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.rotations import axis_angles_from_matrices
@@ -126,7 +128,8 @@ def test_pictures_do_not_depend_on_the_workers(frames, novel):
 
 
 def test_by_itself_there_is_a_worker_for_each_core(monkeypatch, package):
-    monkeypatch.setattr(play_arguments.os, "sched_getaffinity", lambda process: {0, 2, 5})
+    monkeypatch.setattr(hardware, "CGROUP", Path("/none"))
+    monkeypatch.setattr(hardware.os, "sched_getaffinity", lambda process: {0, 2, 5})
     assert play_arguments.PlayArguments(avatar=package).worker_count == 3
     assert play_arguments.PlayArguments(avatar=package, workers=2).worker_count == 2
 
