@@ -11,7 +11,7 @@ from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_alignment import BodyAlignment
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import CapturePaths, find_own_masks
+from preprocess.capture_paths import CapturePaths, find_own_cameras, find_own_masks
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStream
@@ -63,6 +63,7 @@ def open_tracked_stream(
         shaped,
         assume_camera(wanted.video, wanted.cameras, stream),
         fixed_body=avatar_body is not None,
+        stated_focal=not source.live and _names_cameras(wanted),
     )
     segment, notes = None, tuple[str, ...]()
     if not choice.is_fallback:
@@ -82,6 +83,13 @@ def open_tracked_stream(
         live=tracking,
         segment=segment,
     )
+
+
+def _names_cameras(wanted: CaptureInputs) -> bool:
+    """Whether a recording comes with a file of cameras."""
+    if wanted.cameras is None:
+        return find_own_cameras(wanted.video) is not None
+    return wanted.cameras != "static"
 
 
 def _open_masks(

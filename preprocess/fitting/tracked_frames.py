@@ -71,21 +71,27 @@ def reduced_size_px(person: PersonKeypoints, frame_px: tuple[int, int]) -> tuple
 
 
 def fit_first_frames(
-    seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera, *, fixed: bool = False
+    seen: Sequence[SeenPerson],
+    shaped: ShapedBody,
+    camera: Camera,
+    *,
+    fixed: bool = False,
+    sigma_log_focal: float = SIGMA_LOG_ASSUMED_FOCAL,
 ) -> tuple[Motion, ShapedBody, Camera]:
     """Fit proportions, focal length and poses to the first frames of a stream.
 
     Args:
         seen: The frames.
         shaped: The body's mean shape, or the person.
-        camera: Camera of the frames, whose focal length is a guess.
+        camera: Camera of the frames, whose focal length is not exact.
         fixed: Whether the body is the person's, and its proportions stay.
+        sigma_log_focal: How uncertain the focal length is.
 
     Returns:
         Poses of the frames, the person, and the camera.
     """
     space = ProportionSpace.around(shaped)
-    fitter = _fitter(seen, None, OutlineModel(space), camera, range(len(seen)))
+    fitter = _fitter(seen, None, OutlineModel(space), camera, range(len(seen)), sigma_log_focal)
     everything = FitParameters(proportions=not fixed)
     for _ in range(FIRST_ITERATIONS[0]):
         fitter.iterate(everything._replace(outlines=False))
@@ -226,6 +232,7 @@ def _fitter(
     model: OutlineModel,
     camera: Camera,
     outlined: Collection[int],
+    sigma_log_focal: float = SIGMA_LOG_ASSUMED_FOCAL,
 ) -> ClipFitter:
     """The fit of some frames, of which those at some places are compared with their masks."""
     shaped = model.space.shaped
@@ -246,7 +253,7 @@ def _fitter(
     return ClipFitter(
         motion, model.space, frames, model=model, track=_track(seen, camera),
         settled=poses is not None,
-        sigma_log_focal=SIGMA_LOG_ASSUMED_FOCAL,
+        sigma_log_focal=sigma_log_focal,
     )  # fmt: skip
 
 

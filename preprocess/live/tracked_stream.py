@@ -22,6 +22,7 @@ from capture.source import FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
+from preprocess.fitting.clip_fitting import SIGMA_LOG_ASSUMED_FOCAL, SIGMA_LOG_FOCAL
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
     EarlierPoses,
@@ -188,13 +189,21 @@ class LiveTracking:
         self._earlier: EarlierPoses | None = None
         stream.look = self._look
 
-    def start(self, shaped: ShapedBody, camera: Camera, *, fixed_body: bool = False) -> StreamStart:
+    def start(
+        self,
+        shaped: ShapedBody,
+        camera: Camera,
+        *,
+        fixed_body: bool = False,
+        stated_focal: bool = False,
+    ) -> StreamStart:
         """Track the first frames, and fit person and camera to them.
 
         Args:
             shaped: The body's mean shape, or the person of a finished avatar.
-            camera: Its focal length is a guess.
+            camera: Its focal length is not exact.
             fixed_body: Whether `shaped` is the person.
+            stated_focal: Whether the focal length comes from a file and is no guess.
 
         Raises:
             InputError: If the stream ends before the person was found.
@@ -207,7 +216,10 @@ class LiveTracking:
                 f"No person was found in {self.stream.path} ({len(self.times_s)} frames were "
                 "searched). Tracking needs one person, from head to feet in the picture."
             )
-        motion, person, camera = fit_first_frames(seen, shaped, camera, fixed=fixed_body)
+        motion, person, camera = fit_first_frames(
+            seen, shaped, camera, fixed=fixed_body,
+            sigma_log_focal=SIGMA_LOG_FOCAL if stated_focal else SIGMA_LOG_ASSUMED_FOCAL,
+        )  # fmt: skip
         self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
         self.stream.end = self._earlier.fit_rest
         for row, each in enumerate(seen):

@@ -169,3 +169,15 @@ def test_a_finished_avatars_person_keeps_the_body(standing):
     camera = assume_camera(Path("film.mp4"), "static", stream)
     start = tracking.start(person, camera, fixed_body=True)
     assert np.allclose(start.shaped.joints, person.joints)
+
+
+def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
+    changes = []
+    for stated in (False, True):
+        stream = TrackedStream(Pictures())
+        tracking = LiveTracking(stream, Tracker(standing), plain)
+        guess = assume_camera(Path("film.mp4"), "static", stream).scale_focal(1.3)
+        shaped = load_body_model(None).with_shape()
+        start = tracking.start(shaped, guess, stated_focal=stated)
+        changes.append(abs(np.log(start.cameras[0].focal_px[0] / guess.focal_px[0])))
+    assert changes[1] < 0.5 * changes[0]
