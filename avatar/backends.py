@@ -153,7 +153,6 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
         box_low=low.astype(np.float32), box_high=high.astype(np.float32), weights=weights,
         skin_distance=np.abs(off_axis - 0.05).astype(np.float32), inside_skin=off_axis < 0.05,
         seeds=seeds.astype(np.float32),
-        seed_weights=np.eye(24, dtype=np.float32)[[0] * TEST_POINTS],
         seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
     )  # fmt: skip
     bones = np.tile(np.eye(4)[:3], (24, 1, 1))

@@ -24,6 +24,8 @@ SKINNING_CELL_M = 0.023
 """Spacing of the nodes of the skinning volume, metres."""
 CLOTHING_BAND_M = 0.08
 """Distance from the skin within which clothes and hair lie, metres."""
+BOX_MARGIN_M = 0.17
+"""Margin of the canonical box about the skin, metres; clothes must fit into it."""
 DISTANCE_CELL_M = 0.015
 """Cell size of the skin distance and the occupancy, metres."""
 
@@ -68,7 +70,6 @@ class Rig:
         inside_skin: Whether that center lies under the skin.
         seeds: Canonical points of the skin at which root finding starts, metres; one per voxel of
             `SEED_SPACING_M` and body part.
-        seed_weights: Skinning weights of the seeds.
         seed_parts: The body part of each seed.
     """
 
@@ -81,27 +82,21 @@ class Rig:
     skin_distance: Float32[np.ndarray, "cx cy cz"]
     inside_skin: Bool[np.ndarray, "cx cy cz"]
     seeds: Float32[np.ndarray, "seeds 3"]
-    seed_weights: Float32[np.ndarray, "seeds 24"]
     seed_parts: Int32[np.ndarray, "seeds"]
 
     @classmethod
-    def from_shaped_body(cls, shaped: ShapedBody, *, margin_m: float = 0.17) -> "Rig":
-        """The rig of a shaped body.
-
-        Args:
-            shaped: Shaped body; its pose blend shapes are ignored, as in the paper's code.
-            margin_m: Margin of the box about the canonical skin, metres; clothes must fit into it.
-        """
+    def from_shaped_body(cls, shaped: ShapedBody) -> "Rig":
+        """The rig of a shaped body; its pose blend shapes are ignored, as in the paper's code."""
         rotations, body = canonical_rotations(), shaped.body
         transforms = body_from_rest(shaped.joints, body.parents, rotations)
         blended = np.einsum("vj,jab->vab", body.weights, transforms)
         vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
-        low = (vertices.min(axis=0) - margin_m).astype(np.float32)
-        high = (vertices.max(axis=0) + margin_m).astype(np.float32)
+        low = (vertices.min(axis=0) - BOX_MARGIN_M).astype(np.float32)
+        high = (vertices.max(axis=0) + BOX_MARGIN_M).astype(np.float32)
         seeds = _seed_vertices(vertices, body.weights)
         normals = vertex_normals(vertices, body.faces)
         distance, inside = skin_distance_volume(
-            vertices, normals, low, high, DISTANCE_CELL_M, margin_m + 0.02
+            vertices, normals, low, high, DISTANCE_CELL_M, BOX_MARGIN_M + 0.02
         )
         return cls(
             rest_joints=shaped.joints,
@@ -110,12 +105,11 @@ class Rig:
             box_low=low,
             box_high=high,
             weights=skinning_weight_volume(
-                vertices, body.weights, low, high, SKINNING_CELL_M, margin_m + 0.05
+                vertices, body.weights, low, high, SKINNING_CELL_M, BOX_MARGIN_M + 0.05
             ),
             skin_distance=distance,
             inside_skin=inside,
             seeds=vertices[seeds].astype(np.float32),
-            seed_weights=body.weights[seeds].astype(np.float32),
             seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
         )
 

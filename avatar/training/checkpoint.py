@@ -120,7 +120,7 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
 
 
 def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
-    rig = Rig(**{name: tensor.numpy() for name, tensor in state["rig"].items()})
+    rig = Rig(**{item.name: state["rig"][item.name].numpy() for item in dataclasses.fields(Rig)})
     trainer = Trainer(rig, TrainConfig(**state["config"]), device)
     with torch.no_grad():
         for field, name in ((trainer.field, "field"), (trainer.avatar.field, "mean")):

@@ -92,7 +92,6 @@ class CorrectionResult:
         iou_after: Mean IoU with all corrections.
         corrections: The corrections, the one with the largest gain first.
         candidates: The best candidate of each cause in the first round, best first.
-        frame_iou: IoU of each frame as the files are; NaN where a frame has no pose.
         corrected: The geometry with all corrections.
         video: Edge scores of the video; None if no image was compared.
     """
@@ -101,7 +100,6 @@ class CorrectionResult:
     iou_after: float
     corrections: tuple[Correction, ...]
     candidates: tuple[CorrectionCandidate, ...]
-    frame_iou: Float[np.ndarray, "samples"]
     corrected: CaptureGeometry
     video: VideoEdgeResult | None = None
 
@@ -140,7 +138,6 @@ def _find_body_corrections(
     geometry: CaptureGeometry, objective: SilhouetteObjective, frames: int
 ) -> CorrectionResult:
     """The mistakes between body and masks; with a fitted camera where the others explain little."""
-    frame_iou = objective.frame_scores(geometry)
     search = _body_search(objective, frames)
     chosen, corrected, candidates = greedy_search(geometry, search)
     jumps = find_jumps(geometry)[0]
@@ -161,11 +158,10 @@ def _find_body_corrections(
             chosen, corrected = [camera, *others], better
             candidates = best_per_cause([*candidates, *evaluate([camera], geometry, objective)])
     return CorrectionResult(
-        iou_before=mean_score(frame_iou),
+        iou_before=mean_score(objective.frame_scores(geometry)),
         iou_after=mean_score(objective.frame_scores(corrected)),
         corrections=tuple(chosen),
         candidates=candidates,
-        frame_iou=frame_iou,
         corrected=corrected,
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.deformation.rig import PART_OF_JOINT
 from avatar.field.occupancy_grid import (
     INTERIOR_DEPTH_M,
     MIN_STEP_OPACITY,
@@ -161,7 +162,7 @@ def cell_at(rig, point):
 
 def knees(rig):
     """Where they are in canonical space."""
-    return [rig.seeds[rig.seed_weights.argmax(axis=1) == joint].mean(axis=0) for joint in (4, 5)]
+    return [rig.seeds[rig.seed_parts == PART_OF_JOINT[joint]].mean(axis=0) for joint in (4, 5)]
 
 
 def test_the_middle_of_the_knees_is_between_legs_and_what_is_before_or_beside_them_is_not(rig):
