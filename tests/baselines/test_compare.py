@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from baselines import compare
-from baselines.comparison_table import comparison_table, time_to_reach
+from baselines import compare, comparison_scores
+from baselines.comparison_table import comparison_table, time_to_reach, with_better_poses
 from studio.shoot import ShootConfig, film_capture
 
 
@@ -17,7 +17,10 @@ def compared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared")
     film_capture(folder / "sample", ShootConfig(size=32, frames=11))
     words = [str(folder / "sample"), "--steps", "6", "--out", str(folder / "out")]
-    assert compare.main([*words, "--methods", "anim-nerf", "ours"]) == 0
+    with pytest.MonkeyPatch.context() as quick:
+        quick.setattr(comparison_scores, "RENDERINGS", 2)
+        quick.setattr(comparison_scores, "CURVE_RENDERINGS", 1)
+        assert compare.main([*words, "--methods", "anim-nerf", "ours"]) == 0
     return folder, words
 
 
@@ -110,8 +113,9 @@ def test_missing_time_is_extrapolated_by_the_last_doubling(values, wanted, text)
 
 
 def test_a_capture_without_novel_poses_has_a_table():
-    scores = {"psnr": 30.0, "psnr_mask": 22.0, "ssim": 0.98}
-    none = dict.fromkeys(scores)
+    frame = {"psnr": 30.0, "psnr_mask": 22.0, "ssim": 0.98}
+    scores = {**frame, "frames": [frame]}
+    none = {**dict.fromkeys(frame), "frames": []}
     result = {
         "method": "ours", "core_seconds": 60.0, "steps": 100, "conditions": {"steps": None},
         "held_out": scores, "held_out_fitted": scores, "novel": none, "novel_fitted": none,
@@ -120,3 +124,14 @@ def test_a_capture_without_novel_poses_has_a_table():
     table = comparison_table([result])
     assert "| ours | 60 | 100 | 600 | - | - | - | - | 30.00 | 30.00 | 22.00 | 0.9800 |" in table
     assert "held-out frames in fitted poses, PSNR after" in table
+
+
+def test_a_pose_that_was_better_before_it_was_fitted_stays():
+    def scored(*values):
+        return {"frames": [{"psnr": value, "psnr_mask": value, "ssim": value} for value in values]}
+
+    result = {
+        "novel": scored(40.0, 20.0), "novel_fitted": scored(38.0, 26.0),
+        "held_out": scored(), "held_out_fitted": scored(),
+    }  # fmt: skip
+    assert with_better_poses(result)["novel_fitted"]["psnr"] == 33.0
