@@ -26,8 +26,8 @@ demo: install
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m apps.fetch_runtime
 
-results: install # docs/results.md: 50 minutes on two cores; MOTION=track.npz films a track of poses
-	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(MOTION),--motion $(MOTION))
+results: install # docs/results.md: an hour on two cores; MOTION=track.npz films a track of poses, PLAN=whole runs all
+	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
 
 test: install
 	$(BIN)/python -m pytest -q -m "not slow"
