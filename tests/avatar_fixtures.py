@@ -1,5 +1,6 @@
-"""Fixtures of the avatar and the baselines: a rig, poses, hash levels and a short training."""
+"""Shared fixtures: a body, an actor, a rig, poses, hash levels and a short training."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,11 +19,26 @@ from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.frame import Frame
+from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 from studio import actor_motions
 from studio.actor import Actor
 from studio.studio_cameras import static_camera
+
+
+@pytest.fixture(scope="session")
+def shaped() -> ShapedBody:
+    return load_body_model().with_shape()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def dressed_once():
+    """The same actor in every shoot: dressing takes a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Actor, "of", functools.cache(Actor.of))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,6 @@ from capture.camera import Camera
 from export.bake.bake_tables import BakeConfig, bake_field
 from export.build import ExportReport, export_field
 from export.package.player_tables import PlayerTables
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest
 
@@ -125,8 +124,7 @@ def capsule_field(rig: Rig) -> Callable:
 
 
 @pytest.fixture(scope="session")
-def stand_in() -> StandIn:
-    rig = Rig.from_shaped_body(load_body_model().with_shape())
+def stand_in(rig) -> StandIn:
     return StandIn(rig, capsule_field(rig), (rig.skin_distance < 0.10).astype(np.uint8))
 
 

@@ -1,4 +1,3 @@
-import functools
 from dataclasses import replace
 
 import cv2
@@ -24,14 +23,6 @@ from studio.shoot import ShootConfig, film_capture
 from studio.studio_cameras import static_camera
 
 SMALL = ShootConfig(frames=5, size=64, turns=1.0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def dressed_once():
-    """The same actor in every shoot: dressing takes a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Actor, "of", functools.cache(Actor.of))
-        yield
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3])

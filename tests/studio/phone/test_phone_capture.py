@@ -1,6 +1,5 @@
 """Captures as a phone gives them: what is wrong with them, and the truth beside it."""
 
-import functools
 from dataclasses import replace
 
 import cv2
@@ -15,21 +14,12 @@ from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from studio.actor import Actor
 from studio.phone.phone_pictures import drifting_exposure
 from studio.phone.tracker_errors import mean_joint_error_deg
 from studio.shoot import ShootConfig, film_capture
 
 FRAMES = 24
 PHONE = ShootConfig(frames=FRAMES, size=72, subject=3, like_a_phone=True)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def dressed_once():
-    """The same actor in every shoot: dressing takes a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Actor, "of", functools.cache(Actor.of))
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """The room and the phone that is carried around in it."""
 
-import functools
-
 import cv2
 import numpy as np
 import pytest
@@ -20,14 +18,6 @@ from studio.room.room_textures import dead_leaves, repeat_motif
 from studio.shoot import ShootConfig, film_capture
 
 WALK = ShootConfig(frames=6, size=128, motion="walkaround")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def dressed_once():
-    """The same actor in every shoot: dressing takes a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Actor, "of", functools.cache(Actor.of))
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,49 @@
+"""What jaxtyping's import hook writes above each function: types and shapes, checked once a call.
+
+The hook's own decorator binds the arguments and checks them twice, and it compiles the checks of an
+inner function anew at each call of the outer one. This one leaves inner functions out, and those
+without annotations.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any, ForwardRef, get_args
+
+from beartype import beartype
+from jaxtyping import AbstractArray, jaxtyped
+
+ONE_CALL = jaxtyped("context")
+"""Within it a name of an axis means one length."""
+
+
+def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
+    """Decorates as `jaxtyping.jaxtyped` does: a function, a method or a dataclass."""
+    if function is None:
+        return functools.partial(check_calls, typechecker=typechecker)
+    if isinstance(function, classmethod | staticmethod):
+        return type(function)(check_calls(function.__func__, typechecker=typechecker))
+    if not inspect.isfunction(function) or inspect.isgeneratorfunction(function):
+        return jaxtyped(function, typechecker=typechecker)
+    if "<locals>" in function.__qualname__ or not function.__annotations__:
+        return function
+    types = [part for each in function.__annotations__.values() for part in _parts(each)]
+    if any(isinstance(part, str | ForwardRef) for part in types):  # may only be known later
+        return jaxtyped(function, typechecker=typechecker)
+    checked = beartype(function)
+    if not any(inspect.isclass(part) and issubclass(part, AbstractArray) for part in types):
+        return checked
+
+    @functools.wraps(checked)
+    def within_one_call(*args: Any, **kwargs: Any) -> Any:
+        with ONE_CALL:
+            return checked(*args, **kwargs)
+
+    return within_one_call
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """The annotation and all that it is made of."""
+    yield annotation
+    for part in get_args(annotation):
+        yield from _parts(part)
