@@ -2,6 +2,7 @@
 
 import ast
 import collections
+import functools
 import graphlib
 import importlib
 import importlib.util
@@ -37,11 +38,14 @@ TORCH_FREE = ("capture", "preprocess", "export.player")
 PLAYER_FREE = ("torch", "cv2", "scipy", "numba", "onnx", "trimesh", "pycolmap")
 
 
+@functools.cache
 def sources():
     """Every Python file of the stages, with its syntax tree."""
-    for stage in STAGES:
-        for path in sorted((ROOT / stage).rglob("*.py")):
-            yield path.relative_to(ROOT), ast.parse(path.read_text(encoding="utf-8"))
+    return [
+        (path.relative_to(ROOT), ast.parse(path.read_text(encoding="utf-8")))
+        for stage in STAGES
+        for path in sorted((ROOT / stage).rglob("*.py"))
+    ]
 
 
 def modules(package):

@@ -50,16 +50,18 @@ FEW_STEPS = 10
 
 
 BRIEF = pytest.MonkeyPatch()
-"""Shorter fine-tuning and pose fitting; undone after each test, for other folders measure both."""
+"""A shorter end of a run; undone after each test, for other folders measure what it shortens."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
-    """Fine-tune on fewer, smaller images, and fit poses in fewer steps."""
+    """Fine-tune on fewer, smaller images, fit poses in fewer steps, and show a shorter film."""
     BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
     BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
     BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
+    BRIEF.setattr(report_writer, "ANIMATION_PX", 160)
+    BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 12)
 
 
 @pytest.hookimpl(trylast=True)

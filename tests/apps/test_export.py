@@ -104,7 +104,7 @@ def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
     assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
 
 
-@pytest.mark.parametrize("name", ["A.PLY", "a.OBJ"])
+@pytest.mark.parametrize("name", ["A.PLY", pytest.param("a.OBJ", marks=pytest.mark.slow)])
 def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, name):
     out = tmp_path / name
     code, said = call_export(run / "avatar.iavatar", "--to", name[2:].lower(), "--out", out)

@@ -15,6 +15,11 @@ from baselines.instant_avatar.posed_field import BroydenWarp
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
 BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
+COMPILED_SLOWLY = pytest.mark.parametrize(
+    "backend",
+    [pytest.param(TORCH, id="torch"), pytest.param(NUMBA, id="numba", marks=pytest.mark.slow)],
+)
+"""Broyden's kernel takes seven seconds to compile."""
 STEP_M = 0.05
 
 
@@ -145,7 +150,7 @@ def posed(rig):
     return *map(torch.from_numpy, (canonical, carried, slots)), warp.poses
 
 
-@BACKENDS
+@COMPILED_SLOWLY
 def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
     canonical, carried, slots, poses = posed
     roots, valid = find_all_roots(backend, carried, slots, poses)
@@ -153,7 +158,7 @@ def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
     assert (off < 1e-3).float().mean() >= 0.99
 
 
-@BACKENDS
+@COMPILED_SLOWLY
 def test_no_root_is_found_twice(backend, posed):
     _, carried, slots, poses = posed
     roots, valid = find_all_roots(backend, carried, slots, poses)
@@ -162,6 +167,7 @@ def test_no_root_is_found_twice(backend, posed):
     assert gap[both].min() >= SAME_ROOT_M
 
 
+@pytest.mark.slow
 def test_both_twins_find_the_same_roots(posed):
     _, carried, slots, poses = posed
     (roots, valid), (expected, rests) = (
@@ -175,6 +181,7 @@ def test_both_twins_find_the_same_roots(posed):
     assert (there < 1e-3).float().mean() > 0.97
 
 
+@pytest.mark.slow
 def test_nothing_is_found_of_nothing(posed):
     poses = posed[-1]
     for backend in (NUMBA, TORCH):

@@ -23,7 +23,9 @@ def psnr_between(one, other):
     [
         ({"skipping": "none"}, 45.0),
         ({"skipping": "frame"}, 40.0),
-        ({"skipping": "canonical", "roots": "broyden"}, 33.0),
+        pytest.param(
+            {"skipping": "canonical", "roots": "broyden"}, 33.0, marks=pytest.mark.slow
+        ),  # whose kernel takes seven seconds to compile
     ],
     ids=["no skipping", "frame grid", "broyden"],
 )
@@ -35,6 +37,7 @@ def test_every_scheme_renders_the_same_image(avatar, novel, choices, least_db):
     assert psnr_between(ours, theirs) > least_db
 
 
+@pytest.mark.slow
 def test_broydens_images_do_not_depend_on_the_grid(avatar, novel):
     """Both show a haze that ours lacks: roots far from the skin, where the field is untrained."""
     _, seen, cells = novel

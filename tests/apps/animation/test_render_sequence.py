@@ -214,7 +214,7 @@ def animation(motion, pelvis, folder):
     return path, []
 
 
-@pytest.mark.parametrize("write", [amass, humans, animation])
+@pytest.mark.parametrize("write", [amass, humans])
 def test_motions_of_other_programs_look_the_same(frames, player, novel, tmp_path, write):
     """Whatever world they are in: the camera stands before their first pose."""
     motion = read_motion(novel)

@@ -116,6 +116,7 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
         assert np.abs(off).max() < {"frame_offset": 1e-9, "frame_rate": 0.02}[cause]
 
 
+@pytest.mark.slow
 def test_a_stretched_film_is_named_and_its_camera_corrected(spoilt, tmp_path, call_check):
     folder, out = spoilt(stretched), tmp_path / "mended"
     _, said, found = call_check(folder, "--fix", out)
@@ -146,6 +147,7 @@ def test_two_persons_who_touch_in_the_masks_are_named(spoilt, call_check):
     assert "another person" in said
 
 
+@pytest.mark.slow
 def test_ingest_warns_of_masks_that_nothing_explains(spoilt, capsys):
     inputs = CaptureInputs(video=spoilt(lambda folder: with_neighbor(folder, share=0.6)))
     preflight_check(open_capture(inputs), inputs, Console(), force=False)

@@ -70,7 +70,7 @@ def test_a_growing_folder_with_growing_poses_becomes_an_avatar(watch, studio):
     folder, film_the_rest = studio
     thread = threading.Thread(target=film_the_rest)
     thread.start()
-    code, report = watch(folder, "--live", "--seconds", "4", "--idle-seconds", "5")
+    code, report = watch(folder, "--live", "--seconds", "2", "--idle-seconds", "5")
     thread.join()
     assert code == 0
     assert report["stream"]["realtime"]
@@ -93,7 +93,7 @@ def test_a_live_source_that_goes_on_is_left_when_the_time_is_up(watch, studio):
 def test_a_camera_with_growing_poses_becomes_an_avatar(watch, film):
     """A file stands in for the camera, opened through the same class."""
     code, report = watch(
-        f"camera:{film / 'video.mp4'}", "--poses", film / "poses.npz", "--seconds", "3"
+        f"camera:{film / 'video.mp4'}", "--poses", film / "poses.npz", "--seconds", "1.5"
     )
     assert code == 0
     assert report["stream"]["realtime"]

@@ -37,6 +37,7 @@ def test_a_played_video_is_learnt_while_it_lasts_and_none_of_it_is_lost(play, fi
     assert stream["ready_after_last_frame_seconds"] > 0.0
 
 
+@pytest.mark.slow
 def test_seconds_beyond_the_clip_are_used_after_it(play, film):
     report = play(film, "--seconds", "1.6")
     assert report["recipe"]["seconds"] == 1.6

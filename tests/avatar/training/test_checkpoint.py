@@ -35,8 +35,7 @@ def frames(rig, clip):
     return [prepare_frame(observation, rig) for observation in clip.observations[:3]]
 
 
-@pytest.fixture
-def trainer(rig, frames) -> Trainer:
+def taught(rig, frames) -> Trainer:
     trainer = Trainer(rig, CONFIG, CPU)
     for frame in frames:
         trainer.add_frame(frame)
@@ -46,9 +45,32 @@ def trainer(rig, frames) -> Trainer:
     return trainer
 
 
+@pytest.fixture(scope="module")
+def trainer(rig, frames) -> Trainer:
+    """After 20 steps; tests leave it as it is."""
+    return taught(rig, frames)
+
+
 @pytest.fixture
-def saved(trainer, tmp_path) -> Path:
-    return checkpoint.save(trainer, tmp_path / "checkpoint")
+def learner(rig, frames) -> Trainer:
+    """One like it that a test may teach more."""
+    return taught(rig, frames)
+
+
+@pytest.fixture(scope="module")
+def content(trainer, tmp_path_factory) -> tuple[str, bytes]:
+    """Name and bytes of its checkpoint."""
+    path = checkpoint.save(trainer, tmp_path_factory.mktemp("saved") / "checkpoint")
+    return path.name, path.read_bytes()
+
+
+@pytest.fixture
+def saved(content, tmp_path) -> Path:
+    """The checkpoint, to be spoilt."""
+    folder = tmp_path / "checkpoint"
+    folder.mkdir()
+    (folder / content[0]).write_bytes(content[1])
+    return folder / content[0]
 
 
 def damaged(path: Path, change) -> Path:
@@ -93,7 +115,7 @@ def test_the_avatar_looks_the_same_afterwards(trainer, clip, saved):
     np.testing.assert_array_equal(render(again.avatar, seen.pose, seen.camera), before)
 
 
-def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
+def test_training_goes_on_where_it_stopped(rig, frames, saved):
     again, fresh = checkpoint.load(saved.parent, CPU)[0], Trainer(rig, CONFIG, CPU)
     losses = []
     for learner in (again, fresh):
@@ -106,23 +128,24 @@ def test_training_goes_on_where_it_stopped(trainer, rig, frames, saved):
     assert again.frames_seen == 3
 
 
-def test_a_detached_state_is_that_of_the_step_it_was_taken_at(trainer, saved, tmp_path):
-    detached = checkpoint.detached_state(trainer)
-    trainer.step(rate=1.0, hard_surface_share=0.5)
+def test_a_detached_state_is_that_of_the_step_it_was_taken_at(learner, saved, tmp_path):
+    checkpoint.save(learner, saved.parent)
+    detached = checkpoint.detached_state(learner)
+    learner.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.write_state(detached, tmp_path / "later")
     before, after = (
         checkpoint.load(folder, CPU)[0] for folder in (saved.parent, tmp_path / "later")
     )
-    assert before.steps == after.steps == trainer.steps - 1
+    assert before.steps == after.steps == learner.steps - 1
     assert torch.equal(before.field.table, after.field.table)
-    assert not torch.equal(before.field.table, trainer.field.table)
+    assert not torch.equal(before.field.table, learner.field.table)
     moments = [each.optimizer.state[each.field.table]["exp_avg"] for each in (before, after)]
     assert torch.equal(*moments)
 
 
-def test_a_second_checkpoint_replaces_the_first(trainer, saved):
-    trainer.step(rate=1.0, hard_surface_share=0.5)
-    checkpoint.save(trainer, saved.parent)
+def test_a_second_checkpoint_replaces_the_first(learner, saved):
+    learner.step(rate=1.0, hard_surface_share=0.5)
+    checkpoint.save(learner, saved.parent)
     assert checkpoint.load(saved.parent, CPU)[0].steps == 21
     assert list(saved.parent.iterdir()) == [saved]
 

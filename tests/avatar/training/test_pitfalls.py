@@ -246,6 +246,7 @@ def large(large_clip) -> Taught:
     return taught(large_clip, LARGE_STEPS)
 
 
+@pytest.mark.slow
 def test_silhouettes_of_frames_it_has_not_seen_are_the_persons_at_256_px(small):
     assert min(small.overlaps()) >= 0.97
 

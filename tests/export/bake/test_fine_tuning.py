@@ -84,6 +84,13 @@ def tune(stand_in, views):
     return call
 
 
+@pytest.fixture(scope="module")
+def tuned(tune, renderer, spoilt):
+    """The spoilt tables after tuning, and the progress that was reported."""
+    told = []
+    return tune(spoilt, renderer, progress=told.append), told
+
+
 def test_rays_have_segments_of_several_layers(segments):
     further = np.bincount(segments.layer)[1:]
     assert further.sum() > 20
@@ -131,9 +138,9 @@ def squares(error) -> float:
 
 
 def test_tuning_lowers_the_error_on_a_view_that_it_did_not_see(
-    stand_in, tune, renderer, spoilt, bent, camera
+    stand_in, tuned, renderer, spoilt, bent, camera
 ):
-    after = tune(spoilt, renderer)
+    after, _ = tuned
     assert after.psnr[1] > after.psnr[0] + 1.0
     pose = replace(bent, joint_rotations=0.6 * bent.joint_rotations)
     unseen = inputs_of(stand_in.rig, pose, camera(96, 120, distance_m=2.6))
@@ -164,9 +171,8 @@ def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
     assert lies.asked == 10
 
 
-def test_progress_only_grows(tune, renderer, spoilt):
-    told = []
-    tune(spoilt, renderer, progress=told.append)
+def test_progress_only_grows(tuned):
+    _, told = tuned
     assert told == sorted(told)
     assert 0 < told[0] < told[-1] <= 1
     assert len(told) >= 11  # four judge, six are learnt from, and at least one round

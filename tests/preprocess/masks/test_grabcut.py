@@ -210,7 +210,7 @@ def test_the_predicted_background_has_local_brightness_and_spread(camera, rng):
     assert (sure[1][~never] == MIN_BACKGROUND_SPREAD).all()
 
 
-@pytest.mark.parametrize("thick_m", [0.0, 0.04])
+@pytest.mark.parametrize("thick_m", [pytest.param(0.0, marks=pytest.mark.slow), 0.04])
 def test_clothing_offsets_are_learnt_from_masks(shaped, camera, thick_m):
     """Masks of a body that is thicker by `thick_m` all over; the person turns once."""
     large = camera.resize((480, 600))
