@@ -1,7 +1,7 @@
 """What jaxtyping's import hook writes above each function: types and shapes, checked once a call.
 
 The hook's own decorator binds the arguments and checks them twice, and it compiles the checks of an
-inner function anew at each call of the outer one. This one leaves inner functions out, and those
+inner function at each call of the outer one. This one leaves inner functions out, and those
 without annotations.
 """
 
@@ -10,9 +10,11 @@ import inspect
 from collections.abc import Callable, Iterator
 from typing import Any, ForwardRef, get_args
 
-from beartype import beartype
-from jaxtyping import AbstractArray, jaxtyped
+from beartype import BeartypeConf, beartype
+from jaxtyping import AbstractArray, TypeCheckError, jaxtyped
 
+CHECK = beartype(conf=BeartypeConf(violation_type=TypeCheckError))
+"""Raises what jaxtyping raises, which is a TypeError."""
 ONE_CALL = jaxtyped("context")
 """Within it a name of an axis means one length."""
 
@@ -30,7 +32,7 @@ def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
     types = [part for each in function.__annotations__.values() for part in _parts(each)]
     if any(isinstance(part, str | ForwardRef) for part in types):  # may only be known later
         return jaxtyped(function, typechecker=typechecker)
-    checked = beartype(function)
+    checked = CHECK(function)
     if not any(inspect.isclass(part) and issubclass(part, AbstractArray) for part in types):
         return checked
 

@@ -102,9 +102,9 @@ def test_a_person_who_leaves_and_returns_is_lost_meanwhile(track_film):
     assert code == 0
     lost = [each for each in grade["doubtful"] if each["reason"] == "the person was not found"]
     assert len(lost) == 1
-    # frames 15 to 24 show the plant alone
-    assert lost[0]["start_s"] <= 16 / FPS
-    assert lost[0]["end_s"] >= 23 / FPS
+    # frames 17 to 26 show the plant alone
+    assert lost[0]["start_s"] <= 18 / FPS
+    assert lost[0]["end_s"] >= 25 / FPS
 
 
 def walk_past_the_plant_and_back():
@@ -115,7 +115,7 @@ def walk_past_the_plant_and_back():
     motion = turning_motion(actor, frames=2, fps=FPS, turns=0.02, seed=0)
     drawn = [actor.render_rgb_alpha(motion[row], camera) for row in range(2)]
     out = list(range(20, 160, 20))
-    places = [0] * 8 + out + [300] * 10 + out[::-1] + [0] * 10
+    places = [0] * 10 + out + [300] * 10 + out[::-1] + [0] * 20
     pictures = []
     for number, place in enumerate(places):
         moved = np.array([[1.0, 0.0, place], [0.0, 1.0, 0.0]])

@@ -58,19 +58,19 @@ def learner(rig, frames) -> Trainer:
 
 
 @pytest.fixture(scope="module")
-def content(trainer, tmp_path_factory) -> tuple[str, bytes]:
+def written(trainer, tmp_path_factory) -> tuple[str, bytes]:
     """Name and bytes of its checkpoint."""
     path = checkpoint.save(trainer, tmp_path_factory.mktemp("saved") / "checkpoint")
     return path.name, path.read_bytes()
 
 
 @pytest.fixture
-def saved(content, tmp_path) -> Path:
+def saved(written, tmp_path) -> Path:
     """The checkpoint, to be spoilt."""
     folder = tmp_path / "checkpoint"
     folder.mkdir()
-    (folder / content[0]).write_bytes(content[1])
-    return folder / content[0]
+    (folder / written[0]).write_bytes(written[1])
+    return folder / written[0]
 
 
 def damaged(path: Path, change) -> Path:
