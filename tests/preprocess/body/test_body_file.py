@@ -121,7 +121,7 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
 
 
 def test_a_missing_file_or_another_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no body file"):
+    with pytest.raises(InputError, match="does not exist; a body file was expected"):
         load_body_model(tmp_path / "body.npz")
     (tmp_path / "body.obj").write_text("v 0 0 0")
     with pytest.raises(InputError, match=r"\.obj"):
