@@ -27,6 +27,7 @@ from export.graph.graph_skinning import (
 from export.graph.graph_zbuffer import SplatWindow
 from export.graph.onnx_builder import GraphValue
 from export.package.player_tables import SURFEL_MASK
+from export.package.render_settings import MAX_TRUSTED_COMPRESSION
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,6 +43,7 @@ class DepthLayer:
         enter: Distance at which the ray enters the surface, metres.
         end: Distance at which it ends, metres.
         doubtful: Whether the surfel is folded or seen from behind.
+        compressed: Whether canonical space is compressed along the ray.
     """
 
     ray: VectorValue
@@ -53,6 +55,7 @@ class DepthLayer:
     enter: GraphValue
     end: GraphValue
     doubtful: GraphValue
+    compressed: GraphValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,6 +135,7 @@ def trace_depth_layer(
         enter=enter,
         end=end,
         doubtful=trusted.logical_not() | (dot(normal, direction) > 0.0),
+        compressed=dot(direction, direction) > MAX_TRUSTED_COMPRESSION**2,
     )
 
 

@@ -23,7 +23,7 @@ def filter_specks(
     first: DepthLayer,
     channels: list[GraphValue],
 ) -> list[GraphValue]:
-    """Replace doubtful pixels, and specks where light passes the first layer, by the median.
+    """Replace doubtful and compressed pixels, and specks behind the first layer, by the median.
 
     Linearized skinning carries rays to a wrong place in folded skin, and between sheets that cross
     it finds none; both are smaller than a footprint (`export.reference`: `filter_specks`).
@@ -38,7 +38,7 @@ def filter_specks(
     graph, window = context.graph, splats.window
     passed = first.transmittance > context.settings.layer_min_transmittance
     covered = graph.range(graph.size(cell).cast(np.int32))
-    suspect = covered.compress(first.doubtful | passed)
+    suspect = covered.compress(first.doubtful | first.compressed | passed)
     half, rows_columns = splats.footprint_px // 2, np.array(TAPS, dtype=np.int64)
     rows, columns = (graph.constant(part) for part in rows_columns.T)
     steps = ((rows * window.stride + columns) * half).cast(np.int32)
@@ -62,8 +62,8 @@ def filter_specks(
     )
     differs = apart[0].maximum(*apart[1:]) > MAX_MEDIAN_DIFFERENCE
     fine = splats.footprint_px > MIN_FOOTPRINT_PX - 1
-    speck = (medians[-1] > MIN_MEDIAN_ALPHA) & differs & fine
-    chosen = first.doubtful.gather(suspect) | speck
+    speck = first.compressed.gather(suspect) | ((medians[-1] > MIN_MEDIAN_ALPHA) & differs)
+    chosen = first.doubtful.gather(suspect) | (speck & fine)
     there = suspect.compress(chosen)
     *color, alpha = (
         value.scatter(there, part.compress(chosen))

@@ -119,6 +119,7 @@ def _add_further_layers(
             enter=before.enter,
             end=before.end.gather(kept),
             doubtful=before.doubtful,
+            compressed=before.compressed,
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         color = [

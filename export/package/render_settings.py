@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+MAX_TRUSTED_COMPRESSION = 3.0
+"""Canonical metres per metre along a ray above which a pixel is filtered: a footprint spans
+centimetres of cloth there, over which skinning is far from linear."""
 MIN_FOOTPRINT_PX = 3
-"""Edge of a surfel's footprint below which specks are kept: pixels are as coarse as they are, and
-the texture is, too."""
+"""Edge of a surfel's footprint below which only folded skin is filtered: pixels are as coarse as
+specks, and the texture is, too."""
 MIN_MEDIAN_ALPHA = 0.9
 """Least alpha of the median about a pixel that counts as the inside of the avatar."""
 MAX_MEDIAN_DIFFERENCE = 0.15

@@ -17,6 +17,7 @@ from export.package.graph_tables import skinning_nodes
 from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables
 from export.package.render_settings import (
     MAX_MEDIAN_DIFFERENCE,
+    MAX_TRUSTED_COMPRESSION,
     MIN_FOOTPRINT_PX,
     MIN_MEDIAN_ALPHA,
     RenderSettings,
@@ -65,6 +66,7 @@ class TracedPicture(NamedTuple):
         pixel: Numbers of the covered pixels, ascending.
         segments: Their rays, through all layers.
         doubtful: Whether the surfel that the pixel sees is folded or seen from behind.
+        compressed: Whether canonical space is compressed along the ray.
         passed: Whether light passes the first layer, so that others are looked for.
         footprint_px: Edge of a surfel's footprint.
     """
@@ -72,6 +74,7 @@ class TracedPicture(NamedTuple):
     pixel: Int64[np.ndarray, "pixels"]
     segments: RaySegments
     doubtful: Bool[np.ndarray, "pixels"]
+    compressed: Bool[np.ndarray, "pixels"]
     passed: Bool[np.ndarray, "pixels"]
     footprint_px: int
 
@@ -134,8 +137,8 @@ def filter_specks(
 ) -> Float32[np.ndarray, "height width 4"]:
     """Take the median of nine pixels, half a footprint apart, where the picture is unreliable.
 
-    It replaces doubtful pixels, and those inside of the avatar whose ray passed the first layer and
-    that differ from it: specks where sheets of skin cross.
+    It replaces doubtful and compressed pixels, and those inside of the avatar whose ray passed the
+    first layer and that differ from it: specks where sheets of skin cross.
     """
     half = traced.footprint_px // 2
     filtered, pixel = picture.reshape(-1, 4).copy(), traced.pixel
@@ -145,8 +148,8 @@ def filter_specks(
     median = np.median([bordered[row + i, column + j] for i, j in steps], axis=0)
     inside = median[:, 3] > MIN_MEDIAN_ALPHA
     differs = np.abs(median - filtered[pixel]).max(axis=1) > MAX_MEDIAN_DIFFERENCE
-    speck = traced.passed & inside & differs & (traced.footprint_px >= MIN_FOOTPRINT_PX)
-    chosen = traced.doubtful | speck
+    speck = traced.compressed | (traced.passed & inside & differs)
+    chosen = traced.doubtful | (speck & (traced.footprint_px >= MIN_FOOTPRINT_PX))
     filtered[pixel[chosen]] = median[chosen]
     return filtered.reshape(picture.shape)
 
@@ -169,6 +172,7 @@ def trace_picture(
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
     rays, depth, doubtful = _ray_entries(tables, settings, inputs, posed, covered, key, None)
+    compressed = (rays.direction_canonical**2).sum(axis=1) > MAX_TRUSTED_COMPRESSION**2
     segments = RaySegments.of_first_layer(
         rays, posed.nodes, tables.bricks, settings, inputs.samples
     )
@@ -194,7 +198,7 @@ def trace_picture(
         front.depth[alive], front.end[alive] = depth, rays.end
         front.surfel[alive] = surfel_of_key(key[alive])
         segments = segments.append_layer(behind)
-    return TracedPicture(covered, segments, doubtful, passed, splats.side)
+    return TracedPicture(covered, segments, doubtful, compressed, passed, splats.side)
 
 
 def _keys_behind(
