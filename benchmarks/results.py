@@ -4,22 +4,24 @@
 
 For each subject an exact and a phone-like sample are filmed and `python -m baselines.compare` is
 run on both, as many at a time as there are --jobs. What is in OUT already is not made again: Ctrl-C
-and the same command continue, with the most important comparisons first. Times are the processor's,
-so that other programs hardly count; commit, machine and versions come from the score files.
+or SIGTERM (the second one ends it at once) and the same command continue, with the most important
+comparisons first. Times are the processor's, so that other programs hardly count; commit, machine
+and versions come from the score files.
 """
 
 import json
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import cv2
 import tyro
 
-from apps.cli.exit_codes import run_command
+from apps.cli.exit_codes import INTERRUPTED, run_command
 from benchmarks.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
@@ -83,19 +85,56 @@ def run(job: ResultsJob) -> int:
     _claim(job)
     for sample in samples:
         film(job, sample)
-    codes, done = [0], 0
+    codes, comparisons = [0], RunningComparisons()
     with ThreadPoolExecutor(job.jobs) as pool:
-        running = [pool.submit(compare, job, each) for each in planned]
+        running = [pool.submit(compare, job, each, comparisons) for each in planned]
         try:
             for finished in as_completed(running):
                 codes.append(finished.result())
-                done += 1
-                print(f"{done} of {len(planned)} comparisons", file=sys.stderr, flush=True)
+                done = f"{len(codes) - 1} of {len(planned)} comparisons"
+                print(done, file=sys.stderr, flush=True)
                 write_page(job, samples)
+        except BaseException:
+            comparisons.stop()
+            raise
         finally:
-            pool.shutdown(cancel_futures=True)
+            try:
+                pool.shutdown(cancel_futures=True)
+            except KeyboardInterrupt:
+                comparisons.stop()  # the second signal ends them at once
+                raise
             write_page(job, samples)  # an interrupted run has a page, too
     return max(codes)
+
+
+@final
+class RunningComparisons:
+    """Processes that are running, each in a session of its own: they end with this one."""
+
+    def __init__(self) -> None:
+        """None is running."""
+        self._running: list[subprocess.Popen[bytes]] = []
+        self._is_stopped = False
+        self._lock = threading.Lock()
+
+    def run(self, command: list[str]) -> int:
+        """Runs a command to its end; its exit code, that of Ctrl-C once they were stopped."""
+        with self._lock:
+            if self._is_stopped:
+                return INTERRUPTED
+            process = subprocess.Popen(
+                command, cwd=ROOT, stdout=subprocess.DEVNULL, start_new_session=True
+            )
+            self._running.append(process)
+        code = process.wait()
+        return code if code >= 0 else 128 - code  # as a shell tells a signal
+
+    def stop(self) -> None:
+        """Asks what runs to stop as Ctrl-C does, the second time at once; nothing starts later."""
+        with self._lock:
+            self._is_stopped = True
+            for process in self._running:
+                process.terminate()
 
 
 def plan(name: str) -> list[PlannedComparison]:
@@ -153,7 +192,7 @@ def film(job: ResultsJob, sample: ComparedSample) -> None:
     film_capture(place, config)
 
 
-def compare(job: ResultsJob, planned: PlannedComparison) -> int:
+def compare(job: ResultsJob, planned: PlannedComparison, comparisons: RunningComparisons) -> int:
     """Compares the methods on a sample; the exit code."""
     sample = planned.sample
     command = [
@@ -161,7 +200,7 @@ def compare(job: ResultsJob, planned: PlannedComparison) -> int:
         "--seconds", f"{sample.seconds:g}", "--out", str(folder_of(job, sample)),
         "--methods", *planned.methods, *(["--redo-older"] if job.redo_older else []),
     ]  # fmt: skip
-    return subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
+    return comparisons.run(command)
 
 
 def folder_of(job: ResultsJob, sample: ComparedSample) -> Path:

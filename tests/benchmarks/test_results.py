@@ -1,12 +1,18 @@
 """docs/results.md: its plan, its tables, and that the text around them stays."""
 
 import json
+import os
+import signal
+import sys
+import threading
+import time
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
+from apps.cli.exit_codes import run_command
 from benchmarks import results
 from benchmarks.results import ResultsJob, plan, write_page
 from benchmarks.results_page import ComparedSample, results_lines
@@ -74,7 +80,7 @@ def test_the_most_important_comparisons_come_first():
 def test_an_interrupted_run_goes_on_and_other_films_are_refused(tmp_path, monkeypatch):
     filmed, compared = [], []
 
-    def compare(_, planned):
+    def compare(_, planned, __):
         compared.append(planned)
         return 130 if len(compared) == 3 else 0
 
@@ -88,6 +94,28 @@ def test_an_interrupted_run_goes_on_and_other_films_are_refused(tmp_path, monkey
     assert compared[len(plan("short")) :] == plan("short")
     with pytest.raises(InputError, match="filmed with"):
         results.run(replace(job, size=128))
+
+
+def test_sigterm_ends_the_comparison_that_runs(tmp_path, monkeypatch):
+    started, ended = tmp_path / "started", []
+    program = "import pathlib, sys, time; pathlib.Path(sys.argv[1]).touch(); time.sleep(60)"
+
+    def compare(_, __, comparisons):
+        ended.append(comparisons.run([sys.executable, "-c", program, str(started)]))
+        return ended[-1]
+
+    def terminate_once_it_runs():
+        while not started.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(results, "film_capture", lambda place, _: place.mkdir())
+    monkeypatch.setattr(results, "compare", compare)
+    job = ResultsJob(out=tmp_path / "out", jobs=1)
+    threading.Thread(target=terminate_once_it_runs, daemon=True).start()
+    assert run_command("results", lambda: results.run(job)) == 130
+    assert ended[0] == 128 + signal.SIGTERM
+    assert set(ended[1:]) <= {130}  # nothing was started after it
 
 
 def test_text_around_the_tables_is_kept(tmp_path):
