@@ -181,7 +181,7 @@ def associate_masks(masks: Masks | None, source: FrameSource) -> Callable[[int],
             return lambda index: index
         raise InputError(
             f"No masks were found for {source.path}. Give --masks: a folder with one 8-bit picture "
-            "a frame, 255 where the person is, or segmenter:grabcut to have them estimated."
+            "a frame, 255 where the person is, or segmenter:blazepose to have them estimated."
         )
     if not same_aspect_ratio(masks.size_px, source.size_px):
         raise InputError(

@@ -32,7 +32,7 @@ class CaptureArguments:
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, one per frame, 255 where the person is: a folder of images, a video, an .npz, or COCO
     run-length codes. Default: tracked with the poses, or estimated from images and given poses
-    (segmenter:grabcut); segmenter:NAME selects another installed segmenter."""
+    (segmenter:blazepose); segmenter:NAME selects another installed segmenter."""
     mask_invert: Flag = False
     """Masks are dark where the person is (default: detected automatically)."""
     no_mask_invert: Flag = False

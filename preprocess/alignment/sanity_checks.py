@@ -147,7 +147,7 @@ def _mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
     if objective.are_boxes:
         yield (
             "The masks are boxes, not outlines: all that is in them will be learnt as the person. "
-            "Leave them out (--masks segmenter:grabcut), or give a segmenter's."
+            "Leave them out (--masks segmenter:blazepose), or give a segmenter's."
         )
 
 

@@ -207,8 +207,7 @@ def sample_masks(
     usable = [start + step * n for n in range(source.frame_count or 1)]
     usable = [frame for frame in usable if frame not in excluded_frames] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
-    full = source.size_px
-    size_px = _scaled_size(full, COARSE_MASK_PX)
+    size_px = _scaled_size(source.size_px, COARSE_MASK_PX)
     if masks is None:
         found, refused = _sample_alpha_channels(source, frames, size_px), []
     else:
@@ -218,17 +217,27 @@ def sample_masks(
         raise InputError(
             f"None of the masks of {len(frames)} frames of {source.path} shows a person."
         )
-    heights = [_mask_height(alpha) for _, alpha in found]
-    longer = max(size_px) * person_px / max(float(np.median(heights)), 1.0)
-    small = _scaled_size(full, min(longer, 4.0 * person_px))
-    return SilhouetteObjective(
-        samples=tuple(
-            MaskSample(index=index, camera_row=camera_row(index), alpha=_resize_alpha(alpha, small))
-            for index, alpha in found
-        ),
-        skin=skin,
-        rejections=tuple(refused),
-    )
+    samples = [
+        MaskSample(index=index, camera_row=camera_row(index), alpha=alpha) for index, alpha in found
+    ]
+    samples = reduce_masks(samples, source.size_px, person_px)
+    return SilhouetteObjective(samples=samples, skin=skin, rejections=tuple(refused))
+
+
+def reduce_masks(
+    samples: Sequence[MaskSample], full_px: tuple[int, int], person_px: int
+) -> tuple[MaskSample, ...]:
+    """Bring masks of one size to one in which the person has a height.
+
+    Args:
+        samples: The masks; each shows a person.
+        full_px: Width and height of the frames.
+        person_px: Height of the person in the result, px.
+    """
+    tall = float(np.median([_mask_height(each.alpha) for each in samples]))
+    longer = max(samples[0].alpha.shape) * person_px / max(tall, 1.0)
+    small = _scaled_size(full_px, min(longer, 4.0 * person_px))
+    return tuple(replace(each, alpha=_resize_alpha(each.alpha, small)) for each in samples)
 
 
 class CaptureEvidence(NamedTuple):

@@ -19,6 +19,7 @@ from preprocess.blazepose.blazepose_detector import (
 )
 from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks, FoundLandmarks
 from preprocess.blazepose.person_square import PersonSquare
+from preprocess.tracking.dark_film import DarkFilmBrightener
 from preprocess.tracking.keypoints import PersonKeypoints
 
 SHOULDERS, HIPS, KNEES = (11, 12), (23, 24), (25, 26)
@@ -134,7 +135,7 @@ class BlazePoseTracker:
         """
         if person is not None and person < 1:
             raise InputError(f"--person {person}: persons are counted from 1, the leftmost one.")
-        self._detect = BlazePoseDetector()
+        self._brighten, self._detect = DarkFilmBrightener(), BlazePoseDetector()
         self._find_landmarks = BlazePoseLandmarks()
         self._person = person
         self._last: LastPlace | None = None
@@ -145,6 +146,7 @@ class BlazePoseTracker:
 
     def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
+        rgb = self._brighten(rgb)
         found = self._follow(rgb) or self._find(rgb)
         if found is None:
             if self._last is not None:

@@ -9,9 +9,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
-from preprocess.alignment.silhouette_objective import CaptureEvidence
+from preprocess.alignment.silhouette_objective import (
+    CaptureEvidence,
+    MaskSample,
+    SilhouetteObjective,
+    reduce_masks,
+)
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
@@ -26,6 +32,7 @@ from preprocess.fitting.clip_fitting import (
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
+from preprocess.observation import Observation
 from preprocess.observe import associate_cameras
 
 KEY_FRAMES = 120
@@ -35,7 +42,8 @@ MIN_ITERATIONS = 6
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 60
-"""Frames whose masks are fitted where key points tell the poses between them."""
+"""Frames whose masks are fitted where key points tell the poses between them, or where masks must
+be estimated."""
 TRACKED_FRAMES_PER_PRIOR = 30.0
 """Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5
@@ -156,11 +164,11 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         The problem, at its start; None without enough masks or key points.
     """
     track, has_masks = capture.motion.keypoints, capture.masks is not None
-    has_masks |= capture.source.has_alpha
+    has_masks |= capture.source.has_alpha or capture.segment is not None
     if capture.live is not None or not (has_masks or track):
         return None
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
-    count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
+    count = TRACKED_KEY_FRAMES if track or capture.segment else KEY_FRAMES
     outlines = _read_outlines(capture, geometry, count) if has_masks else {}
     numbers = {*outlines, *([] if track is None else track.frames.tolist())}
     sizes = [each.camera.size_px for each in outlines.values()]
@@ -214,8 +222,11 @@ def _read_outlines(
     capture: Capture, geometry: CaptureGeometry, count: int
 ) -> dict[int, OutlineDistances]:
     """Outlines of evenly spread masks, by frame."""
-    evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
-    objective = evidence.silhouettes(SkinPoints.of(capture.shaped, 1), count, OUTLINE_PERSON_PX)
+    if capture.segment is not None:
+        objective = _estimate_silhouettes(capture, count)
+    else:
+        evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
+        objective = evidence.silhouettes(SkinPoints.of(capture.shaped, 1), count, OUTLINE_PERSON_PX)
     if objective is None:
         return {}
     return {
@@ -225,6 +236,26 @@ def _read_outlines(
         for sample in objective.samples
         if geometry.row_for_frame(sample.index) is not None
     }
+
+
+def _estimate_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
+    """Estimated masks of evenly spread frames; None if there is none."""
+    source, observe = capture.source, capture.observation_builder()
+    chosen, camera_row = source.selection, associate_cameras(capture.cameras, source)
+    stride = chosen.step * max(1, -(-(source.frame_count or 1) // count))
+    some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
+    seen = map(observe, open_source(source.path, frames=some).frames())
+    samples = [
+        MaskSample(
+            index=each.frame.index, camera_row=camera_row(each.frame.index), alpha=each.alpha
+        )
+        for each in seen
+        if isinstance(each, Observation)
+    ]
+    if not samples:
+        return None
+    samples = reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX)
+    return SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped, 1))
 
 
 def _reduction(capture: Capture, fitter: ClipFitter) -> float:

@@ -25,7 +25,7 @@ def check_mask_folder(named: Path | None) -> None:
     if named is not None and segmenter_name(named) is None and not named.is_dir():
         raise InputError(
             f"There is no folder of masks {named}. Give --masks: the folder to which "
-            "they will be written, or segmenter:grabcut to have them estimated."
+            "they will be written, or segmenter:blazepose to have them estimated."
         )
 
 

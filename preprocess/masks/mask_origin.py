@@ -18,7 +18,7 @@ from preprocess.plugins import make_plugin
 
 SEGMENTER_PREFIX = "segmenter:"
 """What precedes a segmenter's name in --masks."""
-DEFAULT_SEGMENTER = "grabcut"
+DEFAULT_SEGMENTER = "blazepose"
 """Name of this project's own segmenter."""
 
 
@@ -54,9 +54,9 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
         InputError: If no package registers that name, or its segmenter cannot be loaded.
     """
     if name == DEFAULT_SEGMENTER:
-        from preprocess.masks.grabcut import GrabCutSegmenter
+        from preprocess.blazepose.blazepose_segmenter import BlazePoseSegmenter
 
-        return GrabCutSegmenter(shaped)
+        return BlazePoseSegmenter(shaped)
     option = f"--masks {SEGMENTER_PREFIX}{name}"
     return make_plugin("segmenter", name, shaped, own=DEFAULT_SEGMENTER, option=option)
 

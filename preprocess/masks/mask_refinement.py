@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from preprocess.masks.background_plate import BackgroundPlate, PlateColors
 from preprocess.masks.local_colors import color_density, local_densities
 from preprocess.masks.matting import apply_coefficients, guided_coefficients, refine_border
+from preprocess.tracking.dark_film import DarkFilmBrightener
 from preprocess.tracking.keypoints import CroppedMask
 
 WORKING_SCALE = 2.0
@@ -108,7 +109,7 @@ class MaskRefiner:
             frame_px: Width and height of the frames.
         """
         self._frame_px = frame_px
-        self._plate = BackgroundPlate()
+        self._brighten, self._plate = DarkFilmBrightener(), BackgroundPlate()
         self._reduction = 0
         self._histograms = np.zeros((2, 16**3), np.float32)
 
@@ -128,7 +129,7 @@ class MaskRefiner:
         Returns:
             How far each pixel is person, in [0, 1].
         """
-        alpha = self._refine(rgb, mask)
+        alpha = self._refine(self._brighten(rgb), mask)
         if size_px is None or size_px == self._frame_px:
             return alpha
         way = cv2.INTER_AREA if size_px[0] < self._frame_px[0] else cv2.INTER_LINEAR

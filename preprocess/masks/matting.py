@@ -1,87 +1,17 @@
-"""Alpha matting of a mask's border, with local mean colors or with a known background.
+"""Alpha matting of a mask's border before a known background, and the guided filter.
 
 A border pixel shows I = a F + (1 - a) B (Chuang et al. 2001, a Bayesian approach to digital
-matting). `soften_border` takes F and B from the colors beside the border of a hard mask.
-`refine_border` knows the background: the border may be displaced from the mask's, each displacement
-gives a pixel its a, and is weighted by the prior of the mask's error and by the likelihood of the
-color. The result is the mean over all displacements. `guided_coefficients` are those of the guided
-filter with a color guide (He et al. 2013, Guided image filtering).
+matting). `refine_border` knows the background: the border may be displaced from the mask's, each
+displacement gives a pixel its a, and is weighted by the prior of the mask's error and by the
+likelihood of the color. The result is the mean over all displacements. `guided_coefficients` are
+those of the guided filter with a color guide (He et al. 2013, Guided image filtering).
 """
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Float32, Shaped
 
 from preprocess.body.silhouette import signed_distance_px
-
-LOCAL_COLOR_PX = 1.0
-"""Gaussian σ, px, of the mean colors of person and background around a border pixel."""
-
-EDGE_SIGMA_PX = 0.5
-"""Gaussian σ, px, of an image's edge: the blur of lens and pixel."""
-
-COLOR_CONTRAST = 20.0, 45.0
-"""Difference of the two mean colors, in levels, from which color counts, and counts fully; below
-the first the mask is only smoothed."""
-
-MAX_COLOR_WEIGHT = 0.5
-"""Largest weight of color against the smoothed mask: thin stripes and hair mislead it."""
-
-CROP_MARGIN_PX = 8
-"""Margin around the mask that is processed, px."""
-
-MIXTURE_RESIDUAL = 30.0
-"""Distance of a pixel's color from all mixtures, in levels, at which its weight is halved."""
-
-
-def soften_border(
-    rgb: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]
-) -> Float32[np.ndarray, "height width"]:
-    """Split the pixels along a hard mask's border between person and background.
-
-    A border pixel is a mixture I = a F + (1 - a) B of the mean colors of person and background
-    beside it, so a is the projection of I - B on F - B. It is averaged with the blurred mask, and
-    counts less where F and B are alike or I is far from every mixture of them.
-    """
-    hard = mask.astype(np.uint8)
-    left, top, width, height = cv2.boundingRect(hard)
-    around = np.s_[max(top - CROP_MARGIN_PX, 0) : top + height + CROP_MARGIN_PX,
-                   max(left - CROP_MARGIN_PX, 0) : left + width + CROP_MARGIN_PX]  # fmt: skip
-    alpha = hard.astype(np.float32)
-    alpha[around] = _soften_crop(rgb[around], np.ascontiguousarray(hard[around]))
-    return alpha
-
-
-def _soften_crop(
-    rgb: UInt8[np.ndarray, "height width 3"], hard: UInt8[np.ndarray, "height width"]
-) -> Float32[np.ndarray, "height width"]:
-    square = np.ones((3, 3), np.uint8)
-    inside, touched = cv2.erode(hard, square), cv2.dilate(hard, square)
-    border = (touched > 0) & (inside == 0)
-    smooth = cv2.GaussianBlur(hard.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
-    image = rgb.astype(np.float32)
-    front, has_front = _local_mean_color(image, inside)
-    back, has_back = _local_mean_color(image, 1 - touched)
-    apart = front - back
-    squared = (apart**2).sum(axis=-1)
-    share = ((image - back) * apart).sum(axis=-1) / np.maximum(squared, np.float32(1.0))
-    beside = np.abs(image - back - share[..., None] * apart).max(axis=-1)
-    low, high = COLOR_CONTRAST[0] ** 2, COLOR_CONTRAST[1] ** 2
-    trust = MAX_COLOR_WEIGHT * np.clip((squared - low) / (high - low), 0.0, 1.0)
-    trust *= np.clip(1.5 - beside / MIXTURE_RESIDUAL, 0.0, 1.0) * (has_front & has_back)
-    alpha = trust * np.clip(share, 0.0, 1.0) + (1.0 - trust) * smooth
-    return np.where(border, alpha, hard).astype(np.float32)
-
-
-def _local_mean_color(
-    image: Float32[np.ndarray, "height width 3"], selected: UInt8[np.ndarray, "height width"]
-) -> tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Mean color of the selected pixels around each pixel, and whether there are any."""
-    chosen = selected.astype(np.float32)
-    weight = cv2.GaussianBlur(chosen, (0, 0), LOCAL_COLOR_PX)
-    total = cv2.GaussianBlur(image * chosen[..., None], (0, 0), LOCAL_COLOR_PX)
-    return total / np.maximum(weight, np.float32(1e-6))[..., None], weight > 1e-4
-
 
 BORDER_SIGMA_PX = 0.35
 """Standard deviation of a mask's border error, px."""

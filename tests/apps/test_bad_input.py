@@ -73,7 +73,7 @@ def test_a_folder_without_what_was_asked_for(refused, capture, tmp_path, option)
     refused(capture, f"--{option}", tmp_path / "empty", words=["empty", "expected"])
 
 
-@pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:grabcut"]])
+@pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:blazepose"]])
 def test_poses_in_degrees(refused, capture, changed, flags):
     with np.load(capture / "poses.npz") as given:
         changed(capture / "poses.npz", body_pose=np.rad2deg(given["body_pose"]))
@@ -198,7 +198,7 @@ def test_empty_masks(refused, capture):
 
 
 def test_a_segmenter_that_is_not_installed_is_refused(refused, capture):
-    refused(capture, "--masks", "segmenter:sam", words=["no such segmenter", "grabcut"])
+    refused(capture, "--masks", "segmenter:sam", words=["no such segmenter", "blazepose"])
 
 
 def test_a_camera_of_another_aspect_ratio(refused, capture, changed):

@@ -17,7 +17,7 @@ from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 
 FRAMES = 4
-ESTIMATED, ALPHA = "estimated by GrabCut", "alpha channel"
+ESTIMATED, ALPHA = "estimated by BlazePose", "alpha channel"
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def lower(mask):
 
 
 def wanted(folder, given, *, live):
-    masks = {"given": folder / "mine", "segmenter": Path("segmenter:grabcut")}.get(given)
+    masks = {"given": folder / "mine", "segmenter": Path("segmenter:blazepose")}.get(given)
     return CaptureInputs(video=folder, masks=masks, live=live, idle_s=1.0)
 
 

@@ -74,7 +74,7 @@ def test_missing_masks_are_estimated_with_a_note(film, tmp_path):
     for name in ("video.mp4", "poses.npz", "cameras.npz"):
         shutil.copy(film / name, bare / name)
     recording = open_capture(CaptureInputs(video=bare))
-    assert any("estimated" in note and "segmenter:grabcut" in note for note in recording.notes)
+    assert any("estimated" in note and "segmenter:blazepose" in note for note in recording.notes)
     true = open_capture(CaptureInputs(video=film))
     assert true.mask_report() == {"masks": "masks", "mask_agreement": None}
     alike = [
@@ -83,7 +83,7 @@ def test_missing_masks_are_estimated_with_a_note(film, tmp_path):
     ]
     assert np.mean(alike) > 0.85  # of 64 px; larger pictures reach 0.95 and more
     told = recording.mask_report()
-    assert told["masks"] == "estimated by GrabCut"
+    assert told["masks"] == "estimated by BlazePose"
     assert 0.6 < told["mask_agreement"] < 1.0
 
 
@@ -108,9 +108,9 @@ def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
         Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
     (folder / "DONE").touch()
     paths = {"video": folder, "poses": film / "poses.npz", "cameras": f"{film}/cameras.npz"}
-    with pytest.raises(InputError, match="segmenter:grabcut"):
+    with pytest.raises(InputError, match="segmenter:blazepose"):
         open_capture(CaptureInputs(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
-    named = Path("segmenter:grabcut")
+    named = Path("segmenter:blazepose")
     live = open_capture(CaptureInputs(**paths, live=True, masks=named, idle_s=1.0))
     assert any("estimated" in note for note in live.notes)
     found = list(live.observations())

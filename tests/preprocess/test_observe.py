@@ -166,7 +166,7 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
 
 def test_without_masks_and_a_segmenter_there_is_nothing_to_do(parts):
     source, _, cameras = parts()
-    with pytest.raises(InputError, match=r"No masks were found.*--masks.*segmenter:grabcut"):
+    with pytest.raises(InputError, match=r"No masks were found.*--masks.*segmenter:blazepose"):
         observe(source, moving(COUNT), None, cameras)
 
 

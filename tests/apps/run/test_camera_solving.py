@@ -108,7 +108,7 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
     changed(poses, K=None)
     stated, silent = (
         open_capture(replace(job_of(walkaround).paths, **parts))
-        for parts in ({}, {"poses": poses, "masks": Path("segmenter:grabcut")})
+        for parts in ({}, {"poses": poses, "masks": Path("segmenter:blazepose")})
     )
     assert silent.cameras[0].focal_px[0] > 1.2 * stated.cameras[0].focal_px[0]  # a phone's
     one, other = (apply_camera_solution(each, solved_of(solved_run)) for each in (stated, silent))
@@ -223,7 +223,7 @@ def test_a_broken_solver_process_is_reported_with_its_log(walkaround, tmp_path):
 def test_without_masks_the_posed_body_says_where_the_person_is(walkaround):
     masked, posed = (
         open_capture(replace(job_of(walkaround).paths, masks=masks))
-        for masks in (walkaround / "masks", Path("segmenter:grabcut"))
+        for masks in (walkaround / "masks", Path("segmenter:blazepose"))
     )
     frame = next(masked.source.frames())
     mask = make_person_mask(masked)(frame, (160, 90))

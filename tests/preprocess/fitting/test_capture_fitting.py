@@ -1,11 +1,14 @@
 """A capture with the changes of a fit."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
+from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
@@ -14,10 +17,20 @@ from studio.shoot import ShootConfig, film_capture
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
+def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fit") / "capture"
     film_capture(folder, ShootConfig(frames=12, size=64))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def capture(folder):
     return open_capture(CaptureInputs(video=folder))
+
+
+@pytest.fixture(scope="module")
+def unmasked(folder):
+    return open_capture(CaptureInputs(video=folder, masks=Path("segmenter:blazepose")))
 
 
 @pytest.fixture
@@ -66,7 +79,20 @@ def test_a_fit_that_is_not_taken_changes_nothing(capture, fit):
     assert kept.shaped is capture.shaped
 
 
-def test_exact_poses_are_left_alone(capture):
-    found = fit_capture(capture)
+@pytest.mark.parametrize("masks", ["capture", "unmasked"])
+def test_exact_poses_are_left_alone(masks, request):
+    found = fit_capture(request.getfixturevalue(masks))
     assert found is not None
     assert not found.taken
+
+
+def test_without_masks_poses_are_fitted_to_estimated_ones(unmasked):
+    motion, angle = unmasked.motion, np.radians(6.0)
+    lean = rotation_matrices(np.array([0.0, 0.0, angle]))
+    leaning = axis_angles_from_matrices(lean @ rotation_matrices(motion.root_rotations))
+    found = fit_capture(replace(unmasked, motion=replace(motion, root_rotations=leaning)))
+    assert found is not None
+    assert found.taken
+    assert found.error_after_cm < 0.7 * found.error_before_cm
+    turned = np.linalg.norm(found.corrections[:, :3], axis=1)
+    assert 0.5 * angle < turned.mean() < 1.2 * angle  # priors hold it back
