@@ -29,7 +29,7 @@ web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 results: install # docs/results.md: an hour on two cores; MOTION=track.npz films a track of poses, PLAN=whole runs all
 	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
 
-test: install # on one thread: these tests are small, and a second one would wait more than it works
+test: install # on one thread: these tests are small, a second thread costs more CPU time than it saves
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow"
 
 test-all: install # the slow ones, too: long trainings, the browser, a fresh installation
