@@ -24,6 +24,7 @@ from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.live.live_inputs import LiveInputs
 from preprocess.live.tracked_stream import LiveTracking
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_origin import Segmenter, segmenter_name
 from preprocess.observation import Observation
@@ -48,6 +49,7 @@ class CaptureInputs:
         height_m: How tall the person is; None if only the poses tell.
         tracker: Name of the tracker that finds poses where none are given; None for the built-in
             one.
+        refine_masks: Whether given masks are refined where their borders miss the pictures' edges.
         transposed: Whether the film's width and height are exchanged before masks and cameras are
             compared with it; only to find out whether it was rotated.
     """
@@ -64,6 +66,7 @@ class CaptureInputs:
     idle_s: float = IDLE_TIMEOUT_S
     height_m: float | None = None
     tracker: str | None = None
+    refine_masks: bool = True
     transposed: bool = False
 
     def input_paths(self) -> list[Path]:
@@ -97,6 +100,7 @@ class Capture:
         live: Poses and masks of a live source, which come while it runs, or what tracks them;
             `motion` is what had come when it was opened.
         segment: What estimates the masks, if nothing holds them.
+        mask_refiner: What refines given masks; None if they stay as they are.
         camera_report: Entry of the report about solved cameras.
         tracking_report: Entry of the report about poses that were tracked in the video.
         refit: How the poses were fitted to the masks, if they were made for another body.
@@ -114,6 +118,7 @@ class Capture:
     notes: tuple[str, ...]
     live: LiveInputs | LiveTracking | None = None
     segment: Segmenter | None = None
+    mask_refiner: GivenMaskRefiner | None = None
     camera_report: dict[str, Any] | None = None
     tracking_report: dict[str, Any] | None = None
     refit: BodyPlacement | None = None
@@ -151,11 +156,12 @@ class Capture:
         """What joins a frame with its pose, mask and camera."""
         if self.live is not None:
             return self.live.observation_builder(
-                self.source, self.cameras, self.size_px, self.segment, self.live_fit
-            )
+                self.source, self.cameras, self.size_px, segment=self.segment,
+                refine=self.mask_refiner, fit=self.live_fit,
+            )  # fmt: skip
         return observation_builder(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
-            segment=self.segment,
+            segment=self.segment, refine=self.mask_refiner,
         )  # fmt: skip
 
     def take_revised_poses(self) -> dict[int, BodyPose]:
@@ -171,12 +177,15 @@ class Capture:
         if isinstance(self.live, LiveTracking) and self.live.given_masks is None:
             return {"masks": "tracked", "mask_agreement": None}
         source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
-        return {"masks": source, "mask_agreement": None}
+        refined = self.mask_refiner is not None and self.mask_refiner.is_needed
+        return {"masks": f"{source}, refined" if refined else source, "mask_agreement": None}
 
     def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""
         if isinstance(self.live, LiveTracking):
             yield from self.live.final_notes()
+        if self.mask_refiner is not None and self.mask_refiner.note is not None:
+            yield self.mask_refiner.note
         growing = self.live_fit
         if growing is not None and growing.placement is not None:
             yield f"{growing.placement.describe()} (By the first {growing.frame_count} frames.)"

@@ -16,6 +16,7 @@ from capture.source import FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_name, associate_by_order, associate_by_time
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_origin import Segmenter
 from preprocess.observation import Observation
@@ -42,9 +43,12 @@ def observe(
     *,
     size_px: int | None = None,
     segment: Segmenter | None = None,
+    refine: GivenMaskRefiner | None = None,
 ) -> Iterator[Observation | DroppedFrame]:
     """Observations of the wanted frames in order, lazily; `observation_builder` says the rest."""
-    observed = observation_builder(source, motion, masks, cameras, size_px=size_px, segment=segment)
+    observed = observation_builder(
+        source, motion, masks, cameras, size_px=size_px, segment=segment, refine=refine
+    )
     return map(observed, source.frames())
 
 
@@ -56,6 +60,7 @@ def observation_builder(
     *,
     size_px: int | None = None,
     segment: Segmenter | None = None,
+    refine: GivenMaskRefiner | None = None,
 ) -> Callable[[Frame], Observation | DroppedFrame]:
     """What makes an observation of a frame, after everything was checked.
 
@@ -66,6 +71,7 @@ def observation_builder(
         cameras: Cameras of the frames' size.
         size_px: Longer side of the observations; pictures are never enlarged.
         segment: What estimates the mask where there are no `masks`, whatever the alpha channel.
+        refine: What refines given masks.
 
     Raises:
         InputError: At once, if the parts do not fit together.
@@ -95,6 +101,7 @@ def observation_builder(
         lambda index: cameras[camera_row(index)],
         target_px,
         segment=segment if made else None,
+        refine=refine,
     )
 
 
@@ -105,6 +112,7 @@ def compose_observation_builder(
     target_px: tuple[int, int],
     *,
     segment: Segmenter | None = None,
+    refine: GivenMaskRefiner | None = None,
 ) -> Callable[[Frame], Observation | DroppedFrame]:
     """What joins a frame with its pose, mask and camera, each found by a function of its own.
 
@@ -114,7 +122,13 @@ def compose_observation_builder(
         camera_of: The camera of a frame's number, of the frames' size.
         target_px: Width and height of the observations.
         segment: What finds the mask in place of `alpha_of`, once the frame was scaled.
+        refine: What refines the mask that `alpha_of` finds.
     """
+
+    def given_alpha(frame: Frame) -> Float32[np.ndarray, "height width"]:
+        if refine is None or refine.is_decided:
+            return alpha_of(frame, target_px)
+        return refine(frame.rgb, alpha_of(frame, frame.size_px), target_px)
 
     def joined(frame: Frame) -> Observation | DroppedFrame:
         if "corrupt" in frame.flags:
@@ -125,7 +139,7 @@ def compose_observation_builder(
         camera = camera_of(frame.index).resize(target_px)
         try:
             if segment is None:
-                alpha, scaled = alpha_of(frame, target_px), _resize_frame(frame, target_px)
+                alpha, scaled = given_alpha(frame), _resize_frame(frame, target_px)
             else:
                 scaled = _resize_frame(frame, target_px)
                 alpha = segment(scaled, pose, camera)

@@ -32,6 +32,7 @@ from preprocess.capture_paths import CapturePaths, find_capture_paths, find_live
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.live.live_inputs import LiveInputs
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
 from preprocess.masks.mask_origin import (
     MaskOrigin,
@@ -247,6 +248,7 @@ def _open_recorded(
             *doubts,
         ),
         segment=_make_segmenter(choice, fit.shaped),
+        mask_refiner=make_mask_refiner(wanted),
         refit=fit.placement,
     )
 
@@ -292,6 +294,7 @@ def _open_live(
         notes=(*describe_capture(fit, None, cameras, choice, expected_masks=looked_for), *doubts),
         live=live,
         segment=_make_segmenter(choice, fit.shaped),
+        mask_refiner=make_mask_refiner(wanted),
         live_fit=growing_fit,
     )
     recording.check()
@@ -305,6 +308,11 @@ def _mask_file(masks: Path | None) -> Path | None:
 
 def _make_segmenter(choice: MaskOrigin, shaped: ShapedBody) -> Segmenter | None:
     return None if choice.segmenter is None else make_segmenter(choice.segmenter, shaped)
+
+
+def make_mask_refiner(wanted: CaptureInputs) -> GivenMaskRefiner | None:
+    """What refines given masks, if that is wanted."""
+    return GivenMaskRefiner() if wanted.refine_masks else None
 
 
 def _unread_alpha(source: FrameSource) -> Path | None:

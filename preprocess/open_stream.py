@@ -18,7 +18,7 @@ from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStre
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_origin import MaskOrigin, choose_mask_origin, make_segmenter
 from preprocess.observe import alpha_channel_mask, associate_masks
-from preprocess.open_capture import describe_capture
+from preprocess.open_capture import describe_capture, make_mask_refiner
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement
 
@@ -65,7 +65,7 @@ def open_tracked_stream(
         fixed_body=avatar_body is not None,
         stated_focal=not source.live and _names_cameras(wanted),
     )
-    segment, notes = None, tuple[str, ...]()
+    segment, notes = None, ()
     if not choice.is_fallback:
         fit = BodyAlignment(shaped=found.shaped, motion=found.motion)
         notes = tuple(describe_capture(fit, None, found.cameras, choice))
@@ -80,9 +80,8 @@ def open_tracked_stream(
         shaped=found.shaped,
         size_px=None,
         notes=notes,
-        live=tracking,
-        segment=segment,
-    )
+        live=tracking, segment=segment, mask_refiner=make_mask_refiner(wanted),
+    )  # fmt: skip
 
 
 def _names_cameras(wanted: CaptureInputs) -> bool:

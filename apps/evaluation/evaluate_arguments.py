@@ -155,4 +155,5 @@ class EvaluateArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parse_frame_range(self.frames),
+            refine_masks=False,
         )

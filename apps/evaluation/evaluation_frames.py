@@ -45,10 +45,11 @@ class EvaluationFrames:
     def __iter__(self) -> Iterator[Observation]:
         """Yield the frames that show the person; reading ends after the last one needed."""
         recording, wanted = self.recording, self.frame_indices
+        sequential = recording.segment is not None or recording.mask_refiner is not None
         observe, last = recording.observation_builder(), max(wanted, default=-1) if wanted else None
         for frame in recording.source.frames():
             counts = wanted is None or frame.index in wanted
-            if counts or recording.segment is not None:  # masks are estimated sequentially
+            if counts or sequential:  # masks are estimated and refined in the frames' order
                 seen = observe(frame)
                 if counts and isinstance(seen, Observation):
                     yield seen

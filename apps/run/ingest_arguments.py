@@ -106,6 +106,8 @@ class IngestArguments(CaptureArguments):
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
     """Fit poses, body and focal length to the masks, and optimize the poses during training. With
     --no-refine-poses all are taken as exact."""
+    refine_masks: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Refine given masks if the pictures have stronger edges beside their borders."""
     force: Flag = False
     """Train even if ia-check considers poses and masks unusable."""
     view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
@@ -187,6 +189,7 @@ class IngestArguments(CaptureArguments):
             live=self.live,
             tracker=self.tracker,
             idle_s=self.idle_seconds,
+            refine_masks=self.refine_masks,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
 

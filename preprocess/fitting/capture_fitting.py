@@ -32,6 +32,7 @@ from preprocess.fitting.clip_fitting import (
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.observation import Observation
 from preprocess.observe import associate_cameras
 
@@ -222,9 +223,8 @@ def _read_outlines(
     capture: Capture, geometry: CaptureGeometry, count: int
 ) -> dict[int, OutlineDistances]:
     """Outlines of evenly spread masks, by frame."""
-    if capture.segment is not None:
-        objective = _estimate_silhouettes(capture, count)
-    else:
+    objective = _observe_silhouettes(capture, count)
+    if objective is None and capture.segment is None:
         evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
         objective = evidence.silhouettes(SkinPoints.of(capture.shaped, 1), count, OUTLINE_PERSON_PX)
     if objective is None:
@@ -238,21 +238,29 @@ def _read_outlines(
     }
 
 
-def _estimate_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
-    """Estimated masks of evenly spread frames; None if there is none."""
-    source, observe = capture.source, capture.observation_builder()
+def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
+    """Estimated or refined masks of evenly spread frames, which are decoded.
+
+    Returns:
+        None if there is no such mask: given ones that stay as they are can be read without frames.
+    """
+    estimated, tracked = capture.segment is not None, capture.motion.keypoints is not None
+    as_they_are = estimated or tracked or capture.mask_refiner is None
+    refine = None if as_they_are else GivenMaskRefiner()
+    if refine is None and not estimated:
+        return None
+    source, observe = capture.source, replace(capture, mask_refiner=refine).observation_builder()
     chosen, camera_row = source.selection, associate_cameras(capture.cameras, source)
     stride = chosen.step * max(1, -(-(source.frame_count or 1) // count))
     some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
-    seen = map(observe, open_source(source.path, frames=some).frames())
-    samples = [
-        MaskSample(
-            index=each.frame.index, camera_row=camera_row(each.frame.index), alpha=each.alpha
-        )
-        for each in seen
-        if isinstance(each, Observation)
-    ]
-    if not samples:
+    samples = []
+    for each in map(observe, open_source(source.path, frames=some).frames()):
+        if isinstance(each, Observation):
+            index = each.frame.index
+            samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
+        if refine is not None and refine.is_decided:
+            return None
+    if not samples or (refine is not None and not refine.is_needed):
         return None
     samples = reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX)
     return SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped, 1))

@@ -14,6 +14,7 @@ from preprocess.capture_paths import CapturePaths
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.live_poses import LivePoses
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_origin import MaskOrigin, Segmenter, choose_mask_origin
 from preprocess.observation import Observation
 from preprocess.observe import (
@@ -87,7 +88,9 @@ class LiveInputs:
         source: FrameSource,
         cameras: CameraTrack,
         size_px: int | None,
+        *,
         segment: Segmenter | None = None,
+        refine: GivenMaskRefiner | None = None,
         fit: LiveAlignment | None = None,
     ) -> Callable[[Frame], Observation | DroppedFrame]:
         """What makes an observation of a frame, waiting for its pose and its mask.
@@ -97,6 +100,7 @@ class LiveInputs:
             cameras: One, that stands still.
             size_px: Longer side of the observations.
             segment: What estimates masks, where none are waited for.
+            refine: What refines those that are.
             fit: What fits the poses to another body than their tracker's, if that is needed.
 
         Raises:
@@ -113,7 +117,7 @@ class LiveInputs:
         if fit is not None and not fit.uses_masks:
             pose_of = fit.align_poses(pose_of, cameras[0])
         seen = compose_observation_builder(
-            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment
+            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment, refine=refine
         )
         if self.choice.is_fallback:
             seen = _warn_of_late_alpha(seen, source)

@@ -32,6 +32,7 @@ from preprocess.fitting.tracked_frames import (
     reduced_size_px,
 )
 from preprocess.live.live_alignment import LiveAlignment
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_origin import Segmenter
 from preprocess.observation import Observation
 from preprocess.observe import DroppedFrame, compose_observation_builder, shrink_to_longer_side
@@ -236,7 +237,9 @@ class LiveTracking:
         source: FrameSource,
         cameras: CameraTrack,
         size_px: int | None,
+        *,
         segment: Segmenter | None = None,
+        refine: GivenMaskRefiner | None = None,
         fit: LiveAlignment | None = None,
     ) -> Callable[[Frame], Observation | DroppedFrame]:
         """What makes an observation of a frame, which was tracked when it was taken.
@@ -246,6 +249,7 @@ class LiveTracking:
             cameras: The camera.
             size_px: Longer side of the observations.
             segment: What estimates masks, where the user asked for that.
+            refine: What refines given masks; the tracker's are refined already.
             fit: Not used: poses are tracked.
         """
         assert fit is None
@@ -268,8 +272,9 @@ class LiveTracking:
             return self._refine(frame.rgb, found[-1].keypoints.mask, size_px)
 
         return compose_observation_builder(
-            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment
-        )
+            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment,
+            refine=None if self.given_masks is None else refine,
+        )  # fmt: skip
 
     def take_revised_poses(self) -> dict[int, BodyPose]:
         """Poses of earlier frames that were fitted again since the last call, by their numbers."""

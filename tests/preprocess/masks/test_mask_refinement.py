@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.tracking.keypoints import CroppedMask
 
@@ -193,3 +194,46 @@ def test_textured_background_that_the_network_takes_for_person_is_cleared() -> N
     taken = (wrong.resample(SIZE_PX, SIZE_PX) > 0.9) & (truth < 0.01)
     assert taken.sum() > 300
     assert refiner(rgb, wrong)[taken].mean() < 0.1
+
+
+def _given_masks(refiner: GivenMaskRefiner, *, wrong: bool) -> list[tuple[np.ndarray, ...]]:
+    """Given, found and exact masks of a clip; wrong ones are wider and have a wandering border."""
+    background, clip = _background(1), []
+    for number in range(12):
+        rgb, _, truth = _frame((number % 8 - 4) * 5, background)
+        given = truth
+        if wrong:
+            noise = np.random.default_rng(number).normal(0.0, 1.0, truth.shape).astype(np.float32)
+            given = cv2.GaussianBlur(truth, (0, 0), 2.0) + cv2.GaussianBlur(noise, (0, 0), 4.0)
+            given = np.clip(2.0 * given - 0.25, 0.0, 1.0)
+        clip.append((given, refiner(rgb, given, SIZE_PX), truth))
+    return clip
+
+
+def test_given_masks_are_refined_where_they_miss_the_edges() -> None:
+    """Wandering borders come nearer to the truth, and a note tells."""
+    refiner = GivenMaskRefiner()
+    clip = _given_masks(refiner, wrong=True)[6:]
+    before = float(np.mean([_iou(given, truth) for given, _, truth in clip]))
+    after = float(np.mean([_iou(found, truth) for _, found, truth in clip]))
+    assert before < 0.95
+    assert after > before + 0.04
+    assert refiner.note is not None
+    assert "--no-refine-masks" in refiner.note
+
+
+def test_exact_masks_stay_as_they_are() -> None:
+    """No pixel of them changes."""
+    refiner = GivenMaskRefiner()
+    clip = _given_masks(refiner, wrong=False)
+    assert all(found is given for given, found, _ in clip)
+    assert refiner.is_decided
+    assert refiner.note is None
+
+
+def test_a_frame_without_the_person_is_no_evidence() -> None:
+    """Its empty mask comes back, and decides nothing."""
+    refiner, empty = GivenMaskRefiner(), np.zeros(SIZE_PX[::-1], np.float32)
+    assert refiner(np.zeros((*SIZE_PX[::-1], 3), np.uint8), empty, SIZE_PX) is empty
+    assert not refiner.is_needed
+    assert not refiner.is_decided
