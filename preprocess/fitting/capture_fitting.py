@@ -32,7 +32,6 @@ from preprocess.fitting.clip_fitting import (
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.observation import Observation
 from preprocess.observe import associate_cameras
 
@@ -241,15 +240,16 @@ def _read_outlines(
 def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
     """Estimated or refined masks of evenly spread frames, which are decoded.
 
+    What refines masks then knows the background from the film's first frame on.
+
     Returns:
         None if there is no such mask: given ones that stay as they are can be read without frames.
     """
     estimated, tracked = capture.segment is not None, capture.motion.keypoints is not None
-    as_they_are = estimated or tracked or capture.mask_refiner is None
-    refine = None if as_they_are else GivenMaskRefiner()
+    refine = None if estimated or tracked else capture.mask_refiner
     if refine is None and not estimated:
         return None
-    source, observe = capture.source, replace(capture, mask_refiner=refine).observation_builder()
+    source, observe = capture.source, capture.observation_builder()
     chosen, camera_row = source.selection, associate_cameras(capture.cameras, source)
     stride = chosen.step * max(1, -(-(source.frame_count or 1) // count))
     some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
