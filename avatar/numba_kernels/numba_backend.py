@@ -48,6 +48,18 @@ def _level_arrays(
     return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
 
 
+def _skinning_arrays(
+    skin: SkinningVolume,
+) -> tuple[
+    Float32[np.ndarray, "nodes 24"],
+    tuple[int, ...],
+    Float32[np.ndarray, "3"],
+    Float32[np.ndarray, "3"],
+]:
+    nodes = skin.weights.numpy().reshape(-1, skin.weights.shape[3])
+    return nodes, tuple(skin.weights.shape[:3]), skin.low.numpy(), skin.nodes_per_m.numpy()
+
+
 def _scratch_samples(
     rays: int, max_samples: int
 ) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
@@ -186,7 +198,7 @@ class NumbaBackend:
         numba_skinning.bone_wrenches(
             samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
             samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
-            *(part.numpy() for part in skin), bones.numpy(), out.numpy(),
+            *_skinning_arrays(skin), bones.numpy(), out.numpy(),
         )  # fmt: skip
         return out
 
@@ -200,5 +212,5 @@ class NumbaBackend:
         numba_skinning.update_roots(
             cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
-            *(part.numpy() for part in skin), bones.numpy(),
+            *_skinning_arrays(skin), bones.numpy(),
         )  # fmt: skip

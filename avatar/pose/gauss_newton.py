@@ -5,6 +5,7 @@ gradients. The same gradients measure the noise in their sum: errors of the fiel
 gradient another way, an error of the pose points them all one way.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -64,26 +65,19 @@ def gauss_newton_step(
     scale[24] = PRIOR_SIGMA_M
     scaled = (gradients * scale).reshape(-1, 75)
     curvature = (scaled / (2.0 * (loss.clip(min=0.0) + MIN_RAY_LOSS))[:, None]).T @ scaled
-    determined, axes = np.linalg.eigh(curvature)
-    determined = determined.clip(min=0.0)
-    along = scaled @ axes
-    chance, wish = (along**2).sum(axis=0), along.sum(axis=0)
     # the prior's stiffness in units of the curvature: one sigma weighs as much as a mean ray
-    given = chance.sum() / (determined.sum() + 1e-12) + 1e-12
-    told = determined > given
-    evidence = float(np.mean(wish[told] ** 2 / (chance[told] + 1e-12))) if told.any() else 0.0
-    share = min(
-        max(
-            (0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / (FULL_EVIDENCE - MIN_EVIDENCE),
-            0.0,
-        ),
-        1.0,
-    )
+    given = float((scaled**2).sum() / (np.trace(curvature) + 1e-12) + 1e-12)
+    evidence, share = math.inf, 1.0
+    if math.isfinite(shared_evidence):
+        evidence = _agreement(scaled, curvature, given)
+        full = FULL_EVIDENCE - MIN_EVIDENCE
+        share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / full, 0.0), 1.0)
 
     def asked(believed: PosePrior) -> Float[np.ndarray, "25 3"]:
         stiff = believed.precision * given
-        back = stiff * (axes.T @ ((correction - believed.mean) / scale).reshape(75))
-        found = axes @ ((wish + back) / (determined + stiff))
+        back = stiff * ((correction - believed.mean) / scale).reshape(75)
+        held = curvature + stiff * np.eye(75, dtype=np.float32)
+        found = np.linalg.solve(held, scaled.sum(axis=0) + back)
         return found.reshape(25, 3).astype(np.float64)
 
     change = -share * scale * asked(prior)
@@ -91,3 +85,20 @@ def gauss_newton_step(
     return GaussNewtonStep(
         shortened * change, evidence, correction / scale - asked(UNINFORMATIVE_PRIOR)
     )
+
+
+def _agreement(
+    scaled: Float32[np.ndarray, "rays 75"], curvature: Float32[np.ndarray, "75 75"], given: float
+) -> float:
+    """`GaussNewtonStep.evidence` of gradients in prior sigmas.
+
+    Args:
+        scaled: The gradients.
+        curvature: Their curvature.
+        given: Curvature from which the rays determine a direction.
+    """
+    determined, axes = np.linalg.eigh(curvature)
+    along = (scaled @ axes)[:, determined > given]
+    if not along.size:
+        return 0.0
+    return float(np.mean(along.sum(axis=0) ** 2 / ((along**2).sum(axis=0) + 1e-12)))

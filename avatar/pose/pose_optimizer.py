@@ -22,7 +22,12 @@ from avatar.kernels.backend_protocol import SkinningVolume
 from avatar.pose.gauss_newton import MIN_EVIDENCE, gauss_newton_step
 from avatar.pose.temporal_prior import TemporalPosePrior
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.kinematics import body_from_rest, descendant_matrix, rotation_matrices
+from preprocess.body.kinematics import (
+    body_from_rest,
+    descendant_matrix,
+    joint_transforms,
+    rotation_matrices,
+)
 
 MAX_RAYS_PER_FRAME = 512
 """Rays per frame that are accumulated until its pose is corrected."""
@@ -343,8 +348,11 @@ class PoseOptimizer:
     def _update_bones(self, slot: int) -> None:
         """Updates the slot's joint and bone transforms to its correction."""
         rig = self.rig
-        self._joint_transforms[slot] = body_from_rest(
-            rig.rest_joints, rig.parents, self.pose(slot).joint_rotations
+        given = self._tracker_poses[slot]
+        assert given is not None
+        turns = rotation_matrices(np.stack([given.joint_rotations, self.corrections[slot, 1:24]]))
+        self._joint_transforms[slot] = joint_transforms(
+            rig.rest_joints, rig.parents, np.concatenate([np.eye(3)[None], turns[0] @ turns[1]])
         )
         bones = (self._joint_transforms[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
         self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)

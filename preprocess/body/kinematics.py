@@ -53,15 +53,15 @@ def joint_transforms(
         parents: Parent of each joint, before its children; -1 for the root.
         rotations: Rotation of each joint relative to its parent; the root's about itself.
     """
-    posed_from_joint = np.zeros((len(parents), 4, 4))
-    for joint, parent in enumerate(parents):
-        local = np.eye(4)
-        local[:3, :3] = rotations[joint]
-        local[:3, 3] = rest_joints[joint] - (rest_joints[parent] if parent >= 0 else 0.0)
-        posed_from_joint[joint] = posed_from_joint[parent] @ local if parent >= 0 else local
-    posed_from_rest = posed_from_joint.copy()
-    posed_from_rest[:, :3, 3] -= np.einsum("jab,jb->ja", posed_from_joint[:, :3, :3], rest_joints)
-    return posed_from_rest
+    parents = np.asarray(parents)
+    start = np.where(parents[:, None] >= 0, rest_joints[parents], 0.0)
+    posed_from_joint = rigid_transform(rotations, rest_joints - start)
+    for joint, parent in enumerate(parents.tolist()):
+        if parent >= 0:
+            posed_from_joint[joint] = posed_from_joint[parent] @ posed_from_joint[joint]
+    turned = (posed_from_joint[:, :3, :3] @ rest_joints[:, :, None])[..., 0]
+    posed_from_joint[:, :3, 3] -= turned
+    return posed_from_joint
 
 
 def body_from_rest(

@@ -91,3 +91,11 @@ def test_evidence_that_would_not_move_a_pose_moves_it_where_other_frames_are_off
     assert alone.evidence == among.evidence < 2.0 * MIN_EVIDENCE - 1.0
     assert not alone.change.any()
     assert among.change.any()
+
+
+def test_a_pose_that_is_to_move_in_any_case_makes_the_whole_step_without_evidence(slopes, rng):
+    gradients, loss = rays_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)
+    whole = gauss_newton_step(gradients, loss, NONE, np.inf)
+    gated = gauss_newton_step(gradients, loss, NONE, 100.0)
+    assert whole.evidence == np.inf
+    np.testing.assert_array_equal(whole.change, gated.change)
