@@ -6,7 +6,6 @@ nothing). Its four numbers are shared by all frames and found by linear least sq
 sums. The field and the package hold neutral colors.
 """
 
-import math
 from typing import final
 
 import numpy as np
@@ -19,6 +18,7 @@ from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
+    NormalVolume,
     PremultipliedPixels,
     RawOutputs,
     RayBatch,
@@ -40,14 +40,10 @@ RIDGE = 0.02
 UNEXPLAINED_SHARE, EXPLAINED_SHARE = 0.02, 0.06
 """Share of the squared error that shading has to explain: below the first it is not believed, from
 the second on it is believed in full."""
-MIN_OPTICAL_DEPTH = 0.02
-"""Optical depth of a sample below which its normal does not count."""
 MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
 """Bounds of the factor."""
 OBSERVATION_INTERVAL = 4
-"""Steps between observations while no shading has been found; from then on every step is one."""
-NORMAL_SCALE = 0.4995
-"""Scale of normals that are composited as colors, which keeps them inside (0, 1)."""
+"""Steps between observations of the light."""
 
 
 @final
@@ -65,9 +61,11 @@ class OrientationShading:
         distance = gaussian_filter(distance.astype(np.float32), 1.0)
         slope = np.stack([np.gradient(distance, axis=axis) for axis in range(3)], axis=-1)
         slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-6)
-        self._normals = torch.from_numpy(slope.astype(np.float32)).to(device)
-        self._low = torch.from_numpy(rig.box_low).to(device)
-        self._cells_per_m = torch.from_numpy(rig.cells_per_m).to(device)
+        self._normals = NormalVolume(
+            torch.from_numpy(slope.astype(np.float32)).to(device),
+            torch.from_numpy(rig.box_low).to(device),
+            torch.from_numpy(rig.cells_per_m).to(device),
+        )
         self._gram: Float64[Tensor, "harmonics harmonics"] = torch.zeros(
             HARMONICS, HARMONICS, dtype=torch.float64, device=device
         )
@@ -94,17 +92,7 @@ class OrientationShading:
         """
         if self.is_neutral and self._steps % OBSERVATION_INTERVAL:
             return torch.zeros(len(rays.slots), 3, device=raw.device)
-        last = torch.tensor(self._normals.shape[:3], device=raw.device) - 1
-        dense = (raw[:, 3] > math.log(MIN_OPTICAL_DEPTH / step_m)).nonzero()[:, 0]
-        cell = ((samples.points[dense] - self._low) * self._cells_per_m).long().clamp(min=0)
-        normals = self._normals[torch.minimum(cell, last).unbind(dim=1)]
-        slots = torch.repeat_interleave(rays.slots.long(), samples.counts.long())[dense]
-        warp = cells.roots[slots, samples.root_rows.long()[dense], 3:].unflatten(1, (3, 3))
-        normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)
-        encoded = torch.cat([torch.zeros_like(raw[:, :3]), raw[:, 3:]], dim=1)
-        encoded[dense, :3] = torch.logit(0.5 + NORMAL_SCALE * normals)
-        mean = backend.composite(encoded, samples, step_m)
-        return (mean[:, :3] - 0.5 * mean[:, 3:]) / NORMAL_SCALE
+        return backend.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
 
     def factor(self, normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 1"]:
         """Factor of the neutral color of surfaces with these world normals; 1 without one."""
@@ -133,6 +121,8 @@ class OrientationShading:
             rendered: Shaded rendering of the same rays.
         """
         self._steps += 1
+        if (self._steps - 1) % OBSERVATION_INTERVAL:
+            return
         length = normals.norm(dim=1, keepdim=True)
         alpha = torch.minimum(target[:, 3:], rendered[:, 3:])
         counts = (alpha > MIN_ALPHA) & (length > MIN_NORMAL_LENGTH)

@@ -200,6 +200,20 @@ class SkinningVolume(NamedTuple):
     nodes_per_m: Float32[Tensor, "3"]
 
 
+class NormalVolume(NamedTuple):
+    """The skin's outward normals in canonical space.
+
+    Attributes:
+        normals: Unit normals of the cells of the canonical box.
+        low: Corner of the box, metres.
+        cells_per_m: Cells per metre along each axis.
+    """
+
+    normals: Float32[Tensor, "x y z 3"]
+    low: Float32[Tensor, "3"]
+    cells_per_m: Float32[Tensor, "3"]
+
+
 class MarchSettings(NamedTuple):
     """Spacing, end and number of the samples of a ray.
 
@@ -281,6 +295,18 @@ class Backend(Protocol):
         hard_weight: float,
     ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
         """Rendering and loss of each ray, and the mean loss's gradient with respect to `raw`."""
+        ...
+
+    def mean_normals(
+        self,
+        raw: RawOutputs,
+        samples: RaySamples,
+        step_m: float,
+        slots: Int32[Tensor, "rays"],
+        cells: CorrespondenceTables,
+        volume: NormalVolume,
+    ) -> Float32[Tensor, "rays 3"]:
+        """Normals at the samples, in the body frame, composited like colors."""
         ...
 
     def scatter_max_density(

@@ -32,6 +32,7 @@ class TorchBackend:
     name = "torch"
     solve_correspondences = staticmethod(torch_correspondence.solve_correspondences)
     march_resumable = staticmethod(torch_reference.march)
+    mean_normals = staticmethod(torch_reference.mean_normals)
     scatter_max_density = staticmethod(torch_reference.scatter_max_density)
     bone_wrenches = staticmethod(torch_skinning.bone_wrenches)
     update_roots = staticmethod(torch_skinning.update_roots)

@@ -15,6 +15,7 @@ from avatar.kernels.backend_protocol import (
     DensityGrid,
     HashLevels,
     MarchSettings,
+    NormalVolume,
     RayBatch,
     RaySamples,
 )
@@ -27,6 +28,8 @@ ALPHA_DEAD_ZONE = 1e-3
 """Error of alpha up to which the L1 loss on alpha is zero."""
 OPAQUE_DEPTH = 12.0
 """Optical depth, by cached densities, at which a training ray counts as opaque."""
+MIN_NORMAL_DEPTH = 0.02
+"""Optical depth of a sample below which its normal does not count."""
 
 
 def encode(
@@ -99,6 +102,32 @@ def composite(
     weight = before * (1.0 - kept)
     premultiplied = (weight[..., None] * color[index]).sum(dim=1)
     return torch.cat([premultiplied, 1.0 - through[:, -1:]], dim=1)
+
+
+def mean_normals(
+    raw: Float32[Tensor, "samples 4"],
+    samples: RaySamples,
+    step_m: float,
+    slots: Int32[Tensor, "rays"],
+    cells: CorrespondenceTables,
+    volume: NormalVolume,
+) -> Float32[Tensor, "rays 3"]:
+    """Mean normal of what each ray sees, Σ T_i α_i n_i; n is that of the skin, warped."""
+    last = torch.tensor(volume.normals.shape[:3], device=raw.device) - 1
+    cell = ((samples.points - volume.low) * volume.cells_per_m).long().clamp(min=0)
+    normals = volume.normals[torch.minimum(cell, last).unbind(dim=1)]
+    slot = torch.repeat_interleave(slots.long(), samples.counts.long())
+    warp = cells.roots[slot, samples.root_rows.long(), 3:].unflatten(1, (3, 3))
+    normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)
+    normals = normals * (raw[:, 3:] > math.log(MIN_NORMAL_DEPTH / step_m))
+    optical = torch.exp(raw[:, 3].double().clamp(max=MAX_LOG_DENSITY)) * step_m
+    until = torch.cumsum(optical, dim=0)
+    ray = torch.arange(len(slots), device=raw.device).repeat_interleave(samples.counts)
+    before = until - optical
+    before = before - torch.cat([before, before.new_zeros(1)])[samples.offsets][ray]
+    weight = torch.exp(-before) * (1.0 - torch.exp(-optical))
+    mean = normals.new_zeros(len(slots), 3)
+    return mean.index_add_(0, ray, weight.to(mean)[:, None] * normals)
 
 
 def loss_per_ray(

@@ -16,6 +16,7 @@ from avatar.kernels.backend_protocol import (
     HashLevels,
     HashTable,
     MarchSettings,
+    NormalVolume,
     Points,
     PremultipliedPixels,
     RawOutputs,
@@ -166,6 +167,23 @@ class NumbaBackend:
             np.float32(hard_weight), rendered.numpy(), loss.numpy(), grad.numpy(),
         )  # fmt: skip
         return rendered, loss, grad
+
+    def mean_normals(
+        self,
+        raw: RawOutputs,
+        samples: RaySamples,
+        step_m: float,
+        slots: Int32[Tensor, "rays"],
+        cells: CorrespondenceTables,
+        volume: NormalVolume,
+    ) -> Float32[Tensor, "rays 3"]:
+        mean = torch.empty(len(slots), 3)
+        numba_rendering.mean_normals(
+            raw.numpy(), samples.points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
+            samples.root_rows.numpy(), slots.numpy(), cells.roots.numpy(), np.float32(step_m),
+            *(part.numpy() for part in volume), mean.numpy(),
+        )  # fmt: skip
+        return mean
 
     def scatter_max_density(
         self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid

@@ -7,6 +7,7 @@ from avatar.kernels.torch_reference import (
     ALPHA_DEAD_ZONE,
     COLOR_HUBER_DELTA,
     MAX_LOG_DENSITY,
+    MIN_NORMAL_DEPTH,
     OPAQUE_DEPTH,
 )
 from avatar.numba_kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
@@ -213,6 +214,41 @@ def composite(raw, offsets, counts, sample_step_m, rendered):
         rendered[ray, 1] = green
         rendered[ray, 2] = blue
         rendered[ray, 3] = F32(1) - through
+
+
+@compile_kernel(parallel=True, **NO_ALLOCATION)
+def mean_normals(
+    raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
+    normals, low, cells_per_m, mean,
+):  # fmt: skip
+    """Normals at each ray's samples, in the body frame, composited front to back."""
+    nx, ny, nz, _ = normals.shape
+    for ray in prange(offsets.shape[0]):
+        slot, through = slots[ray], F32(1)
+        x, y, z = F32(0), F32(0), F32(0)
+        for i in range(offsets[ray], offsets[ray] + counts[ray]):
+            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
+            before = through
+            through *= np.exp(-optical)
+            if optical <= F32(MIN_NORMAL_DEPTH):
+                continue
+            a = _cell_index((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
+            b = _cell_index((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
+            c = _cell_index((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
+            n = U32(rows[i])
+            p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
+            u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
+            v = (
+                cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
+                + cell_roots[slot, n, 10] * r
+            )  # fmt: skip
+            w = (
+                cell_roots[slot, n, 5] * p + cell_roots[slot, n, 8] * q
+                + cell_roots[slot, n, 11] * r
+            )  # fmt: skip
+            weight = (before - through) / max(np.sqrt(u * u + v * v + w * w), F32(1e-12))
+            x, y, z = x + weight * u, y + weight * v, z + weight * w
+        mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
 
 
 @compile_kernel(inline="always")

@@ -20,7 +20,7 @@ def shading(rig):
     return OrientationShading(rig, CPU)
 
 
-def observe(shading, generator, light, *, steps=40):
+def observe(shading, generator, light, *, steps=160):
     for _ in range(steps):
         normals = torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=1)
         neutral = torch.rand(1000, 4, generator=generator) * 0.4 + 0.2

@@ -13,8 +13,10 @@ from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import (
     FEATURES_PER_LEVEL,
+    CorrespondenceTables,
     DensityGrid,
     MarchSettings,
+    NormalVolume,
     RayBatch,
     RaySamples,
 )
@@ -133,6 +135,30 @@ def test_compiled_loss_and_gradient_agree_with_autograd(generator):
     case = loss_case(generator)
     for ours, theirs in zip(NUMBA.composite_loss(*case), TORCH.composite_loss(*case), strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4)
+
+
+def test_compiled_normals_agree_with_their_meaning_and_lie_on_rays_that_see_something(generator):
+    raw, samples, step_m, *_ = loss_case(generator, counts=(5, 0, 1, 30, 17))
+    count = len(raw)
+    samples = samples._replace(
+        points=torch.rand(count, 3, generator=generator),
+        root_rows=torch.randint(9, (count,), generator=generator).int(),
+    )
+    normals = torch.nn.functional.normalize(torch.randn(6, 5, 4, 3, generator=generator), dim=-1)
+    volume = NormalVolume(normals, torch.full((3,), -0.05), torch.tensor([6.0, 5.0, 4.0]))
+    roots = torch.randn(2, 9, 12, generator=generator)
+    cells = CorrespondenceTables(
+        torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
+    )
+    slots = torch.tensor([0, 0, 1, 1, 1], dtype=torch.int32)
+    ours, theirs = (
+        backend.mean_normals(raw, samples, step_m, slots, cells, volume)
+        for backend in (NUMBA, TORCH)
+    )
+    torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
+    assert not ours[1].any()
+    assert (ours.norm(dim=1) <= TORCH.composite(raw, samples, step_m)[:, 3] + 1e-5).all()
+    assert ours[0].any()
 
 
 def test_the_gradient_of_the_loss_is_exact_to_a_millionth_however_opaque_a_ray(generator):

@@ -10,7 +10,7 @@ from avatar.numba_kernels.numba_backend import NumbaBackend
 NUMBA = NumbaBackend()
 OPERATIONS = (
     "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
-    "scatter_max_density", "bone_wrenches", "update_roots",
+    "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals",
 )  # fmt: skip
 
 
@@ -35,7 +35,10 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     )
     moved = cells._replace(roots=cells.roots.clone())
     NUMBA.update_roots(moved, 0, poses.skinning, poses.bones[0])
+    volume = trainer.learner.shading._normals
+    normals = NUMBA.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     return {
+        "mean_normals": [normals],
         "encode": [NUMBA.encode(points, field.table, field.levels)],
         "encode_backward": [grad_table],
         "encode_points_backward": [grad_points],
