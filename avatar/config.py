@@ -47,6 +47,9 @@ class TrainConfig:
     result on any machine. `seconds` is then `steps / NOMINAL_STEPS_PER_S`."""
     rays: int = 1024
     """Rays per step."""
+    faint_gradient_share: float = 0.2
+    """Strength of a sample's gradient, as a share of the mean, below which it is propagated by
+    chance, and the more strongly; 0: all are propagated."""
     sample_step_m: float = 0.01
     """Distance between samples along a ray, metres."""
     initial_step_factor: float = 3.0

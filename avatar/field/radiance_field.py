@@ -5,7 +5,7 @@ import math
 from typing import NamedTuple, final
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, Backend, HashLevels
@@ -32,6 +32,10 @@ class Activations(NamedTuple):
     features: Float32[Tensor, "points width"]
     hidden: Float32[Tensor, "points hidden"]
     raw: Float32[Tensor, "points 4"]
+
+    def rows(self, points: Int64[Tensor, "some"]) -> "Activations":
+        """The values of some of the points."""
+        return Activations(*(part.index_select(0, points) for part in self))
 
 
 @final

@@ -3,7 +3,7 @@
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from avatar.config import TrainConfig
@@ -133,10 +133,12 @@ def compute_gradients(
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
-    grad_features = field.backward(seen, torch.cat(grads))
+    drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
+    grad_features = field.backward(seen.rows(drawn), drawn_grads)
     if poses is not None and count:
+        drawn = drawn[drawn < count]
         _accumulate_pose_gradients(
-            poses, field, samples, grad_features[:count], batch.rays.slots, correspondences, loss
+            poses, field, samples, drawn, grad_features, batch.rays.slots, correspondences, loss
         )
     if caches_density:
         log_density = raw[:, 3].contiguous()
@@ -182,27 +184,55 @@ def _regularization_gradients(
         grad_pairs += field_priors.double_well_gradient(
             pairs, config.double_well_weight * surface_share
         )
-    grad_close = field_priors.density_slope_gradient(
-        close,
-        points[3],
-        config.max_log_density_slope_per_m,
-        config.density_slope_weight * surface_share,
-    )
-    grad_close += field_priors.color_tv_gradient(close, config.color_tv_weight * surface_share)
+    grad_close = torch.zeros_like(close)
+    if len(close):
+        grad_close += field_priors.density_slope_gradient(
+            close,
+            points[3],
+            config.max_log_density_slope_per_m,
+            config.density_slope_weight * surface_share,
+        )
+        grad_close += field_priors.color_tv_gradient(close, config.color_tv_weight * surface_share)
     return [
         field_priors.empty_space_gradient(empty, config.empty_space_weight),
         grad_pairs,
-        field_priors.interior_gradient(solid, config.interior_weight),
+        field_priors.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
         grad_close,
-        field_priors.log_density_l1_gradient(gaps, config.inner_leg_weight),
+        field_priors.log_density_l1_gradient(gaps, config.inner_leg_weight) if len(gaps) else gaps,
     ]
+
+
+def draw_by_strength(
+    grads: Float32[Tensor, "points 4"], faint_share: float, generator: torch.Generator
+) -> tuple[Int64[Tensor, "drawn"], Float32[Tensor, "drawn 4"]]:
+    """Draws the points whose gradients are propagated, faint ones by chance ("Russian roulette").
+
+    Half of the samples have hardly a gradient. They cannot be left out, since Adam makes much of
+    little; but a few of them, with larger gradients, have the same sum in the mean.
+
+    Args:
+        grads: Gradients of all points.
+        faint_share: Strength, as a share of the mean, below which a gradient is faint.
+        generator: Decides, on the gradients' device.
+
+    Returns:
+        The points that were drawn, and their gradients, divided by the chance of each.
+    """
+    if not faint_share:
+        return torch.arange(len(grads), device=grads.device), grads
+    strength = grads.abs().sum(dim=1)
+    chance = (strength / (faint_share * strength.mean() + 1e-30)).clamp(max=1.0)
+    drawn = torch.rand(len(chance), generator=generator, device=generator.device) < chance
+    points = drawn.nonzero()[:, 0]
+    return points, grads[points] / chance[points, None]
 
 
 def _accumulate_pose_gradients(
     poses: PoseOptimizer,
     field: RadianceField,
     samples: RaySamples,
-    grad_features: Float32[Tensor, "samples width"],
+    drawn: Int64[Tensor, "drawn"],
+    grad_features: Float32[Tensor, "points width"],
     slots: Int32[Tensor, "rays"],
     cells: CorrespondenceTables,
     loss: Float32[Tensor, "rays"],
@@ -210,8 +240,11 @@ def _accumulate_pose_gradients(
     """Adds the wrenches that the samples exert on the bones of their frames' poses."""
     backend, levels = field.backend, field.levels.coarser_than(MIN_POSE_GRADIENT_CELL_M)
     # undo the mean over rays: a pose is judged by the loss of each of its rays
-    each = grad_features[:, : levels.feature_width] * len(loss)
-    grad_points = backend.encode_points_backward(samples.points, each, field.table, levels)
+    each = grad_features[: len(drawn), : levels.feature_width] * len(loss)
+    grad_points = torch.zeros_like(samples.points)
+    grad_points[drawn] = backend.encode_points_backward(
+        samples.points[drawn], each, field.table, levels
+    )
     wrenches = backend.bone_wrenches(
         samples, grad_points, slots, cells, poses.skinning, poses.bones
     )

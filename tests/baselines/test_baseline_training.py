@@ -155,7 +155,9 @@ def test_global_sparsity_pulls_as_the_opacity_of_its_points_does(rig, clip):
         field.table_grad.zero_()
         compute_gradients(
             trainer.learner, trainer.sampler, trainer.replay.correspondences, batch,
-            dataclasses.replace(config, empty_space_weight=weight),
+            dataclasses.replace(
+                config, empty_space_weight=weight, faint_gradient_share=0.0
+            ),
             hard_surface_share=0.0, generator=torch.Generator().manual_seed(2),
         )  # fmt: skip
         pulls.append(float(field.layers[3].grad[3]))

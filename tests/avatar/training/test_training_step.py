@@ -1,5 +1,6 @@
 """The step's hand-written gradient against autograd of its meaning, and against differences."""
 
+import dataclasses
 import math
 
 import pytest
@@ -11,10 +12,15 @@ from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RaySamples
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame
-from avatar.training.training_step import OccupancySampler, compute_gradients
+from avatar.training.training_step import (
+    OccupancySampler,
+    compute_gradients,
+    draw_by_strength,
+)
 
 FIRM_SHARE = 0.25
 """Far from 0 and 1, so that no term may be left out."""
@@ -24,7 +30,7 @@ CONFIG = TrainConfig(
     density_tv_pairs=16, initial_density_tv_factor=3.0, double_well_weight=0.4,
     interior_weight=0.1, interior_points=24, max_samples=256,
     density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40,
-    inner_leg_weight=0.5, inner_leg_points=20,
+    inner_leg_weight=0.5, inner_leg_points=20, faint_gradient_share=0.0,
 )  # fmt: skip
 
 
@@ -134,6 +140,46 @@ def test_the_whole_loss_changes_as_its_gradient_says(trainer):
         predicted = float((grads[place].double() * direction).sum())
         scale = float(grads[place].norm() * direction.norm()) / math.sqrt(direction.numel())
         assert measured == pytest.approx(predicted, abs=2e-2 * scale)
+
+
+def test_faint_gradients_that_are_drawn_by_chance_have_the_same_mean():
+    generator = torch.Generator().manual_seed(0)
+    grads = torch.randn(400, 4, generator=generator) * torch.logspace(-5, 0, 400)[:, None]
+    grads[7] = 0.0
+    mean, kept = torch.zeros_like(grads), 0
+    for _ in range(400):
+        drawn, drawn_grads = draw_by_strength(grads, 0.3, generator)
+        mean.index_add_(0, drawn, drawn_grads / 400)
+        kept += len(drawn) / len(grads) / 400
+    strength = grads.abs().sum(dim=1)
+    firm = strength >= 0.3 * strength.mean()
+    torch.testing.assert_close(mean[firm], grads[firm], atol=1e-5, rtol=1e-4)
+    assert not mean[7].any()
+    assert float(mean[~firm].sum()) == pytest.approx(float(grads[~firm].sum()), abs=0.3)
+    assert 0.3 < kept < 0.6
+    assert torch.equal(draw_by_strength(grads, 0.0, generator)[1], grads)
+
+
+def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
+    """The table's gradient, and that of the poses, of one draw against those of all samples."""
+    found = []
+    for share in (0.0, 0.2):
+        poses = PoseOptimizer(trainer.avatar.rig, trainer.replay.capacity, torch.device("cpu"))
+        for slot in range(4):
+            poses.set_pose(slot, trainer.poses.pose(slot))
+        trainer.field.table_grad.zero_()
+        compute_gradients(
+            trainer.learner, trainer.sampler, trainer.replay.correspondences,
+            trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3)),
+            dataclasses.replace(CONFIG, faint_gradient_share=share), hard_surface_share=1.0,
+            poses=poses, generator=torch.Generator().manual_seed(4),
+        )  # fmt: skip
+        pulls = torch.cat([torch.from_numpy(poses.pose_gradients(slot)) for slot in range(4)])
+        found.append((trainer.field.table_grad.clone(), pulls))
+    for whole, drawn in zip(*found, strict=True):
+        assert not torch.equal(whole, drawn)
+        alike = torch.cosine_similarity(whole.flatten(), drawn.flatten(), dim=0)
+        assert float(alike) > 0.98
 
 
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
