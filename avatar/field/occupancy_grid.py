@@ -215,8 +215,8 @@ def find_floaters(
     pieces, count = label(solid.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
         return torch.zeros_like(solid, dtype=torch.uint8)
-    sizes = np.bincount(pieces.ravel(), weights=near_skin.ravel())
-    sizes[0] = 0.0
+    sizes = np.bincount(pieces[near_skin], minlength=count + 1)
+    sizes[0] = 0
     kept = sizes >= MIN_COMPONENT_SHARE * sizes.max()
     kept[0] = False
 
