@@ -39,7 +39,8 @@ main .failed, main .refused { border-color: var(--masked); }
 .filters input, .filters select { font: inherit; padding: 0.2rem 0.5rem; color: inherit;
   background: var(--card); border: 1px solid var(--line); border-radius: 0.4rem; }
 th { text-align: left; font-weight: 600; padding: 0.3rem 0.6rem 0.3rem 0; }
-figcaption b { color: var(--ink); overflow-wrap: anywhere; }
+figcaption b { color: var(--ink); }
+figcaption { overflow-wrap: anywhere; }
 """
 """Styles of the cards, in addition to those of report.html."""
 SCRIPT = """
@@ -150,7 +151,7 @@ class BatchSummary:
         return (
             f"{text}. Median {format_psnr(float(np.median(psnr)) if psnr else None, None)}, "
             f"{np.median([r.wall_s for r in done]):.0f} s; {self.per_avatar_core_s():.0f} "
-            f"core-seconds{f' and {cost}' if cost else ''} per avatar."
+            f"occupied core-seconds{f' and {cost}' if cost else ''} per avatar."
         )
 
 
