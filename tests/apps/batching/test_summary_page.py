@@ -42,8 +42,8 @@ def test_the_worst_come_first(summary):
 def test_an_avatar_costs_what_all_attempts_cost(summary):
     assert summary.per_avatar_core_s() == 4 * 3600.0 / 2
     assert summary.headline() == (
-        "2 done, 1 waiting, 1 refused. Median 30.00 dB, 1800 s; 7200 occupied core-seconds and 1.0000 EUR "
-        "per avatar."
+        "2 done, 1 waiting, 1 refused. Median 30.00 dB, 1800 s; 7200 occupied core-seconds and "
+        "1.0000 EUR per avatar."
     )
 
 
