@@ -20,8 +20,8 @@ from preprocess.alignment.capture_alignment import (
     needs_placement,
     place_motion,
 )
+from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
-from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody

@@ -2,16 +2,16 @@
 
 Poses may be for another body than the one that is used: without SMPL's file SMPL's poses move the
 embedded body, and poses that are added to a finished avatar move its own person, whatever their
-betas state. Rotations stay; distance and pelvis shift are fitted to masks or, without masks, to
-images. Where a file does not state the body model of its poses, the better fit decides.
+betas state. Rotations stay; distance and pelvis shift are fitted to masks; without any, to masks
+that are estimated. Where a file does not state the body model of its poses, the better fit decides.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from capture.input_error import InputError
 from preprocess.alignment.camera_from_masks import fit_factor
+from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
     GOOD_IOU,
@@ -19,20 +19,14 @@ from preprocess.alignment.correction_search import (
     MIN_FITTED_IOU_GAIN,
 )
 from preprocess.alignment.corrections import scale_focal_length
-from preprocess.alignment.image_alignment import edge_contrast, place_body_on_images, sample_video
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
-    MIN_EDGE_CONTRAST,
     BodyPlacement,
     body_height_m,
     place_body_on_masks,
     rescale_motion,
 )
-from preprocess.alignment.silhouette_objective import (
-    CaptureEvidence,
-    SilhouetteObjective,
-    mean_score,
-)
+from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody
 from preprocess.body.proportion_space import shape_for_motion
@@ -63,7 +57,7 @@ def estimate_focal_length(
     cameras, geometry = evidence.cameras, evidence.geometry(motion)
     if evidence.masks is None or motion.body_model != shaped.body.family:
         return cameras
-    objective = evidence.silhouettes(SkinPoints.of(shaped), FOCAL_SAMPLES)
+    objective = evidence.silhouettes(SkinPoints.of(shaped), geometry, FOCAL_SAMPLES)
     if objective is None:
         return cameras
     scale = fit_factor(scale_focal_length, geometry, objective)
@@ -91,6 +85,12 @@ REPORTED_DIFFERENCE_M = 0.01
 """Least difference in height, or of a joint relative to the pelvis, that is reported, metres."""
 MAX_HEIGHT_DIFFERENCE = 0.08
 """Relative difference in height beyond which it may not be the same person."""
+NO_PERSON_FOUND = (
+    "There are no masks, and where the poses put the body no person was found in the images; "
+    "distances stay as they are. Do poses and video belong together? Give --masks, from which "
+    "ia-check can find what is wrong, or your own SMPL file (--body)."
+)
+"""Note about a capture in which no masks can be estimated."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,11 +129,9 @@ def align_body(motion: Motion, shaped: ShapedBody, evidence: CaptureEvidence) ->
     if not needs_placement(motion, shaped):
         return BodyAlignment(shaped=shaped, motion=motion)
     geometry = evidence.geometry(motion)
-    if not evidence.has_masks:
-        return _accept(_place_on_images(geometry, shaped, evidence), shaped, motion)
-    objective = evidence.silhouettes(SkinPoints.of(shaped), ALIGNMENT_SAMPLES)
+    objective = evidence.silhouettes(SkinPoints.of(shaped), geometry, ALIGNMENT_SAMPLES)
     if objective is None:
-        return _accept(None, shaped, motion)
+        return _accept(None, shaped, motion, "" if evidence.has_masks else NO_PERSON_FOUND)
     placement = place_body_on_masks(geometry, objective)
     own = shaped.body.with_shape()
     other = place_body_on_masks(geometry, _with_body(objective, own))
@@ -158,17 +156,15 @@ def align_to_person(
     if same and not foreign:
         return BodyAlignment(shaped=person, motion=motion)
     objective = None
-    if evidence.has_masks:
-        objective = evidence.silhouettes(SkinPoints.of(person), ALIGNMENT_SAMPLES)
+    if foreign or evidence.has_masks:
+        there = evidence.geometry(motion)
+        objective = evidence.silhouettes(SkinPoints.of(person), there, ALIGNMENT_SAMPLES)
     if not same and not (foreign and objective is not None):
         motion = rescale_motion(evidence.geometry(motion), shaped, person)
-    geometry = evidence.geometry(motion)
     difference = "" if foreign or same else _describe_difference(shaped, person)
     placement = None
     if objective is not None:
-        placement = place_body_on_masks(geometry, objective)
-    elif foreign and not evidence.has_masks:
-        placement = _place_on_images(geometry, person, evidence)
+        placement = place_body_on_masks(evidence.geometry(motion), objective)
     return _accept(placement, person, motion, difference)
 
 
@@ -210,18 +206,6 @@ def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
     )
 
 
-def _place_on_images(
-    geometry: CaptureGeometry, shaped: ShapedBody, evidence: CaptureEvidence
-) -> BodyPlacement | None:
-    """Align a body to a few images; None where parts do not fit (reported elsewhere)."""
-    skin = SkinPoints.of(shaped)
-    try:
-        images = sample_video(geometry, skin, evidence.cameras, evidence.source)
-    except InputError:
-        return None
-    return place_body_on_images(geometry, skin, images)
-
-
 def _with_body(objective: SilhouetteObjective, shaped: ShapedBody) -> SilhouetteObjective:
     """The objective of the same masks for another person."""
     return SilhouetteObjective(samples=objective.samples, skin=SkinPoints.of(shaped))
@@ -229,8 +213,6 @@ def _with_body(objective: SilhouetteObjective, shaped: ShapedBody) -> Silhouette
 
 MIN_SMPL_IOU_GAIN = 0.05
 """Gain in mean IoU by which SMPL's body must beat the file's."""
-MIN_SMPL_CONTRAST_RATIO = 1.1
-"""Ratio of edge contrasts by which SMPL's body must beat the file's, without masks."""
 
 
 def place_motion(
@@ -259,7 +241,7 @@ def place_motion(
         return own
     smpl = placed(replace(motion_read, body_model="smpl"))
     one, other = ((evidence.geometry(each), who) for each, who in (own, smpl))
-    reason = (_smpl_fits_masks if evidence.has_masks else _smpl_fits_images)(one, other, evidence)
+    reason = _smpl_fits_masks(one, other, evidence)
     if reason is None:
         return own
     words = (
@@ -276,7 +258,7 @@ PosedPerson = tuple[CaptureGeometry, ShapedBody]
 
 def _smpl_fits_masks(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvidence) -> str | None:
     """How much better SMPL's body fits the masks than the file's; None if it does not."""
-    objective = evidence.silhouettes(SkinPoints.of(own[1]), ALIGNMENT_SAMPLES)
+    objective = evidence.silhouettes(SkinPoints.of(own[1]), own[0], ALIGNMENT_SAMPLES)
     if objective is None or mean_score(objective.frame_scores(own[0])) >= GOOD_IOU:
         return None
     before = place_body_on_masks(own[0], objective).iou_after
@@ -284,22 +266,3 @@ def _smpl_fits_masks(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvide
     if after < before + MIN_SMPL_IOU_GAIN:
         return None
     return f"whose mean IoU with the masks is {after:.2f}, not {before:.2f}"
-
-
-def _smpl_fits_images(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvidence) -> str | None:
-    """How much stronger edges are across the outline of SMPL's body; None if they are not."""
-    (one, skin), (other, smpl_skin) = ((each, SkinPoints.of(who)) for each, who in (own, smpl))
-    cameras, source = evidence.cameras, evidence.source
-    try:
-        before = edge_contrast(one, skin, sample_video(one, skin, cameras, source))
-        images = sample_video(other, smpl_skin, cameras, source)
-    except InputError:
-        return None
-    fitted = place_body_on_images(other, smpl_skin, images)
-    after = edge_contrast(replace(other, motion=fitted.motion), smpl_skin, images)
-    if after < MIN_SMPL_CONTRAST_RATIO * max(before, MIN_EDGE_CONTRAST):
-        return None
-    return (
-        f"across whose outline edges are {after:.1f} times as strong as beside it, not "
-        f"{before:.1f} times"
-    )

@@ -1,41 +1,36 @@
-"""Alignment of a body to images without masks, and the edge contrast of its outline.
-
-At first the body may be off by a fifth of its size. GrabCut (Rother et al. 2004) segments the
-person by color in a band of that width around the body's outline; the body is aligned to these
-masks, the band becomes narrower, and so on until the body stays. Such masks follow the body:
-whether there is a person at all is decided by the images' edges, which are independent of it.
-"""
+"""A few images of a capture without masks: estimated masks, and edges along the body's outline."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
+from capture.frame import Frame
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.edge_objective import gradient_along, outward_normals
-from preprocess.alignment.mask_alignment import BodyPlacement, place_body_on_masks
 from preprocess.alignment.silhouette_objective import (
     MaskSample,
     SilhouetteObjective,
-    mean_score,
+    reduce_masks,
     spaced_indices,
 )
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.silhouette import (
     NEAR_PLANE_M,
+    SILHOUETTE_PERSON_PX,
     SkinPoints,
     signed_distance_px,
     splat_silhouette,
 )
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.masks.graph_cut import cut_foreground
+from preprocess.masks.mask_origin import DEFAULT_SEGMENTER, make_segmenter
 from preprocess.observe import associate_cameras
 
 IMAGE_PERSON_PX = 130
@@ -188,97 +183,30 @@ def edge_contrast(
     return (along / along_px) / (beside / beside_px)
 
 
-UNCERTAIN_BANDS_M = (0.12, 0.05, 0.035)
-"""Half width of the uncertain band around the body's outline in each round, metres."""
-MAX_INNER_BAND = 0.6
-"""Largest width of the band inside, as a fraction of the body's greatest depth in the image."""
-CLOTHING_GUESS_M = 0.01
-"""Assumed clothing offset, metres."""
-BACKGROUND_BORDER_M = 0.25
-"""Width of the background around the band from which GrabCut learns its colors, metres."""
-GRABCUT_ITERATIONS = 2
-"""GrabCut iterations per round."""
-MAX_ROUNDS = 6
-"""Rounds of segmentation and alignment."""
-CONVERGED_DISTANCE = 0.005
-"""Relative change of the distance in a round below which the alignment has converged."""
-CONVERGED_SHIFT_M = 0.003
-"""Shift of the pelvis in a round below which the alignment has converged, metres."""
-
-
-def place_body_on_images(
+def estimate_silhouettes(
     geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample]
-) -> BodyPlacement:
-    """Align SMPL's poses, on another body, to a few images.
+) -> SilhouetteObjective | None:
+    """The objective of masks that are estimated in a few images; None if no person is found.
 
     Args:
         geometry: Poses and cameras; the body may be off by a fifth of its size.
         skin: The body.
-        samples: Images; see `sample_video`.
+        samples: Images of one size; see `sample_video`.
     """
-    nearer, shift_m, objective, now = 1.0, np.zeros(3), None, geometry
-    for number in range(MAX_ROUNDS):
-        found = _estimate_masks(
-            now, skin, samples, UNCERTAIN_BANDS_M[min(number, len(UNCERTAIN_BANDS_M) - 1)]
-        )
-        if found is None:
-            break
-        objective = found
-        step = place_body_on_masks(now, objective)
-        now = replace(now, motion=step.motion)
-        nearer, shift_m = (
-            nearer * step.distance_divisor,
-            shift_m / step.distance_divisor + step.pelvis_shift_m,
-        )
-        stands = (
-            abs(step.distance_divisor - 1.0) < CONVERGED_DISTANCE
-            and np.linalg.norm(step.pelvis_shift_m) < CONVERGED_SHIFT_M
-        )
-        if number + 1 >= len(UNCERTAIN_BANDS_M) and stands:
-            break
-
-    def scores_of(moved: CaptureGeometry) -> Float[np.ndarray, "samples"]:
-        return np.zeros(0) if objective is None else objective.frame_scores(moved)
-
-    return BodyPlacement(
-        motion=now.motion,
-        iou_before=mean_score(scores_of(geometry)),
-        iou_after=mean_score(scores_of(now)),
-        distance_divisor=nearer,
-        pelvis_shift_m=shift_m,
-        edge_contrast=(edge_contrast(geometry, skin, samples), edge_contrast(now, skin, samples)),
-    )
-
-
-def _estimate_masks(
-    geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample], band_m: float
-) -> SilhouetteObjective | None:
-    """Estimated masks of all images that show the body; None if none does."""
-    masks = []
+    segment, masks = make_segmenter(DEFAULT_SEGMENTER, skin.shaped), list[MaskSample]()
     for sample in samples:
-        body = body_outline(geometry, skin, sample)
-        person = None if body is None else grabcut_near_outline(sample.rgb, body, band_m)
-        if person is not None:
-            alpha = person.astype(np.float32)
-            row = sample.camera_row
-            masks.append(MaskSample(index=sample.index, camera_row=row, alpha=alpha))
-    return SilhouetteObjective(samples=tuple(masks), skin=skin) if masks else None
-
-
-def grabcut_near_outline(
-    rgb: UInt8[np.ndarray, "height width 3"], outline: BodyOutline, band_m: float
-) -> Bool[np.ndarray, "height width"] | None:
-    """Segment the person in a band around a body's outline; None if that fails.
-
-    Args:
-        rgb: The image.
-        outline: Approximate outline of the body.
-        band_m: Half width of the uncertain band, metres; narrower inside thin bodies.
-    """
-    away = outline.signed_distance_m - np.float32(CLOTHING_GUESS_M)
-    inwards = min(band_m, MAX_INNER_BAND * float(-away.min()))
-    labels = np.where(away < 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[away >= band_m], labels[away <= -inwards] = cv2.GC_BGD, cv2.GC_FGD
-    margin = int(BACKGROUND_BORDER_M * outline.px_per_m) + 1
-    person = cut_foreground(rgb, labels, away < band_m, margin, GRABCUT_ITERATIONS)
-    return person if person is not None and person.any() else None
+        row = geometry.row_for_frame(sample.index)
+        if row is None:
+            continue
+        camera = geometry.camera_at(sample.camera_row, sample.size_px)
+        frame = Frame(index=sample.index, time_s=0.0, rgb=sample.rgb)
+        try:
+            alpha = segment(frame, geometry.motion[row], camera)
+        except InputError:  # the person is not there, or the body is out of the image
+            continue
+        if (alpha > 0.5).any():
+            masks.append(MaskSample(index=sample.index, camera_row=sample.camera_row, alpha=alpha))
+    if not masks:
+        return None
+    small = reduce_masks(masks, samples[0].size_px, SILHOUETTE_PERSON_PX)
+    return SilhouetteObjective(samples=small, skin=skin)

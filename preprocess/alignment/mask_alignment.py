@@ -69,8 +69,6 @@ MIN_ALIGNED_IOU = 0.6
 """Mean IoU from which an alignment is reliable."""
 MIN_ALIGNMENT_GAIN = 0.01
 """Gain in mean IoU from which an alignment is taken."""
-MIN_EDGE_CONTRAST = 1.6
-"""Least edge contrast of the body's outline from which an alignment without masks is reliable."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,9 +81,6 @@ class BodyPlacement:
         iou_after: Mean IoU of body and masks with `motion`.
         distance_divisor: Factor by which distances from the camera were divided.
         pelvis_shift_m: Shift of the pelvis in the root's own axes, metres.
-        edge_contrast: Before and after, where masks were estimated around the body itself
-            (`image_alignment`): strength of the images' edges across the body's outline relative
-            to beside it. None where masks were given.
     """
 
     motion: Motion
@@ -93,7 +88,6 @@ class BodyPlacement:
     iou_after: float
     distance_divisor: float
     pelvis_shift_m: Float[np.ndarray, "3"]
-    edge_contrast: tuple[float, float] | None = None
 
     @property
     def is_improvement(self) -> bool:
@@ -102,60 +96,34 @@ class BodyPlacement:
 
     @property
     def is_reliable(self) -> bool:
-        """Whether body and images agree better than by chance."""
-        if self.edge_contrast is not None and self.edge_contrast[1] < MIN_EDGE_CONTRAST:
-            return False
+        """Whether body and masks agree better than by chance."""
         return self.iou_after >= MIN_ALIGNED_IOU
 
     def describe(self) -> str:
         """Describe the alignment, for people."""
+        agreed = f"{self.iou_before:.2f} before, {self.iou_after:.2f} after"
         if not self.is_reliable:
-            return self._describe_failure()
-        agreed = f"agreement {self.iou_before:.2f} before, {self.iou_after:.2f} after"
-        if self.edge_contrast is None:
-            with_what = "masks"
-        else:
-            with_what = "images, in which masks were estimated around it"
-            agreed += (
-                f"; edges across its outline are {self.edge_contrast[1]:.1f} times as strong as "
-                f"beside it, before {self.edge_contrast[0]:.1f} times"
+            return (
+                f"Their distances could not be fitted to the masks ({agreed}); they stay as they "
+                "are."
             )
         if not self.is_improvement:
-            return f"Distances fit the {with_what}, as they are ({agreed})."
+            return f"Distances fit the masks, as they are (agreement {agreed})."
         return (
             f"Distances were divided by {self.distance_divisor:.3f} and the pelvis moved by "
-            f"{100.0 * float(np.linalg.norm(self.pelvis_shift_m)):.1f} cm to fit the {with_what}: "
-            f"{agreed}."
-        )
-
-    def _describe_failure(self) -> str:
-        """Describe an alignment that is not reliable."""
-        if self.edge_contrast is None:
-            return (
-                f"Their distances could not be fitted to the masks ({self.iou_before:.2f} before, "
-                f"{self.iou_after:.2f} after); they stay as they are."
-            )
-        return (
-            "There are no masks, and where the poses put the body no person was found in the "
-            f"images (edges across its outline are {self.edge_contrast[1]:.1f} times as strong as "
-            "beside it, 2 to 5 times is usual); distances stay as they are. Do poses and video "
-            "belong together? Give --masks, from which ia-check can find what is wrong, or your "
-            "own SMPL file (--body)."
+            f"{100.0 * float(np.linalg.norm(self.pelvis_shift_m)):.1f} cm to fit the masks: "
+            f"agreement {agreed}."
         )
 
     def as_json(self) -> dict[str, float | bool]:
         """The alignment's figures for the report."""
-        figures: dict[str, float | bool] = {
+        return {
             "taken": self.is_improvement,
             "agreement_before": round(self.iou_before, 4),
             "agreement_after": round(self.iou_after, 4),
             "distances_divided_by": round(self.distance_divisor, 4),
             "pelvis_moved_cm": round(100.0 * float(np.linalg.norm(self.pelvis_shift_m)), 2),
         }
-        if self.edge_contrast is not None:
-            before, after = self.edge_contrast
-            figures |= {"edges_before": round(before, 2), "edges_after": round(after, 2)}
-        return figures
 
 
 def place_body_on_masks(geometry: CaptureGeometry, objective: SilhouetteObjective) -> BodyPlacement:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,9 +14,8 @@ from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints, soft_iou, splat_silhouette
-from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import Masks
-from preprocess.observe import alpha_channel_mask, associate_cameras, associate_masks
+from preprocess.observe import alpha_channel_mask
 
 SAMPLED_FRAMES = 16
 """Number of frames that are sampled."""
@@ -238,45 +236,6 @@ def reduce_masks(
     longer = max(samples[0].alpha.shape) * person_px / max(tall, 1.0)
     small = _scaled_size(full_px, min(longer, 4.0 * person_px))
     return tuple(replace(each, alpha=_resize_alpha(each.alpha, small)) for each in samples)
-
-
-class CaptureEvidence(NamedTuple):
-    """What shows where the person of a capture is.
-
-    Attributes:
-        source: The frames; few are decoded, and none if there are mask files.
-        masks: The masks; None if the images have an alpha channel, or there are none.
-        cameras: Cameras of the frames' size.
-    """
-
-    source: FrameSource
-    masks: Masks | None
-    cameras: CameraTrack
-
-    @property
-    def has_masks(self) -> bool:
-        """Whether there are mask files, or alpha channels in their place."""
-        return self.masks is not None or self.source.has_alpha
-
-    def geometry(self, motion: Motion) -> CaptureGeometry:
-        """The geometry of a motion, as the files state it."""
-        return CaptureGeometry.of(motion, self.cameras, self.source)
-
-    def silhouettes(
-        self, skin: SkinPoints, count: int, person_px: int = SILHOUETTE_PERSON_PX
-    ) -> SilhouetteObjective | None:
-        """The objective of a few masks; None where parts do not fit (reported elsewhere)."""
-        try:
-            rows = (
-                associate_masks(self.masks, self.source),
-                associate_cameras(self.cameras, self.source),
-            )
-            return sample_masks(
-                self.source, self.masks, *rows, skin, count=count, person_px=person_px,
-                excluded_frames=self.cameras.frames_without_camera,
-            )  # fmt: skip
-        except InputError:
-            return None
 
 
 def _sample_mask_files(

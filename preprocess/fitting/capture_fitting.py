@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.source_opening import open_source
+from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.alignment.silhouette_objective import (
-    CaptureEvidence,
     MaskSample,
     SilhouetteObjective,
     reduce_masks,
@@ -225,7 +225,8 @@ def _read_outlines(
     objective = _observe_silhouettes(capture, count)
     if objective is None and capture.segment is None:
         evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
-        objective = evidence.silhouettes(SkinPoints.of(capture.shaped, 1), count, OUTLINE_PERSON_PX)
+        skin = SkinPoints.of(capture.shaped, 1)
+        objective = evidence.silhouettes(skin, geometry, count, OUTLINE_PERSON_PX)
     if objective is None:
         return {}
     return {

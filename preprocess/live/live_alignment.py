@@ -1,9 +1,9 @@
 """Incremental alignment of streamed SMPL poses to a body that is not SMPL's.
 
 The first frame determines the person's distance, turning the rest. So the alignment is solved with
-the first frame and again whenever the number of frames has doubled: by masks
-(`preprocess.alignment.mask_alignment`) or, where there are none, by images
-(`preprocess.alignment.image_alignment`).
+the first frame and again whenever the number of frames has doubled, by masks
+(`preprocess.alignment.mask_alignment`) or, where there are none, by those that are estimated in
+reduced images.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from capture.frame import Frame
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.image_alignment import (
     ImageSample,
-    place_body_on_images,
+    estimate_silhouettes,
     thumbnail_size_px,
 )
 from preprocess.alignment.mask_alignment import (
@@ -128,8 +128,8 @@ class LiveAlignment:
             self._every *= 2
             del self._seen[1::2]
 
-    def _solve(self, camera: Camera) -> BodyPlacement:
-        """Solve the placement from all kept frames."""
+    def _solve(self, camera: Camera) -> BodyPlacement | None:
+        """Solve the placement from all kept frames; None if no person is found in them."""
         poses = [seen.pose for seen in self._seen]
         count = len(poses)
         motion = Motion(
@@ -148,17 +148,19 @@ class LiveAlignment:
             size_px=camera.size_px,
             distortion=camera.distortion,
         )
-        if not self.uses_masks:
+        if self.uses_masks:
+            samples = tuple(
+                MaskSample(index=index, camera_row=0, alpha=seen.thumbnail.astype(np.float32))
+                for index, seen in enumerate(self._seen)
+            )
+            objective = SilhouetteObjective(samples=samples, skin=self._skin)
+        else:
             images = [
                 ImageSample(index=index, camera_row=0, rgb=seen.thumbnail)
                 for index, seen in enumerate(self._seen)
             ]
-            return place_body_on_images(geometry, self._skin, images)
-        samples = tuple(
-            MaskSample(index=index, camera_row=0, alpha=seen.thumbnail.astype(np.float32))
-            for index, seen in enumerate(self._seen)
-        )
-        return place_body_on_masks(geometry, SilhouetteObjective(samples=samples, skin=self._skin))
+            objective = estimate_silhouettes(geometry, self._skin, images)
+        return None if objective is None else place_body_on_masks(geometry, objective)
 
     def _place(self, pose: BodyPose, camera: Camera, placement: BodyPlacement) -> BodyPose:
         rest = self._skin.shaped.joints[0]

@@ -21,6 +21,8 @@ CHANGED_DIFFERENCE = 12.0
 MAX_CHANGED_FRACTION = 0.12
 """Fraction of changed background pixels from which the camera has moved: static ones have at most
 0.1 (texts, shadows, passers-by), a hand-held one 0.2 to 0.3."""
+MIN_GAIN = 0.2
+"""Least gain; less is a frame without light, after which the plate starts again."""
 STRIDE = 7
 """Gains are estimated from every n-th row and column."""
 MIN_SAMPLES = 50
@@ -106,10 +108,11 @@ class BackgroundPlate:
         )
         alike = np.ones(seen.shape[1], dtype=bool)
         for _ in range(2):  # again without what does not fit
-            total = np.maximum((before[:, alike] ** 2).sum(axis=1), np.float32(1.0))
-            self._gain = (seen[:, alike] * before[:, alike]).sum(axis=1) / total
+            count = np.float32(alike.sum())  # of one level: a black background has gain 1
+            total = (before[:, alike] ** 2).sum(axis=1) + count
+            self._gain = ((seen[:, alike] * before[:, alike]).sum(axis=1) + count) / total
             alike = np.abs(seen - self._gain[:, None] * before).max(axis=0) < CHANGED_DIFFERENCE
-            if alike.mean() < 1.0 - MAX_CHANGED_FRACTION:
+            if alike.mean() < 1.0 - MAX_CHANGED_FRACTION or self._gain.min() < MIN_GAIN:
                 self._frames[:] = 0.0
                 self._gain = np.ones(3, np.float32)
                 return

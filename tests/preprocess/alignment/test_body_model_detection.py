@@ -10,7 +10,7 @@ from PIL import Image
 from capture.camera import Camera
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import place_motion
-from preprocess.alignment.silhouette_objective import CaptureEvidence
+from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.proportion_space import shape_for_motion

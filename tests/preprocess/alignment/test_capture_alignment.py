@@ -10,8 +10,8 @@ from capture.camera import Camera
 from capture.frame import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import BodyAlignment, align_body, align_to_person
+from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
-from preprocess.alignment.silhouette_objective import CaptureEvidence
 from preprocess.body.body_file import load_body_model, read_shaped_body, write_shaped_body
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import BodyModel, ShapedBody

@@ -78,3 +78,19 @@ def test_texture_in_plain_sight_is_no_person() -> None:
         plain.align(wall, FREE)
         plain.update(wall, FREE)
     assert not plain.within(ALL).in_sight(wall).any()
+
+
+def test_a_black_background_is_learnt_and_a_black_frame_is_not() -> None:
+    dark, black = BackgroundPlate(), np.zeros((3, *SIZE), np.float32)
+    for _ in range(3):
+        dark.align(black, FREE)
+        dark.update(black, FREE)
+    assert dark.within(ALL).known.all()
+    assert not dark.within(ALL).mean.any()
+    plate = _plate(3)
+    plate.align(black, FREE)
+    plate.update(black, FREE)
+    for _ in range(3):
+        plate.align(_wall(), FREE)
+        plate.update(_wall(), FREE)
+    assert plate.within(ALL).mean == pytest.approx(_wall(), abs=1.0)
