@@ -82,15 +82,14 @@ def _made_on_lines(found: Found) -> list[str]:
     )
     lines = [f"commit {', '.join(commits)}; {dates[0]} to {dates[-1]}", *machines]
     lines.append(f"{min(loads):g} to {max(loads):g} processes wanted a core when each method began")
-    if len(commits) > 1:
-        newest = max(made, key=lambda each: each["date"])["commit"]
-        lines += [
-            f"of another commit, {each['made_on']['commit']}: {each['method']} on "
-            f"{_title(sample)}, {sample.seconds:g} s"
-            for sample, results in found.items()
-            for each in results
-            if each["made_on"]["commit"] != newest
-        ]
+    newest = max(made, key=lambda each: each["date"])["commit"]
+    for commit in (each for each in commits if each != newest):
+        cells = []
+        for sample, results in found.items():
+            names = [r["method"] for r in results if r["made_on"]["commit"] == commit]
+            if names:
+                cells.append(f"{', '.join(names)} on {_title(sample)}, {sample.seconds:g} s")
+        lines.append(f"of another commit, {commit}: {'; '.join(cells)}")
     return lines
 
 

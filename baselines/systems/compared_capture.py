@@ -98,7 +98,7 @@ def novel_observations(
         None,
     )
     true_body = body if body.exists() else None
-    inputs = CaptureInputs(video=novel, cameras=cameras, body=true_body)
+    inputs = CaptureInputs(video=novel, cameras=cameras, body=true_body, refine_masks=False)
     found = [
         seen
         for seen in open_capture(inputs, size_px=size_px).observations()

@@ -2,12 +2,15 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from baselines import compare, comparison_scores
 from baselines.comparison_table import comparison_table, time_to_reach, with_better_poses
+from baselines.systems import compared_capture
+from preprocess.body.body_file import load_body_model
 from studio.shoot import ShootConfig, film_capture
 
 
@@ -135,3 +138,17 @@ def test_a_pose_that_was_better_before_it_was_fitted_stays():
         "held_out": scored(), "held_out_fitted": scored(),
     }  # fmt: skip
     assert with_better_poses(result)["novel_fitted"]["psnr"] == 33.0
+
+
+def test_true_masks_are_never_refined(tmp_path, monkeypatch):
+    asked = []
+    (tmp_path / "truth" / "novel").mkdir(parents=True)
+
+    def open_nothing(inputs, **_):
+        asked.append(inputs)
+        return SimpleNamespace(observations=list)
+
+    monkeypatch.setattr(compared_capture, "open_capture", open_nothing)
+    person = load_body_model().with_shape()
+    assert compared_capture.novel_observations(tmp_path, person) == []
+    assert not asked[0].refine_masks
