@@ -93,6 +93,7 @@ class PoseOptimizer:
 
     Attributes:
         poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong.
+        min_gradient_cell_m: Smallest cells of the hash levels whose gradient reaches the poses.
         corrections: Root rotation, joint rotations and root shift of each slot.
         bones: Body-from-canonical transforms of the corrected poses.
     """
@@ -112,6 +113,7 @@ class PoseOptimizer:
         """
         self.rig = rig
         self.poses_may_be_exact = poses_may_be_exact
+        self.min_gradient_cell_m = MIN_POSE_GRADIENT_CELL_M
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
         self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
         self.skinning = SkinningVolume(

@@ -25,6 +25,9 @@ CORRECTIONS_PER_FRAME = 32
 """Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 512
 """Rays per correction of a pose."""
+COARSE_SHARE = 0.5
+"""Share of the corrections that follow the coarse levels of the hash grid alone; then poses are so
+near that the finer ones, which do not change any more, point to the right place, too."""
 FITTING_SHARE = 0.8
 """Share of fitting in the time that fitting and scoring take, for the progress."""
 
@@ -87,6 +90,8 @@ def _fit_frames(
     generator = torch.Generator(device=replay.device).manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / 2)
     for step in range(steps):
+        if step >= COARSE_SHARE * steps:
+            poses.min_gradient_cell_m = 0.0
         batch = replay.sample_rays(config.rays, generator)
         result = compute_gradients(
             avatar, sampler, replay.correspondences, exposures.neutralize(batch), config,

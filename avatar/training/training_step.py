@@ -19,7 +19,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.pose.pose_optimizer import MIN_POSE_GRADIENT_CELL_M, PoseOptimizer
+from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import TrainingBatch
 
 
@@ -238,7 +238,7 @@ def _accumulate_pose_gradients(
     loss: Float32[Tensor, "rays"],
 ) -> None:
     """Adds the wrenches that the samples exert on the bones of their frames' poses."""
-    backend, levels = field.backend, field.levels.coarser_than(MIN_POSE_GRADIENT_CELL_M)
+    backend, levels = field.backend, field.levels.coarser_than(poses.min_gradient_cell_m)
     # undo the mean over rays: a pose is judged by the loss of each of its rays
     each = grad_features[: len(drawn), : levels.feature_width] * len(loss)
     grad_points = torch.zeros_like(samples.points)

@@ -11,7 +11,12 @@ from avatar.config import TrainConfig
 from avatar.deformation.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels import torch_skinning
-from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, CorrespondenceTables, RaySamples
+from avatar.kernels.backend_protocol import (
+    FEATURES_PER_LEVEL,
+    CorrespondenceTables,
+    HashLevels,
+    RaySamples,
+)
 from avatar.kernels.torch_backend import TorchBackend
 from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.pose.pose_optimizer import (
@@ -19,6 +24,7 @@ from avatar.pose.pose_optimizer import (
     FREEZE_AFTER_STEPS,
     MAX_ESTIMATED_INTERVAL,
     MIN_ESTIMATES_BEFORE_FREEZE,
+    MIN_POSE_GRADIENT_CELL_M,
     MIN_STEPS_BEFORE_FREEZE,
     PoseOptimizer,
 )
@@ -233,6 +239,15 @@ def test_poses_fitted_to_held_out_frames_score_better_where_the_given_ones_are_o
     )
     assert fitted.psnr_mask > given.psnr_mask + 2.0
     assert torch.equal(table, learnt.trainer.avatar.field.table)
+
+
+def test_fine_levels_pull_held_out_poses_in_the_second_half_alone(learnt, clip, monkeypatch):
+    asked = list[float]()
+    monkeypatch.setattr(
+        HashLevels, "coarser_than", lambda levels, cell_m: (asked.append(cell_m), levels)[1]
+    )
+    list(fit_test_poses(learnt.trainer, [HeldOutFrame(observation=clip.observations[11])]))
+    assert asked == 8 * [MIN_POSE_GRADIENT_CELL_M] + 8 * [0.0]
 
 
 def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
