@@ -27,8 +27,10 @@ from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
     SIGMA_LOG_ASSUMED_FOCAL,
     SIGMA_LOG_FOCAL,
+    USUAL_WEIGHTS,
     ClipFitter,
     ClipFrame,
+    EvidenceWeights,
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
@@ -41,9 +43,12 @@ MIN_ITERATIONS = 6
 """Fewest Gauss-Newton iterations; the first ones may overshoot."""
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
-TRACKED_KEY_FRAMES = 60
-"""Frames whose masks are fitted where key points tell the poses between them, or where masks must
-be estimated."""
+ESTIMATED_KEY_FRAMES = 60
+"""Frames whose masks are fitted where masks must be estimated."""
+TRACKED_KEY_FRAMES = 300
+"""Frames, evenly spread, whose masks are fitted together with key points."""
+TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
+"""Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
 TRACKED_FRAMES_PER_PRIOR = 30.0
 """Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5
@@ -168,7 +173,8 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
     if capture.live is not None or not (has_masks or track):
         return None
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
-    count = TRACKED_KEY_FRAMES if track or capture.segment else KEY_FRAMES
+    count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
+    count = ESTIMATED_KEY_FRAMES if capture.segment else count
     outlines = _read_outlines(capture, geometry, count) if has_masks else {}
     numbers = {*outlines, *([] if track is None else track.frames.tolist())}
     sizes = [each.camera.size_px for each in outlines.values()]
@@ -191,6 +197,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         track=track,
         sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
         frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
+        weights=TRACKED_WEIGHTS if outlines else USUAL_WEIGHTS,
     )
 
 

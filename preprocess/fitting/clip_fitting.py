@@ -26,8 +26,6 @@ from preprocess.tracking.keypoint_track import KeypointTrack
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""
-INDEPENDENT_ROWS = 60.0
-"""Independent distances along one outline; neighbors on it err alike."""
 FRAMES_PER_PRIOR = 10.0
 """Frames of one person that count as one for the proportions: their clothes err alike."""
 SIGMA_LOG_FOCAL = 0.08
@@ -44,6 +42,18 @@ USUAL_FPS = 30.0
 """Frames per second of a film that does not say."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
+
+
+class EvidenceWeights(NamedTuple):
+    """What a clip's evidence counts against its priors.
+
+    Attributes:
+        outline_rows: Independent distances along one outline; neighbors on it err alike.
+        keypoints: Factor of the key points' precision in the picture.
+    """
+
+    outline_rows: float = 60.0
+    keypoints: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,6 +82,8 @@ class FitParameters(NamedTuple):
     outlines: bool = True
 
 
+USUAL_WEIGHTS = EvidenceWeights()
+"""Where few frames have an outline, or poses are given."""
 ALL_PARAMETERS = FitParameters()
 """Poses, proportions and focal length together."""
 
@@ -98,6 +110,7 @@ class ClipFitter:
         settled: bool = False,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
         frames_per_prior: float = FRAMES_PER_PRIOR,
+        weights: EvidenceWeights = USUAL_WEIGHTS,
         model: OutlineModel | None = None,
     ) -> None:
         """Starts with the poses, the proportions and the focal length as they are.
@@ -111,12 +124,13 @@ class ClipFitter:
             settled: Whether these poses were fitted to key points before.
             sigma_log_focal: How uncertain the focal length is.
             frames_per_prior: Frames that count as one for the proportions.
+            weights: What outlines and key points count.
             model: The person at the space's origin, where several clips share it.
         """
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
-        self._frames_per_prior = frames_per_prior
+        self._frames_per_prior, self._weights = frames_per_prior, weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
@@ -191,7 +205,8 @@ class ClipFitter:
             seen = self.model.compare(carried[index], mask)
             if seen is None:
                 continue
-            weight = seen.weights * (INDEPENDENT_ROWS / SIGMA_OUTLINE_PX**2 / len(seen.weights))
+            precision = self._weights.outline_rows / SIGMA_OUTLINE_PX**2
+            weight = seen.weights * (precision / len(seen.weights))
             squares += float(weight @ seen.residuals**2)
             total += float(weight.sum())
             shared = np.column_stack(
@@ -207,7 +222,11 @@ class ClipFitter:
             return
         cameras = [self.camera(index) for index in range(len(self.frames))]
         seen = self._keypoint_model.compare(
-            self.poses, self.model.joints, ClipCameras.of(cameras), self._keypoints
+            self.poses,
+            self.model.joints,
+            ClipCameras.of(cameras),
+            self._keypoints,
+            self._weights.keypoints,
         )
         focal = self._sigma_log_focal * seen.focal_jacobian[..., None]
         equations.add_all(

@@ -11,7 +11,9 @@ from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion
+from preprocess.fitting.clip_fitting import USUAL_WEIGHTS
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
@@ -122,6 +124,23 @@ def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
     alone = fit_capture(replace(lifted, masks=None))
     assert alone.taken
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
+
+
+def test_key_points_that_are_off_in_all_frames_give_way_to_outlines(lifted, truth, monkeypatch):
+    track = lifted.motion.keypoints
+    aside_px = 0.04 * truth.source.size_px[1] / 2.0  # about 4 cm
+    shifted = track.image_px.copy()
+    shifted[:, [13, 15, 25, 27]] += aside_px
+    shifted[:, [14, 16, 26, 28]] -= aside_px
+    off = replace(lifted, motion=replace(lifted.motion, keypoints=replace(track, image_px=shifted)))
+    error = {}
+    for weights in (capture_fitting.TRACKED_WEIGHTS, USUAL_WEIGHTS):
+        monkeypatch.setattr(capture_fitting, "TRACKED_WEIGHTS", weights)
+        ours, true = joints_in_camera(apply_fit(off, fit_capture(off))), joints_in_camera(truth)
+        away = ours * (ours * true).sum() / (ours * ours).sum() - true
+        error[weights] = float(np.linalg.norm(away[..., :2], axis=2).mean())
+    told, usual = error.values()
+    assert told < 0.95 * usual
 
 
 def see_people(truth: Capture) -> list[SeenPerson]:
