@@ -171,7 +171,10 @@ class BlockValues:
 
 
 def march_segments(
-    context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+    context: GraphContext,
+    posed: PosedNodeValues,
+    segment: SegmentValues,
+    close_up: GraphValue,
 ) -> tuple[VectorValue, GraphValue]:
     """Composite rays front to back, a block of samples at a time.
 
@@ -182,6 +185,7 @@ def march_segments(
         context: Tables, settings and inputs.
         posed: Skinning nodes in the camera's frame.
         segment: The rays.
+        close_up: Whether the picture is one (`MIN_FOOTPRINT_PX`): then there is one more block.
 
     Returns:
         Premultiplied color, and the transmittance, in [0, 1].
@@ -191,7 +195,8 @@ def march_segments(
     shortened = compression_scale(context, segment.direction_canonical)
     # more samples than usual make more blocks, not longer ones
     scale = (context.samples + (settings.samples - 1)) // settings.samples
-    blocks, steady = (scale * count for count in (settings.max_blocks, settings.uniform_blocks))
+    more = close_up.cast(np.int64)
+    blocks, steady = scale * (more + settings.max_blocks), scale * (more + settings.uniform_blocks)
     block = composite_samples(
         context, segment, segment.begin * 0.0 + 1.0, settings.block_samples, usual * shortened
     )

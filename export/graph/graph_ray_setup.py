@@ -42,8 +42,9 @@ class DepthLayer:
         transmittance: In [0, 1].
         enter: Distance at which the ray enters the surface, metres.
         end: Distance at which it ends, metres.
-        doubtful: Whether the surfel is folded or seen from behind.
-        compressed: Whether canonical space is compressed along the ray.
+        doubtful: Whether the surfel is folded (its Jacobian is not inverted), compressed (in a
+            close-up a metre along the ray crosses more than `MAX_TRUSTED_COMPRESSION` metres of
+            canonical space) or seen from behind.
     """
 
     ray: VectorValue
@@ -55,15 +56,15 @@ class DepthLayer:
     enter: GraphValue
     end: GraphValue
     doubtful: GraphValue
-    compressed: GraphValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedProxySurface:
-    """Surfels and skinning nodes in the camera's frame."""
+    """Surfels and skinning nodes in the camera's frame; whether it is near (`MIN_FOOTPRINT_PX`)."""
 
     surfels: PosedSurfels
     posed: PosedNodeValues
+    close_up: GraphValue
 
 
 def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> VectorValue:
@@ -88,7 +89,7 @@ def trace_depth_layer(
     """Trace rays through one depth layer.
 
     Skinning is linearized about the surfel that a ray sees: the inverse Jacobian carries the ray to
-    where it enters the surface. Where the skin is folded, look along its normal.
+    where it enters the surface. Where the skin is folded or compressed, look along its normal.
 
     Args:
         context: Tables, settings and inputs.
@@ -105,7 +106,8 @@ def trace_depth_layer(
     camera, derivative = skin_points(context, surface.posed, cell)
     inverse = invert_jacobian(context, derivative, ray)
     normal = gather_vector(_vector_table(context, "normal"), surfel)
-    trusted = inverse.trusted
+    far = dot(inverse.ray, inverse.ray) > MAX_TRUSTED_COMPRESSION**2
+    trusted = inverse.trusted & (surface.close_up & far).logical_not()
     direction = [graph.where(trusted, d, -n) for d, n in zip(inverse.ray, normal, strict=True)]
     along = dot(camera, ray)
     beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
@@ -124,7 +126,7 @@ def trace_depth_layer(
     if front is not None:
         color, light = _composite_in_one_block(context, segment)
     else:
-        color, light = march_segments(context, surface.posed, segment)
+        color, light = march_segments(context, surface.posed, segment, surface.close_up)
     return DepthLayer(
         ray=ray,
         surfel=surfel,
@@ -135,7 +137,6 @@ def trace_depth_layer(
         enter=enter,
         end=end,
         doubtful=trusted.logical_not() | (dot(normal, direction) > 0.0),
-        compressed=dot(direction, direction) > MAX_TRUSTED_COMPRESSION**2,
     )
 
 
@@ -181,8 +182,10 @@ def _segment_bounds(
     )
     enter = along + hit
     cosine = (-falling).maximum(settings.min_cosine)
-    lead = (settings.entry_margin_m / cosine).minimum(
-        compression_scale(context, direction) * settings.max_entry_margin_m
+    most_lead = compression_scale(context, direction) * settings.max_entry_margin_m
+    # from behind, a ray has come through the body
+    lead = graph.where(
+        falling > 0.0, most_lead, (settings.entry_margin_m / cosine).minimum(most_lead)
     )
     sine = 1.0 - falling * falling / dot(direction, direction).maximum(1e-12)
     bent = cosine.minimum(settings.max_compression)  # compression at the surfel seldom lasts

@@ -23,10 +23,13 @@ def filter_specks(
     first: DepthLayer,
     channels: list[GraphValue],
 ) -> list[GraphValue]:
-    """Replace doubtful and compressed pixels, and specks behind the first layer, by the median.
+    """Replace doubtful pixels, and specks behind the first layer, by the median about them.
 
-    Linearized skinning carries rays to a wrong place in folded skin, and between sheets that cross
-    it finds none; both are smaller than a footprint (`export.reference`: `filter_specks`).
+    A pixel is doubtful where the pose folds the skin about its surfel, compresses it along the ray,
+    or shows it from behind (`DepthLayer`): there a ray sees the surfel's own color or a wrong place
+    of the cloth. A speck is a pixel whose ray passed the first layer, which should have stopped it:
+    it lies inside of the avatar and differs from what is about it. Both are smaller than a
+    footprint. The reference is `export.reference.reference_player.filter_specks`.
 
     Args:
         context: Settings.
@@ -38,7 +41,7 @@ def filter_specks(
     graph, window = context.graph, splats.window
     passed = first.transmittance > context.settings.layer_min_transmittance
     covered = graph.range(graph.size(cell).cast(np.int32))
-    suspect = covered.compress(first.doubtful | first.compressed | passed)
+    suspect = covered.compress(first.doubtful | passed)
     half, rows_columns = splats.footprint_px // 2, np.array(TAPS, dtype=np.int64)
     rows, columns = (graph.constant(part) for part in rows_columns.T)
     steps = ((rows * window.stride + columns) * half).cast(np.int32)
@@ -62,8 +65,8 @@ def filter_specks(
     )
     differs = apart[0].maximum(*apart[1:]) > MAX_MEDIAN_DIFFERENCE
     fine = splats.footprint_px > MIN_FOOTPRINT_PX - 1
-    speck = first.compressed.gather(suspect) | ((medians[-1] > MIN_MEDIAN_ALPHA) & differs)
-    chosen = first.doubtful.gather(suspect) | (speck & fine)
+    speck = (medians[-1] > MIN_MEDIAN_ALPHA) & differs & fine
+    chosen = first.doubtful.gather(suspect) | speck
     there = suspect.compress(chosen)
     *color, alpha = (
         value.scatter(there, part.compress(chosen))

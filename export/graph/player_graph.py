@@ -27,7 +27,7 @@ from export.graph.graph_zbuffer import (
 from export.graph.onnx_builder import GraphBuilder, GraphValue
 from export.package.graph_tables import graph_initializers
 from export.package.player_tables import PlayerTables
-from export.package.render_settings import RenderSettings
+from export.package.render_settings import MIN_FOOTPRINT_PX, RenderSettings
 
 
 def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
@@ -58,8 +58,10 @@ def _draw_picture(context: GraphContext) -> GraphValue:
     """Splat, trace all layers, filter specks, pack."""
     graph = context.graph
     posed = pose_nodes(context)
-    surface = PosedProxySurface(surfels=pose_surfels(context, posed), posed=posed)
-    splats = project_surfels(context, surface.surfels)
+    surfels = pose_surfels(context, posed)
+    splats = project_surfels(context, surfels)
+    close_up = splats.footprint_px > MIN_FOOTPRINT_PX - 1
+    surface = PosedProxySurface(surfels=surfels, posed=posed, close_up=close_up)
     window = splats.window
     keys = nearest_keys(context, splats)
     covered = keys < EMPTY_KEY
@@ -119,7 +121,6 @@ def _add_further_layers(
             enter=before.enter,
             end=before.end.gather(kept),
             doubtful=before.doubtful,
-            compressed=before.compressed,
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         color = [

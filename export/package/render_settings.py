@@ -3,11 +3,12 @@
 from dataclasses import dataclass, replace
 
 MAX_TRUSTED_COMPRESSION = 3.0
-"""Canonical metres per metre along a ray above which a pixel is filtered: a footprint spans
-centimetres of cloth there, over which skinning is far from linear."""
+"""Canonical metres per metre along a ray above which the skin of a close-up counts as compressed: a
+footprint spans centimetres of cloth there, over which skinning is far from linear."""
 MIN_FOOTPRINT_PX = 3
-"""Edge of a surfel's footprint below which only folded skin is filtered: pixels are as coarse as
-specks, and the texture is, too."""
+"""Edge of a surfel's footprint from which a picture counts as a close-up: rays have one more block
+and are not followed through compressed skin, and specks are filtered. Below, pixels are as coarse
+as specks, and the texture is, too."""
 MIN_MEDIAN_ALPHA = 0.9
 """Least alpha of the median about a pixel that counts as the inside of the avatar."""
 MAX_MEDIAN_DIFFERENCE = 0.15
@@ -31,7 +32,8 @@ class RenderSettings:
     uniform_blocks: int = 3
     """Blocks at the nominal spacing; each later block doubles the spacing of the one before."""
     max_blocks: int = 6
-    """Blocks per ray; the last covers what remains. Both counts grow with the number of samples."""
+    """Blocks per ray; the last covers what remains. Both counts are one more in close-ups
+    (`MIN_FOOTPRINT_PX`), and grow with the number of samples."""
     further_layer_samples: int = 6
     """Density samples of a ray in each layer after the first, in a single block."""
     min_transmittance: float = 0.01

@@ -7,7 +7,7 @@ It is written from the tables and the settings alone, with arrays of vectors and
 inverse, and shares no code with the graph.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,8 +65,8 @@ class TracedPicture(NamedTuple):
     Attributes:
         pixel: Numbers of the covered pixels, ascending.
         segments: Their rays, through all layers.
-        doubtful: Whether the surfel that the pixel sees is folded or seen from behind.
-        compressed: Whether canonical space is compressed along the ray.
+        doubtful: Whether the surfel that the pixel sees is folded, compressed along the ray or seen
+            from behind.
         passed: Whether light passes the first layer, so that others are looked for.
         footprint_px: Edge of a surfel's footprint.
     """
@@ -74,7 +74,6 @@ class TracedPicture(NamedTuple):
     pixel: Int64[np.ndarray, "pixels"]
     segments: RaySegments
     doubtful: Bool[np.ndarray, "pixels"]
-    compressed: Bool[np.ndarray, "pixels"]
     passed: Bool[np.ndarray, "pixels"]
     footprint_px: int
 
@@ -137,8 +136,8 @@ def filter_specks(
 ) -> Float32[np.ndarray, "height width 4"]:
     """Take the median of nine pixels, half a footprint apart, where the picture is unreliable.
 
-    It replaces doubtful and compressed pixels, and those inside of the avatar whose ray passed the
-    first layer and that differ from it: specks where sheets of skin cross.
+    It replaces doubtful pixels, and those inside of the avatar whose ray passed the first layer and
+    that differ from it: specks where sheets of skin cross.
     """
     half = traced.footprint_px // 2
     filtered, pixel = picture.reshape(-1, 4).copy(), traced.pixel
@@ -148,8 +147,8 @@ def filter_specks(
     median = np.median([bordered[row + i, column + j] for i, j in steps], axis=0)
     inside = median[:, 3] > MIN_MEDIAN_ALPHA
     differs = np.abs(median - filtered[pixel]).max(axis=1) > MAX_MEDIAN_DIFFERENCE
-    speck = traced.compressed | (traced.passed & inside & differs)
-    chosen = traced.doubtful | (speck & (traced.footprint_px >= MIN_FOOTPRINT_PX))
+    speck = traced.passed & inside & differs & (traced.footprint_px >= MIN_FOOTPRINT_PX)
+    chosen = traced.doubtful | speck
     filtered[pixel[chosen]] = median[chosen]
     return filtered.reshape(picture.shape)
 
@@ -171,11 +170,16 @@ def trace_picture(
     filled = fill_holes(buffer, tables, settings, splats.side).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
-    rays, depth, doubtful = _ray_entries(tables, settings, inputs, posed, covered, key, None)
-    compressed = (rays.direction_canonical**2).sum(axis=1) > MAX_TRUSTED_COMPRESSION**2
-    segments = RaySegments.of_first_layer(
-        rays, posed.nodes, tables.bricks, settings, inputs.samples
+    close_up = splats.side >= MIN_FOOTPRINT_PX
+    rays, depth, doubtful = _ray_entries(
+        tables, settings, inputs, posed, covered, key, None, close_up
     )
+    blocks = replace(
+        settings,
+        uniform_blocks=settings.uniform_blocks + close_up,
+        max_blocks=settings.max_blocks + close_up,
+    )
+    segments = RaySegments.of_first_layer(rays, posed.nodes, tables.bricks, blocks, inputs.samples)
     alpha = composite_segments(segments, settings, tables.bricks, codes)[:, 3]
     front = _FrontLayer(
         transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=surfel_of_key(key)
@@ -188,7 +192,7 @@ def trace_picture(
         key = key[covered]
         alive = np.flatnonzero(key < EMPTY_PIXEL_KEY)
         rays, depth, _ = _ray_entries(
-            tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive)
+            tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive), close_up
         )
         behind = RaySegments.of_further_layer(
             rays, alive, len(covered), tables.bricks, (settings.further_layer_samples, layer)
@@ -198,7 +202,7 @@ def trace_picture(
         front.depth[alive], front.end[alive] = depth, rays.end
         front.surfel[alive] = surfel_of_key(key[alive])
         segments = segments.append_layer(behind)
-    return TracedPicture(covered, segments, doubtful, compressed, passed, splats.side)
+    return TracedPicture(covered, segments, doubtful, passed, splats.side)
 
 
 def _keys_behind(
@@ -318,6 +322,7 @@ def _ray_entries(
     pixel: Int64[np.ndarray, "pixels"],
     key: Int64[np.ndarray, "pixels"],
     front: _FrontLayer | None,
+    close_up: bool,
 ) -> tuple[CanonicalRays, Float32[np.ndarray, "pixels"], Bool[np.ndarray, "pixels"]]:
     """Return canonical rays of covered pixels, where they enter (depth), and which are doubtful."""
     surfels, surfel = tables.surfels, surfel_of_key(key)
@@ -328,22 +333,26 @@ def _ray_entries(
 
     normal, thickness = surfels.normals[surfel], surfels.thickness[surfel]
     camera, derivative = skin_trilinear(posed.nodes, surfels.positions[surfel])
-    inverse, sound = invert_jacobians(settings, derivative)
+    inverse, trusted = invert_jacobians(settings, derivative)
     along = (camera * ray).sum(axis=1)
-    # where the skin is folded, look along its normal
-    direction = np.where(sound[:, None], np.einsum("nij,nj->ni", inverse, ray), -normal)
+    direction = np.einsum("nij,nj->ni", inverse, ray)
+    if close_up:
+        trusted &= (direction**2).sum(axis=1) <= MAX_TRUSTED_COMPRESSION**2
+    # where the skin is folded or compressed, look along its normal
+    direction = np.where(trusted[:, None], direction, -normal)
     nearest = ray * along[:, None] - camera
     beside = np.einsum("nij,nj->ni", inverse, nearest)  # from the surfel to the ray
-    beside = np.where(sound[:, None], beside, np.float32(0.0))
+    beside = np.where(trusted[:, None], beside, np.float32(0.0))
     falling = (normal * direction).sum(axis=1)
-    doubtful = ~sound | (falling > 0.0)
+    behind = falling > 0.0
     shallow = np.float32(-0.5 * settings.min_cosine)
     hit = -(normal * beside).sum(axis=1) / np.minimum(falling, shallow)
     hit = np.where(falling < shallow, hit, 0.0)
     enter = along + np.clip(hit, -settings.max_entry_shift_m, settings.max_entry_shift_m)
     cosine = np.maximum(-falling, settings.min_cosine)
     most_lead = settings.max_entry_margin_m * compression_factor(settings, direction)
-    lead = np.minimum(settings.entry_margin_m / cosine, most_lead)
+    # from behind, a ray has come through the body
+    lead = np.where(behind, most_lead, np.minimum(settings.entry_margin_m / cosine, most_lead))
     begin = enter - lead
     sine = 1.0 - falling**2 / (direction**2).sum(axis=1)
     bent = np.minimum(cosine, np.float32(settings.max_compression))
@@ -360,4 +369,4 @@ def _ray_entries(
         begin = np.where(one_sheet, later, begin)
     start = surfels.positions[surfel] + beside + (begin - along)[:, None] * direction
     rays = CanonicalRays(*(part.astype(np.float32) for part in (ray, begin, end, start, direction)))
-    return rays, (enter * ray[:, 2]).astype(np.float32), doubtful
+    return rays, (enter * ray[:, 2]).astype(np.float32), ~trusted | behind

@@ -82,12 +82,14 @@ def test_folded_skin_is_filtered_as_in_the_reference(exported, tables, camera, t
 
 
 @pytest.mark.parametrize(
-    ("tier", "largest_mean"), [("hq", 0.037), pytest.param("lite", 0.09, marks=pytest.mark.slow)]
+    ("tier", "largest_mean"), [("hq", 0.036), pytest.param("lite", 0.040, marks=pytest.mark.slow)]
 )
 def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, largest_mean):
     """An arm turned half round folds the sleeve; vertices that are in front are seen as they are.
 
     A linearized inverse would carry rays from there to other places of the cloth, or past it.
+    Without the filter of specks 0.028 and 0.034 (lite) of the vertices are seen in another color,
+    and 0.005 of the pixels differ from those about them; with it 0.018 and 0.002.
     """
     rotations = np.zeros((23, 3))
     rotations[15], rotations[16] = [3.0, 0, 0.6], [-3.0, 0, -0.6]
@@ -104,11 +106,17 @@ def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, la
     nearest = np.full((26, 26), np.inf)
     np.minimum.at(nearest, block, depth)
     front = inside & (depth < ndimage.minimum_filter(nearest, 3)[block] + 0.006)
-    drawn = premultiply(player.render(pose, view))[tuple(place[front].T)]
+    picture = premultiply(player.render(pose, view))
+    drawn = picture[tuple(place[front].T)]
     assert front.sum() > 500
-    assert (drawn[:, 3] < 0.6).mean() < 0.012
+    assert (drawn[:, 3] < 0.6).mean() < 0.004
     error = np.abs(on_white(drawn) - mesh.colors[front] / 255.0).max(axis=1)
     assert error.mean() < largest_mean
+    assert (error > 0.2).mean() < 0.023
+    body = ndimage.minimum_filter(ndimage.median_filter(picture[..., 3], 5), 9) > 0.9
+    colors = on_white(picture)
+    apart = np.abs(colors - ndimage.median_filter(colors, (5, 5, 1))).max(axis=2)
+    assert (apart[body] > 0.2).mean() < 0.0035
 
 
 @pytest.mark.parametrize(
