@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import rotation_matrices
 
 MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
 """Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
@@ -33,6 +34,16 @@ MAX_SPIN_STEP_RAD = np.pi
 """Largest median step of a spin from pose to pose; a larger one means degrees."""
 MAX_SPIN_START_RAD = 8.0 * np.pi
 """Largest angle at which a spin begins; a larger one means degrees."""
+FLIP_RAD = 0.5 * np.pi
+"""Rotation of the root between two frames from which it may be a flip."""
+MAX_TURN_RAD_PER_S = 16.0
+"""Fastest rotation of a person, 2.5 turns a second."""
+MAX_FLIP_FRAMES = 8
+"""Most poses in a row that are flipped."""
+MAX_DETOUR_RAD = 0.25
+"""How far the root may stray from its usual speed between the poses around a flip."""
+MAX_FLIP_SHARE = 0.1
+"""Largest share of flipped poses; if there are more, these are no frames of a film."""
 ASSUMED_FPS = 30.0
 """Rate that is assumed where poses have times but no frame numbers."""
 
@@ -54,8 +65,9 @@ def require_plausible(motion: Motion, path: Path | str) -> Motion:
 
 
 def invalidate_implausible_rows(motion: Motion) -> Motion:
-    """Return the motion with every row whose joints are bent too far marked as not valid."""
-    return replace(motion, valid=motion.valid & ~exceeds_joint_limits(motion.joint_rotations))
+    """Return the motion with rows that bend a joint too far, or flip, marked as not valid."""
+    bent = exceeds_joint_limits(motion.joint_rotations)
+    return replace(motion, valid=motion.valid & ~bent & ~find_flips(motion))
 
 
 def exceeds_joint_limits(
@@ -63,6 +75,33 @@ def exceeds_joint_limits(
 ) -> Bool[np.ndarray, "*poses"]:
     """Find poses in which a joint is turned by more than `MAX_JOINT_ANGLE_RAD`."""
     return np.asarray((np.linalg.norm(joint_rotations, axis=-1) > MAX_JOINT_ANGLE_RAD).any(axis=-1))
+
+
+def find_flips(motion: Motion) -> Bool[np.ndarray, "poses"]:
+    """Find short runs of poses that face another way than those before and after them.
+
+    Trackers take front for back now and then, for a few frames. A run begins or ends with a turn
+    that is too fast for a person; its other end may be smooth, where the person is seen from the
+    side. Where many poses are flipped, they are photographs.
+    """
+    flips, rows = np.zeros(len(motion), bool), np.flatnonzero(motion.valid)
+    if len(rows) < 3:
+        return flips
+    roots, gaps_s = rotation_matrices(motion.root_rotations[rows]), np.diff(_times_s(motion)[rows])
+    turned = _angles_between(roots[:-1], roots[1:])
+    usual = float(np.median(turned))
+    for jump in np.flatnonzero((turned > FLIP_RAD) & (turned > MAX_TURN_RAD_PER_S * gaps_s)):
+        if flips[rows[jump]]:
+            continue  # the end of a run
+        for length in range(1, MAX_FLIP_FRAMES + 1):
+            starts = np.array([jump + 1, jump + 1 - length])
+            starts = starts[(starts > 0) & (starts + length < len(rows))]
+            detours = _angles_between(roots[starts - 1], roots[starts + length])
+            found = starts[detours < MAX_DETOUR_RAD + 1.5 * usual * (length + 1)]
+            if len(found):
+                flips[rows[found[0] : found[0] + length]] = True
+                break
+    return flips if flips.sum() <= MAX_FLIP_SHARE * len(rows) else np.zeros_like(flips)
 
 
 def implausibility_reason(motion: Motion) -> str | None:
@@ -110,6 +149,12 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
             f"{bad} of {len(motion)} poses bend a joint by more than "
             f"{np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°, which no pose needs; they are left out."
         )
+    flips = np.flatnonzero(find_flips(motion))
+    if len(flips):
+        yield (
+            f"{len(flips)} of {len(motion)} poses (the first is row {flips[0]}) face another way "
+            "than those just before and after them: front was taken for back. They are left out."
+        )
     angles = np.linalg.norm(joints[~exceeds_joint_limits(joints)], axis=-1)
     if angles.size and angles.max() > SUSPICIOUS_JOINT_ANGLE_RAD:
         yield (
@@ -128,6 +173,21 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
     distance_m = _median_distance_m(motion)
     if distance_m > SUSPICIOUS_DISTANCE_M and not _has_assumed_focal(motion):
         yield f"The poses lie {distance_m:.0f} m from the origin; are they in metres?"
+
+
+def _angles_between(
+    a: Float[np.ndarray, "*batch 3 3"], b: Float[np.ndarray, "*batch 3 3"]
+) -> Float[np.ndarray, "*batch"]:
+    """Angles of the rotations from one to another, radians."""
+    return np.arccos(np.clip(0.5 * ((a * b).sum(axis=(-2, -1)) - 1.0), -1.0, 1.0))
+
+
+def _times_s(motion: Motion) -> Float[np.ndarray, "poses"]:
+    """Times of the poses, or what they are at the assumed rate."""
+    if motion.times_s is not None:
+        return motion.times_s
+    numbers = np.arange(len(motion)) if motion.frames is None else motion.frames
+    return numbers / ASSUMED_FPS
 
 
 def _has_assumed_focal(motion: Motion) -> bool:

@@ -122,3 +122,45 @@ def test_poses_that_are_all_lost_are_left_to_others(walk):
     lost = replace(walk, valid=np.zeros(POSES, dtype=bool))
     assert implausibility_reason(lost) is None
     assert list(plausibility_warnings(lost)) == []
+
+
+def turning(count: int, step_rad: float) -> Motion:
+    """A person who turns about the vertical axis."""
+    roots = np.zeros((count, 3))
+    roots[:, 1] = step_rad * np.arange(count)
+    return Motion(
+        root_rotations=roots,
+        root_translations=np.zeros((count, 3)),
+        joint_rotations=np.zeros((count, 23, 3)),
+        valid=np.ones(count, dtype=bool),
+        betas=np.zeros(10),
+        body_model="smpl",
+    )
+
+
+def take_front_for_back(motion: Motion, rows: list[int]) -> Motion:
+    """Some poses mirrored in depth."""
+    roots = motion.root_rotations.copy()
+    roots[rows, 1] = np.pi - roots[rows, 1]
+    return replace(motion, root_rotations=roots)
+
+
+@pytest.mark.parametrize(
+    ("step_rad", "rows"),
+    [(0.03, [20, 21, 22]), (0.03, [5]), (0.2, [1, 2]), (0.2, [4, 5, 6]), (0.2, [32, 33, 34])],
+)
+def test_front_taken_for_back_is_left_out_and_named(step_rad, rows):
+    """Also where the run begins or ends in a side view, without a jump."""
+    motion = take_front_for_back(turning(60, step_rad), rows)
+    assert np.flatnonzero(~require_plausible(motion, "poses.npz").valid).tolist() == rows
+    (sentence,) = plausibility_warnings(motion)
+    assert f"{len(rows)} of 60 poses (the first is row {rows[0]})" in sentence
+    assert "front was taken for back" in sentence
+
+
+def test_turns_of_films_and_photographs_are_no_flips():
+    """A fast spin, a cut to the other side, and photographs a quarter turn apart."""
+    cut = turning(60, 0.03)
+    cut.root_rotations[30:, 1] += np.pi
+    for motion in (turning(60, 0.5), cut, turning(8, 0.5 * np.pi), turning(8, 2.0)):
+        assert require_plausible(motion, "poses.npz").valid.all()
