@@ -147,10 +147,10 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
 def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, filmed, monkeypatch):
     monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
     monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
-    monkeypatch.setattr(MaskRefiner, "__call__", None)
+    monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
     revised = []
     monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, pose: revised.append(frame))
-    done, out = ingest_video("--realtime", "--masks", filmed / "masks")
+    done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
     assert done.code == 0, done.err
     assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
     assert {0, 2, 4, 6} <= set(revised)  # every second frame is taken
