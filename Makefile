@@ -26,7 +26,7 @@ demo: install
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m apps.fetch_runtime
 
-results: install # docs/results.md: an hour on two cores; MOTION=track.npz films a track of poses, PLAN=whole runs all
+results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses, PLAN=whole runs all
 	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
 
 test: install # on one thread: these tests are small, a second thread costs more CPU time than it saves
