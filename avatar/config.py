@@ -49,7 +49,7 @@ class TrainConfig:
     """Rays per step."""
     faint_gradient_share: float = 0.2
     """Strength of a sample's gradient, as a share of the mean, below which it is propagated by
-    chance, and the more strongly; 0: all are propagated."""
+    chance, and divided by that chance; 0: all are propagated."""
     sample_step_m: float = 0.01
     """Distance between samples along a ray, metres."""
     initial_step_factor: float = 3.0

@@ -126,7 +126,7 @@ def compose_observation_builder(
     """
 
     def given_alpha(frame: Frame) -> Float32[np.ndarray, "height width"]:
-        if refine is None or refine.is_decided:
+        if refine is None or refine.keeps_given_masks:
             return alpha_of(frame, target_px)
         return refine(frame.rgb, alpha_of(frame, frame.size_px), target_px)
 

@@ -207,8 +207,8 @@ def draw_by_strength(
 ) -> tuple[Int64[Tensor, "drawn"], Float32[Tensor, "drawn 4"]]:
     """Draws the points whose gradients are propagated, faint ones by chance ("Russian roulette").
 
-    Half of the samples have hardly a gradient. They cannot be left out, since Adam makes much of
-    little; but a few of them, with larger gradients, have the same sum in the mean.
+    Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
+    enlarges small gradients; a few of them, divided by their chance, keep the expected sum.
 
     Args:
         grads: Gradients of all points.

@@ -266,7 +266,7 @@ def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | 
         if isinstance(each, Observation):
             index = each.frame.index
             samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
-        if refine is not None and refine.is_decided:
+        if refine is not None and refine.keeps_given_masks:
             return None
     if not samples or (refine is not None and not refine.is_needed):
         return None

@@ -56,8 +56,8 @@ class GivenMaskRefiner:
         )
 
     @property
-    def is_decided(self) -> bool:
-        """Whether enough frames were seen to know that the masks stay as they are."""
+    def keeps_given_masks(self) -> bool:
+        """Whether enough frames have shown that the given masks need no refinement."""
         return len(self._ratios) >= COMPARED_FRAMES and not self.is_needed
 
     def __call__(
@@ -74,7 +74,7 @@ class GivenMaskRefiner:
             The refined mask, or the given one if that is as good.
         """
         found = alpha
-        if not self.is_decided and (alpha > 0.5).any():
+        if not self.keeps_given_masks and (alpha > 0.5).any():
             refined = self._refine(rgb, alpha)
             if len(self._ratios) < COMPARED_FRAMES:
                 given = edge_strength(rgb, alpha)

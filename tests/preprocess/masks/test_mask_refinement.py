@@ -227,7 +227,7 @@ def test_exact_masks_stay_as_they_are() -> None:
     refiner = GivenMaskRefiner()
     clip = _given_masks(refiner, wrong=False)
     assert all(found is given for given, found, _ in clip)
-    assert refiner.is_decided
+    assert refiner.keeps_given_masks
     assert refiner.note is None
 
 
@@ -236,4 +236,4 @@ def test_a_frame_without_the_person_is_no_evidence() -> None:
     refiner, empty = GivenMaskRefiner(), np.zeros(SIZE_PX[::-1], np.float32)
     assert refiner(np.zeros((*SIZE_PX[::-1], 3), np.uint8), empty, SIZE_PX) is empty
     assert not refiner.is_needed
-    assert not refiner.is_decided
+    assert not refiner.keeps_given_masks
