@@ -31,8 +31,8 @@ from apps.tracking.person_tracking import (
     track_person,
 )
 from capture.atomic_files import write_text_atomically
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
 from preprocess.alignment.correction_search import GOOD_IOU, USABLE_IOU
 from preprocess.capture_session import CaptureInputs
 

@@ -29,10 +29,9 @@ from apps.run.run_folder import RunFolder
 from apps.run.run_lock import claim_folder
 from apps.tracking.person_tracking import masks_to_use, print_grade, track_person
 from apps.tracking.skeleton_film import write_skeleton_film
-from capture.atomic_files import write_text_atomically
+from capture.atomic_files import OutputFileList, write_text_atomically
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
-from capture.output_file_list import OutputFileList
 from preprocess.capture_session import CaptureInputs
 
 PROGRAM = "ia-track"

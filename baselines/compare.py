@@ -16,9 +16,8 @@ from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
 from apps.cli.interrupt import stop_on_interrupt
 from baselines.comparison_table import comparison_table
-from capture.atomic_files import atomic_file, atomic_folder, write_text_atomically
+from capture.atomic_files import OutputFileList, atomic_file, atomic_folder, write_text_atomically
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from baselines.systems.compared_capture import ComparedCapture

@@ -1,4 +1,4 @@
-"""A folder of images as frames, in natural order, and the reading of one image."""
+"""A folder of images as frames, in natural order; reading and writing of one image."""
 
 import io
 import os
@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from capture.frame import Frame
 from capture.input_error import InputError
-from capture.source import FrameSelection
+from capture.source import Frame, FrameSelection
 
 LOG_LEVEL_SILENT = 0
 """OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
@@ -124,6 +123,18 @@ def read_image(
     if alpha is not None and alpha.shape != rgb.shape[:2]:
         raise InputError(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
     return rgb, alpha
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
+    """Write a gray, RGB or RGBA picture as PNG.
+
+    Raises:
+        OSError: If the disk is full, which OpenCV's own writer does not say.
+    """
+    if picture.ndim == 3:
+        kind = cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        picture = cv2.cvtColor(picture, kind)
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
 def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:

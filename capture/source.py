@@ -1,12 +1,45 @@
-"""The interface of every source of frames, recorded or live, and the selection of its frames."""
+"""Frames and the interface of their sources; a recording transposed, or played in real time."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, final, runtime_checkable
 
-from capture.frame import Frame
+import numpy as np
+from jaxtyping import UInt8
+
 from capture.input_error import InputError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """An upright RGB picture and its place in the stream.
+
+    Attributes:
+        index: Position in the source, counted from 0 (frames that were skipped keep their number).
+        time_s: Container timestamp in seconds; never computed from an assumed rate.
+        rgb: Picture, 8-bit RGB, upright.
+        flags: What is wrong with it: "corrupt", "repeated", or both.
+        alpha: The source's own alpha channel (RGBA pictures), else None.
+        due_s: When it was there to be taken, on `time.perf_counter`'s clock: played or filmed at
+            that moment. None for a recording that is read as fast as it is taken.
+        name: Of the picture's file without its ending, where each picture has a file.
+    """
+
+    index: int
+    time_s: float
+    rgb: UInt8[np.ndarray, "height width 3"]
+    flags: frozenset[str] = frozenset()
+    alpha: UInt8[np.ndarray, "height width"] | None = None
+    due_s: float | None = None
+    name: str | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.rgb.shape[1], self.rgb.shape[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,27 +154,16 @@ class FrameSource(Protocol):
         ...
 
 
-@final
-class TransposedSource:
-    """A recording that reports its width as its height and its height as its width.
-
-    With it masks and cameras of upright images can be opened for a video that was rotated by a
-    quarter turn afterwards. The frames themselves are unchanged.
-    """
+class _WrappedSource:
+    """A recording whose size or times are changed; all else is the recording's own."""
 
     live = False
     paced = False
-    waited_s = 0.0
 
     def __init__(self, source: FrameSource) -> None:
-        """Nothing is read yet.
-
-        Args:
-            source: A recording.
-        """
         self._source = source
         self.path = source.path
-        self.size_px = (source.size_px[1], source.size_px[0])
+        self.size_px = source.size_px
         self.selection = source.selection
         self.frames_in_file = source.frames_in_file
         self.frame_count = source.frame_count
@@ -149,11 +171,20 @@ class TransposedSource:
         self.has_alpha = source.has_alpha
         self.quarter_turns = source.quarter_turns
         self.started_at = source.started_at
-        self.dropped = source.dropped
         self.warnings = source.warnings
 
+    @property
+    def waited_s(self) -> float:
+        """How long it has been waited for frames, in all."""
+        return self._source.waited_s
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames that were lost because they were not taken in time."""
+        return self._source.dropped
+
     def frames(self) -> Iterator[Frame]:
-        """The recording's frames, of its own size."""
+        """The recording's frames."""
         return self._source.frames()
 
     def count_frames(self) -> int:
@@ -163,3 +194,117 @@ class TransposedSource:
     def close(self) -> None:
         """Closes the recording."""
         self._source.close()
+
+
+@final
+class TransposedSource(_WrappedSource):
+    """A recording that reports its width as its height and its height as its width.
+
+    With it masks and cameras of upright images can be opened for a video that was rotated by a
+    quarter turn afterwards. The frames themselves are unchanged.
+    """
+
+    def __init__(self, source: FrameSource) -> None:
+        """Wrap a recording; nothing is read yet."""
+        super().__init__(source)
+        self.size_px = (source.size_px[1], source.size_px[0])
+
+
+@final
+class PacingClock:
+    """The clock of a source whose frames come at times of their own.
+
+    Attributes:
+        waited_s: How long it has been waited for frames, in all.
+    """
+
+    def __init__(
+        self,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+        wait: Callable[[float], object] | None = None,
+    ) -> None:
+        """Start a clock that was not stopped.
+
+        Args:
+            clock: Seconds; another one in tests.
+            wait: Sleeps for the given seconds, or until the clock is stopped.
+        """
+        self._ended = threading.Event()
+        self._clock = clock
+        self._wait: Callable[[float], object] = self._ended.wait if wait is None else wait
+        self.waited_s = 0.0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called: every wait returns at once."""
+        return self._ended.is_set()
+
+    def now(self) -> float:
+        """Seconds on the clock."""
+        return self._clock()
+
+    def stop(self) -> None:
+        """Ends every wait, the present one too; from any thread."""
+        self._ended.set()
+
+    def wait_until(self, moment: float) -> bool:
+        """Waits for a moment on the clock; does not if it has gone by.
+
+        Returns:
+            Whether to go on: False after `stop`.
+        """
+        began = self._clock()
+        if moment > began and not self.stopped:
+            self._wait(moment - began)
+            self.waited_s += self._clock() - began
+        return not self.stopped
+
+
+@final
+class RealtimePlayback(_WrappedSource):
+    """A source whose frames are handed over no earlier than their timestamps say.
+
+    The first frame is at 0; what lies between two frames is what the container says, whatever its
+    rate. Nothing is lost: where frames are not taken in time, the playback falls behind and
+    catches up as soon as it can.
+
+    Attributes:
+        catch_up: Whether frames come as fast as they are taken, as those do that an interrupted run
+            has seen before. Where it ends, the video plays on from there at its own speed.
+    """
+
+    paced = True
+
+    def __init__(self, source: FrameSource, pace: PacingClock) -> None:
+        """Nothing is read yet.
+
+        Args:
+            source: What is played.
+            pace: Its clock; ending it ends the playback, also in the middle of a wait.
+        """
+        super().__init__(source)
+        self._pace = pace
+        self.catch_up = False
+
+    @property
+    def waited_s(self) -> float:
+        """How long frames have been held back in all."""
+        return self._pace.waited_s
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames when they are due, read one ahead; every call plays from the start."""
+        began = due = None
+        for frame in self._source.frames():
+            if began is None or due is None or self.catch_up:
+                due = self._pace.now()
+                began = due - frame.time_s
+            due = max(due, began + frame.time_s)
+            if not self._pace.wait_until(due):
+                return
+            yield replace(frame, due_s=due)
+
+    def close(self) -> None:
+        """Ends the playback, also in the middle of a wait."""
+        self._pace.stop()
+        super().close()

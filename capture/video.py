@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.frame import Frame
-from capture.hdr_video import read_hdr_transfer
 from capture.input_error import InputError
-from capture.source import FrameSelection
-from capture.video_decoder import DecoderFrame, open_decoder
+from capture.source import Frame, FrameSelection
+from capture.video_decoder import DecoderFrame, open_decoder, read_hdr_transfer
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
-from capture.live.realtime_playback import PacingClock, RealtimePlayback
-from capture.live.watched_image_folder import IDLE_TIMEOUT_S
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
+from capture.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import BodyPlacement
 from preprocess.body.body_pose import BodyPose, Motion

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 
 

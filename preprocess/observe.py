@@ -7,12 +7,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from capture.atomic_files import OutputFileList
 from capture.camera import Camera, same_aspect_ratio
-from capture.frame import Frame
 from capture.image_folder import has_cutout_alpha
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_name, associate_by_order, associate_by_time

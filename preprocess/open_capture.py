@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
-from capture.live.realtime_playback import PacingClock
-from capture.source import FrameSource, TransposedSource
+from capture.source import FrameSource, PacingClock, TransposedSource
 from capture.source_opening import open_live_source, open_source
 from capture.video import VideoFile
 from preprocess.alignment.capture_alignment import (

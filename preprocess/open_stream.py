@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
-from capture.live.realtime_playback import PacingClock, RealtimePlayback
-from capture.source import FrameSource
+from capture.source import FrameSource, PacingClock, RealtimePlayback
 from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_alignment import BodyAlignment
 from preprocess.body.body_file import load_body_model, read_shaped_body

@@ -18,7 +18,7 @@ from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody

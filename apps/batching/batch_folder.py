@@ -28,9 +28,13 @@ from apps.batching.remote_files import (
 from apps.cli.console import Console
 from apps.cli.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
 from apps.run.run_lock import claim_folder
-from capture.atomic_files import atomic_folder, check_replaceable_folder, write_text_atomically
+from capture.atomic_files import (
+    OutputFileList,
+    atomic_folder,
+    check_replaceable_folder,
+    write_text_atomically,
+)
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
 
 RESULTS_NAME = "results.jsonl"
 """One line per attempt."""

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from apps.checks.capture_validation import CaptureValidation
-from capture.atomic_files import atomic_file
+from capture.atomic_files import OutputFileList, atomic_file
 from capture.camera import same_aspect_ratio
-from capture.frame import Frame
-from capture.output_file_list import OutputFileList
+from capture.source import Frame
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import mean_score, spaced_indices
 from preprocess.body.silhouette import SkinPoints, splat_silhouette

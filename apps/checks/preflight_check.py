@@ -13,8 +13,8 @@ from apps.checks.capture_validation import (
 from apps.cli.capture_options import capture_name, format_frame_range, option_words
 from apps.cli.console import Console
 from apps.cli.output_paths import unused_path
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
 from preprocess.alignment.correction_search import GOOD_IOU
 from preprocess.capture_session import Capture, CaptureInputs
 

@@ -6,9 +6,13 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from capture.atomic_files import check_replaceable_folder, is_replaceable, is_stream
+from capture.atomic_files import (
+    RESERVED_PREFIX,
+    check_replaceable_folder,
+    is_replaceable,
+    is_stream,
+)
 from capture.input_error import InputError
-from capture.output_file_list import RESERVED_PREFIX
 
 
 def check_writable(path: Path, flag: str) -> None:

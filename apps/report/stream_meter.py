@@ -8,9 +8,8 @@ from typing import TypeVar, final
 
 from apps.report.report_schema import DroppedFrameEntry, Percentiles, StreamStats
 from avatar.training.frame_stream import RedundantFrame
-from capture.frame import Frame
 from capture.process_metrics import ReservoirSample
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from preprocess.observation import Observation
 from preprocess.observe import DroppedFrame
 

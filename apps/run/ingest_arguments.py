@@ -15,9 +15,9 @@ from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
 from apps.tracking.person_tracking import needs_stream_tracking, open_stream
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
+from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.live.camera_device import camera_address
-from capture.live.watched_image_folder import IDLE_TIMEOUT_S
+from capture.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fit import load_capture_fit

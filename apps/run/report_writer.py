@@ -29,7 +29,7 @@ from apps.run.training_session import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
 from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
 from capture.atomic_files import write_text_atomically
-from capture.live.camera_device import camera_address
+from capture.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
 from preprocess.body.body_pose import Motion

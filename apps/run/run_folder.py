@@ -13,8 +13,8 @@ from apps.cli.console import Console
 from apps.cli.output_paths import check_disjoint_from_inputs, check_writable, unused_path
 from apps.run.run_lock import LOCK_FILE_NAME as LOCK
 from apps.run.run_lock import claim_folder
+from capture.atomic_files import OutputFileList
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
 
 STATE_FILE = "state.pt"
 """Trainer and avatar, in checkpoint/."""

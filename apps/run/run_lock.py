@@ -10,8 +10,8 @@ from pathlib import Path
 
 from apps.cli.console import Console
 from apps.cli.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
+from capture.atomic_files import RESERVED_PREFIX
 from capture.input_error import InputError
-from capture.output_file_list import RESERVED_PREFIX
 
 try:
     import fcntl

@@ -28,8 +28,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from apps.cli.console import Console
-from capture.frame import Frame
 from capture.input_error import InputError
+from capture.source import Frame
 from preprocess.body.silhouette import MeshSilhouette
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.observe import alpha_channel_mask, associate_masks, associate_poses

@@ -36,7 +36,7 @@ from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from capture.inbox import Inbox
-from capture.live.realtime_playback import RealtimePlayback
+from capture.source import RealtimePlayback
 from export.bake.render_targets import PosedView
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture

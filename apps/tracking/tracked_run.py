@@ -14,9 +14,8 @@ from apps.cli.interrupt import stop_on_interrupt
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
 from apps.tracking.person_tracking import PersonTracking, needs_tracking, print_grade, track_person
-from capture.atomic_files import write_text_atomically
+from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
 from preprocess.capture_paths import find_own_poses
 from preprocess.capture_session import CaptureInputs
 

@@ -19,8 +19,8 @@ from avatar.training.checkpoint import save_atomically
 from avatar.training.replay_buffer import ReplayBuffer, ReplayFrame
 from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame
 from capture.camera import Camera
-from capture.frame import Frame
 from capture.input_error import InputError
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 

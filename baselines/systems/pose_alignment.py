@@ -20,7 +20,7 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.fitting.clip_fitting import correct_pose
 from preprocess.fitting.pose_priors import POSE_SIGMA
 from preprocess.observation import Observation
-from studio.zbuffer import NO_FACE, rasterize
+from studio.lighting import NO_FACE, rasterize
 
 Renderer = Callable[[Observation], Float32[np.ndarray, "height width 4"]]
 """What draws an observation's pose for its camera: a premultiplied RGBA image in [0, 1]."""

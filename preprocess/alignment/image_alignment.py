@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
-from capture.frame import Frame
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.edge_objective import gradient_along, outward_normals

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.frame import Frame
 from capture.image_folder import list_images, read_image
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints, soft_iou, splat_silhouette

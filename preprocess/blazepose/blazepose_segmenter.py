@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.camera import Camera
-from capture.frame import Frame
 from capture.input_error import InputError
+from capture.source import Frame
 from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks
 from preprocess.blazepose.person_square import PersonSquare
 from preprocess.body.body_pose import BodyPose

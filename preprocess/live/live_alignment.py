@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.image_alignment import (
     ImageSample,

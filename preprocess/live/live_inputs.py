@@ -4,11 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.frame import Frame
 from capture.image_folder import has_cutout_alpha
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource, PacingClock
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths
 from preprocess.live.live_alignment import LiveAlignment

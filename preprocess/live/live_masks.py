@@ -7,10 +7,9 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32
 
-from capture.frame import Frame
 from capture.image_folder import list_images
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
+from capture.source import Frame, PacingClock
 from preprocess.live.live_poses import MAX_WAIT_S, POLL_INTERVAL_S
 from preprocess.masks.mask_files import Masks, read_mask
 from preprocess.masks.mask_origin import segmenter_name

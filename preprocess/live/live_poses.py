@@ -6,9 +6,8 @@ from typing import final
 
 import numpy as np
 
-from capture.frame import Frame
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
+from capture.source import Frame, PacingClock
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.plausibility import invalidate_implausible_rows, require_plausible

@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera
-from capture.frame import Frame
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack

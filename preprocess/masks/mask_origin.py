@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.plugins import make_plugin

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from capture.frame import Frame
 from capture.image_folder import list_images
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 
 MAX_KEYFRAMES = 60
 """Most key frames of a video."""

@@ -19,8 +19,8 @@ from apps.run.report_writer import diagnose_failure
 from apps.run.run_folder import RunFolder
 from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
 from avatar.training import checkpoint
+from capture.atomic_files import LIST_NAME as LIST
 from capture.atomic_files import write_text_atomically
-from capture.output_file_list import LIST_NAME as LIST
 from export.player import Player
 
 KEYS = {

@@ -11,10 +11,10 @@ from baselines.systems.compared_capture import place_in_true_view
 from benchmarks.real import RealJob, ingest_command, table_lines
 from benchmarks.real_scores import pose_error_deg, rest_joint_distance_cm
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
-from studio.phone.proportions import BodyProportions
+from studio.outfit import BodyProportions
 
 CAMERA = Camera(
     focal_px=(300.0, 300.0),

@@ -8,9 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from capture.atomic_files import atomic_file, atomic_folder, write_text_atomically
+from capture.atomic_files import (
+    HEADER,
+    LIST_NAME,
+    OutputFileList,
+    atomic_file,
+    atomic_folder,
+    write_text_atomically,
+)
 from capture.input_error import InputError
-from capture.output_file_list import HEADER, LIST_NAME, OutputFileList
 
 
 def names(folder):

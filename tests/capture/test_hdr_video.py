@@ -3,9 +3,16 @@
 import numpy as np
 import pytest
 
-from capture.hdr_video import HLG, PEAK_NITS, PQ, WHITE_NITS, read_hdr_transfer, tone_map_hdr
 from capture.source_opening import open_source
-from capture.video_decoder import OpenCvDecoder
+from capture.video_decoder import (
+    HLG,
+    PEAK_NITS,
+    PQ,
+    WHITE_NITS,
+    OpenCvDecoder,
+    read_hdr_transfer,
+    tone_map_hdr,
+)
 
 
 def box(kind: bytes, content: bytes) -> bytes:

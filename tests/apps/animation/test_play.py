@@ -19,7 +19,7 @@ from apps.animation.driving_motion import demo_motion
 from apps.animation.following_camera import FollowingCamera
 from apps.animation.package_verification import package_warnings
 from capture import video_encoder
-from capture.output_file_list import LIST_NAME as LIST
+from capture.atomic_files import LIST_NAME as LIST
 from export.package.package_file import read_package, write_package
 from export.player import Player
 from export.web import onnxruntime_web, player_page

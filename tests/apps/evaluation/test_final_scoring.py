@@ -18,7 +18,7 @@ from avatar.evaluation.held_out import HeldOutFrame, PixelSample, score_renderin
 from avatar.field.avatar_model import Avatar
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 

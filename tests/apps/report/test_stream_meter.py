@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from apps.report.stream_meter import MAX_DROPPED_LISTED, StreamMeter
-from capture.frame import Frame
-from capture.source import FrameSelection
+from capture.source import Frame, FrameSelection
 from preprocess.observe import DroppedFrame
 
 

@@ -12,7 +12,7 @@ import pytest
 from apps import ingest
 from avatar.training import warmup
 from avatar.training.warmup import warm_up
-from capture.live import camera_device
+from capture import camera_device
 from capture.source_opening import open_source
 
 FRAMES = 14

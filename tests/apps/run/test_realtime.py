@@ -7,7 +7,7 @@ import pytest
 
 from apps import ingest
 from apps.run.ingest_arguments import IngestArguments
-from capture.live.realtime_playback import PacingClock
+from capture.source import PacingClock
 from preprocess import capture_session
 
 

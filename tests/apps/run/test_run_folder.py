@@ -23,9 +23,8 @@ from apps.run import run_lock
 from apps.run.run_folder import CHECKPOINT_FILES, STATE_FILE, RunFolder
 from apps.run.run_lock import LOCK_FILE_NAME, lock_folder
 from avatar.training import checkpoint, saved_frames
-from capture.atomic_files import write_text_atomically
+from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
-from capture.output_file_list import OutputFileList
 
 
 def listed(folder):

@@ -23,7 +23,7 @@ from avatar.training.frame_stream import is_held_out, prepare_stream
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 from preprocess.observe import DroppedFrame

@@ -35,7 +35,7 @@ from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from baselines.instant_avatar.scheme_rendering import render_samples
-from capture.frame import Frame
+from capture.source import Frame
 from preprocess.observation import Observation
 from studio import actor_motions
 from studio.actor import Actor

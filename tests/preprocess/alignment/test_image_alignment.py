@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from capture.camera import Camera
-from capture.frame import Frame
+from capture.source import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import NO_PERSON_FOUND, align_body
 from preprocess.alignment.capture_evidence import CaptureEvidence

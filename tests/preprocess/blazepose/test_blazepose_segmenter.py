@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from capture.frame import Frame
 from capture.input_error import InputError
+from capture.source import Frame
 from preprocess.blazepose.blazepose_segmenter import (
     MAX_CLOTHING_M,
     BlazePoseSegmenter,

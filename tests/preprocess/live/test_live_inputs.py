@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.frame import Frame
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
+from capture.source import Frame, PacingClock
 from preprocess.body.body_pose import Motion
 from preprocess.live.live_masks import LiveMasks
 from preprocess.live.live_poses import LivePoses

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.frame import Frame
 from capture.input_error import InputError
+from capture.source import Frame
 from preprocess.body.body_file import load_body_model
 from preprocess.body.silhouette import splat_silhouette
 from preprocess.cameras.camera_orientation import assume_camera

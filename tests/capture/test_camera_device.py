@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from capture import camera_device
+from capture.camera_device import MAX_QUEUED_FRAMES, CameraDevice, camera_address
 from capture.input_error import InputError
-from capture.live import camera_device
-from capture.live.camera_device import MAX_QUEUED_FRAMES, CameraDevice, camera_address
-from capture.live.realtime_playback import PacingClock
-from capture.source import FrameSelection
+from capture.source import FrameSelection, PacingClock
 
 
 class Quick:

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture.frame import Frame
-from capture.live.realtime_playback import PacingClock, RealtimePlayback
-from capture.source import FrameSelection
+from capture.source import Frame, FrameSelection, PacingClock, RealtimePlayback
 from capture.source_opening import open_source
 
 UNEVEN_S = [5.0, 5.04, 5.1, 5.1, 5.7, 5.733]

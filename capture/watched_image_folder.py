@@ -8,7 +8,6 @@ from typing import final
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.frame import Frame
 from capture.image_folder import (
     EXIF_QUARTER_TURNS,
     any_has_cutout_alpha,
@@ -18,8 +17,7 @@ from capture.image_folder import (
     read_image,
 )
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
-from capture.source import FrameSelection
+from capture.source import Frame, FrameSelection, PacingClock
 
 DONE_FILE_NAME = "DONE"
 """Name of the file whose presence means that no more images will come."""

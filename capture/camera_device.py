@@ -14,11 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.frame import Frame
 from capture.image_folder import silence_opencv
 from capture.input_error import InputError
-from capture.live.realtime_playback import PacingClock
-from capture.source import FrameSelection
+from capture.source import Frame, FrameSelection, PacingClock
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""

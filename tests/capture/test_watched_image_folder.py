@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from capture import watched_image_folder
 from capture.input_error import InputError
-from capture.live import watched_image_folder
-from capture.live.realtime_playback import PacingClock
-from capture.live.watched_image_folder import WatchedImageFolder
-from capture.source import FrameSelection
+from capture.source import FrameSelection, PacingClock
+from capture.watched_image_folder import WatchedImageFolder
 
 
 def picture(index):

@@ -1,1 +1,0 @@
-"""Live sources: cameras, growing folders, recordings played in real time."""
