@@ -12,7 +12,7 @@ from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_
 from baselines.systems.compared_capture import ComparedCapture
 from baselines.systems.compared_systems import ComparedSystem
 from baselines.systems.pose_alignment import RENDERINGS, align_pose
-from studio.capture_files import write_png
+from capture.image_folder import write_png
 
 CURVE_FRAMES, CURVE_RENDERINGS = 3, 4
 """Frames that a point of the curve is scored on, and small pictures to fit the pose of each: novel
@@ -96,4 +96,4 @@ def _write(folder: Path, frame: HeldOutFrame, image: Float32[np.ndarray, "height
     folder.mkdir(parents=True, exist_ok=True)
     pixels = np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
     name = f"{frame.observation.frame.index:04d}.png"
-    write_png(folder / name, np.ascontiguousarray(pixels[..., ::-1]))
+    write_png(folder / name, pixels)

@@ -1,18 +1,145 @@
-"""Light painted onto the body: how much of the sky and the lamp each vertex sees in the A-pose.
+"""From triangles to colors: a z-buffer, light that is painted onto the body, and shading.
 
-It is baked once and moves with the skin, because the field that is to learn it knows neither pose
-nor view. Visibility comes from the z-buffer, seen from each direction far away.
+The z-buffer says which triangle each subsample sees, and where on it; the grid of subsamples is
+`supersampling` times finer than the picture. Barycentrics are made perspective-correct by dividing
+by depth, so what is interpolated lies on the surface and not on the screen.
 
-From what the subsamples see to colors: the mean over a pixel's covered subsamples.
+Light is how much of the sky and the lamp each vertex sees in the A-pose (by the z-buffer, from each
+direction far away). It is baked once and moves with the skin, because the field that is to learn it
+knows neither pose nor view. A pixel is the mean of its covered subsamples.
 """
+
+from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
 from avatar.numba_kernels.kernel_compiler import compile_kernel
 from capture.camera import Camera
+from studio.outfit import is_visible
 from studio.procedural_albedo import albedo_at
-from studio.zbuffer import ZBuffer, rasterize
+
+RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
+"""A picture of the actor before a background, and the exact soft mask."""
+
+NO_FACE = -1
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ZBuffer:
+    """What the subsamples see.
+
+    Attributes:
+        face: Index of the nearest triangle, or -1.
+        barycentric: Perspective-correct weights of the triangle's second and third corner.
+        depth: Distance along the camera's axis in metres; infinite where there is nothing.
+        supersampling: Subsamples along each side of a pixel.
+    """
+
+    face: Int32[np.ndarray, "rows columns"]
+    barycentric: Float32[np.ndarray, "rows columns 2"]
+    depth: Float32[np.ndarray, "rows columns"]
+    supersampling: int
+
+
+def rasterize(
+    points_world: Float[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    camera: Camera,
+    *,
+    supersampling: int = 4,
+    template_points: Float32[np.ndarray, "vertices 3"] | None = None,
+    materials: Int32[np.ndarray, "faces"] | None = None,
+    measures: Float32[np.ndarray, "cuts"] | None = None,
+) -> ZBuffer:
+    """Draws triangles into a z-buffer.
+
+    Args:
+        points_world: Vertices, metres; triangles with a corner nearer than 1 cm are left out.
+        faces: Triangles, seen from both sides.
+        camera: Where from; a bent lens bends the corners, not the edges between them.
+        supersampling: Subsamples along each side of a pixel.
+        template_points: Where each vertex lies on the undressed body at rest; with `materials`.
+        materials: What each triangle is made of; parts that `is_visible` denies are not drawn.
+        measures: The outfit's measures that `is_visible` reads.
+    """
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    depth = points_world @ rotation[2] + translation[2]
+    screen = np.empty((len(points_world), 3), dtype=np.float32)
+    screen[:, :2] = camera.project(points_world) * supersampling
+    screen[:, 2] = depth
+    if template_points is None or materials is None or measures is None:
+        template_points = np.zeros((1, 3), dtype=np.float32)
+        materials = np.zeros(0, dtype=np.int32)
+        measures = np.zeros(0, dtype=np.float32)
+    rows, columns = camera.size_px[1] * supersampling, camera.size_px[0] * supersampling
+    seen = ZBuffer(
+        face=np.full((rows, columns), NO_FACE, dtype=np.int32),
+        barycentric=np.zeros((rows, columns, 2), dtype=np.float32),
+        depth=np.full((rows, columns), np.inf, dtype=np.float32),
+        supersampling=supersampling,
+    )
+    _rasterize_faces(
+        screen, faces, template_points, materials, measures, seen.face, seen.barycentric, seen.depth
+    )
+    return seen
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def _rasterize_faces(
+    screen: Float32[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    texture: Float32[np.ndarray, "places 3"],
+    kinds: Int32[np.ndarray, "kinds"],
+    cut: Float32[np.ndarray, "cuts"],
+    face_out: Int32[np.ndarray, "rows columns"],
+    share_out: Float32[np.ndarray, "rows columns 2"],
+    depth_out: Float32[np.ndarray, "rows columns"],
+) -> None:
+    rows, columns = face_out.shape
+    for face in range(faces.shape[0]):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        xa, ya, za = screen[a, 0], screen[a, 1], screen[a, 2]
+        xb, yb, zb = screen[b, 0], screen[b, 1], screen[b, 2]
+        xc, yc, zc = screen[c, 0], screen[c, 1], screen[c, 2]
+        if min(za, zb, zc) < 0.01:
+            continue
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        if abs(area) < 1e-9:
+            continue
+        left = max(int(np.ceil(min(xa, xb, xc) - 0.5)), 0)
+        right = min(int(np.floor(max(xa, xb, xc) - 0.5)), columns - 1)
+        top = max(int(np.ceil(min(ya, yb, yc) - 0.5)), 0)
+        bottom = min(int(np.floor(max(ya, yb, yc) - 0.5)), rows - 1)
+        for row in range(top, bottom + 1):
+            y = row + 0.5
+            for column in range(left, right + 1):
+                x = column + 0.5
+                on_b = ((x - xa) * (yc - ya) - (xc - xa) * (y - ya)) / area
+                on_c = ((xb - xa) * (y - ya) - (x - xa) * (yb - ya)) / area
+                on_a = 1.0 - on_b - on_c
+                if on_a < 0.0 or on_b < 0.0 or on_c < 0.0:
+                    continue
+                depth = 1.0 / (on_a / za + on_b / zb + on_c / zc)
+                if depth >= depth_out[row, column]:
+                    continue
+                share_b, share_c = on_b * depth / zb, on_c * depth / zc
+                if kinds.shape[0] > 0:
+                    share_a = 1.0 - share_b - share_c
+                    u = (
+                        share_a * texture[a, 0] + share_b * texture[b, 0] + share_c * texture[c, 0],
+                        share_a * texture[a, 1] + share_b * texture[b, 1] + share_c * texture[c, 1],
+                        share_a * texture[a, 2] + share_b * texture[b, 2] + share_c * texture[c, 2],
+                    )
+                    if not is_visible(kinds[face], u[0], u[1], u[2], cut):
+                        continue
+                depth_out[row, column] = depth
+                face_out[row, column] = face
+                share_out[row, column, 0] = share_b
+                share_out[row, column, 1] = share_c
+
 
 LAMP_FROM = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
 LAMP_RGB = np.array([1.00, 0.96, 0.88])
@@ -149,10 +276,10 @@ def shade_pixels(
     """Color of the covered part of each pixel (sRGB in [0, 1]) and how much of it is covered.
 
     Args:
-        seen: The z-buffer.
-        faces, kinds: Triangles, and what each is made of.
-        place, light: Place on the undressed template and light falling on each vertex.
-        palette, cut, checked: The outfit, as `paint` reads it.
+        zbuffer: What each subsample sees.
+        faces, materials: Triangles, and what each is made of.
+        template_points, light: Place on the undressed template and light on each vertex.
+        palette, measures, checked: The outfit, as `albedo_at` reads it.
     """
     height, width = (
         zbuffer.face.shape[0] // zbuffer.supersampling,

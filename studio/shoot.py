@@ -1,32 +1,225 @@
-"""Film the actor before a backdrop or in a room, and write a native capture folder."""
+"""Film the actor before a backdrop or in a room, and write a capture folder, exact or a phone's."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from os import cpu_count
 from pathlib import Path
 from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
+from capture.image_folder import write_png
 from capture.input_error import InputError
-from capture.video_encoder import video_encoder
+from capture.video_encoder import lossless_video, video_encoder
+from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import write_motion
 from studio import actor_motions, studio_cameras
 from studio.actor import Actor
-from studio.capture_files import lossless_video, to_uint8, write_cameras, write_png
-from studio.draw_ahead import RenderedFrame, ShootProgress, draw_ahead
-from studio.input_noise import add_mask_noise, add_pose_noise, to_camera_space
-from studio.lighting import composite_over
-from studio.phone.phone_capture import write_phone_capture
+from studio.input_errors import (
+    SegmenterErrors,
+    add_mask_noise,
+    add_pose_noise,
+    mistake_focal_length,
+    to_camera_space,
+    track_poses,
+)
+from studio.lighting import RenderedFrame, composite_over
+from studio.outfit import SUBJECT_PROPORTIONS
+from studio.phone_pictures import MovingCloth, PhoneScene, RoomLight, drifting_exposure, expose
 from studio.room import painted_backdrop
 from studio.room.furnished_room import FurnishedRoom
 from studio.shoot_config import ShootConfig as ShootConfig
-from studio.studio_cameras import static_camera
+from studio.studio_cameras import portrait_camera, static_camera
+
+ShootProgress = Callable[[int, int], None]
+"""Called after each picture with how many are done and how many there will be."""
+
+
+def draw_ahead(render: Callable[[int], RenderedFrame], count: int) -> Iterator[RenderedFrame]:
+    """The pictures 0 … count - 1 in order, as `render` draws them."""
+    workers = max(1, min(4, cpu_count() or 1))
+    with ThreadPoolExecutor(workers) as pool:
+        ahead = deque()
+        try:
+            for row in range(count):
+                ahead.append(pool.submit(render, row))
+                if len(ahead) > workers:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for waiting in ahead:
+                waiting.cancel()
+
+
+def _to_uint8(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+    return (alpha * 255.0 + 0.5).astype(np.uint8)
+
+
+def _write_track(path: Path, *cameras: Camera) -> None:
+    write_cameras(path, CameraTrack(cameras=cameras, source="studio"))
+
+
+PHONE_ARM_LIFT_DEG = -64.0
+"""Arms near the body: they fit into a portrait."""
+PHONE_TURNS, WALK_TURNS, TURNS = 1.25, -0.75, 2.0
+"""How often the actor turns round before a phone, a phone that is carried around, or the camera of
+the studio, if the user does not say."""
+
+
+def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:
+    """Films the actor as reality would, into an empty folder.
+
+    It then holds video.mp4, masks/, cameras.npz and poses.npz, all of them a little wrong;
+    dance.npz; and truth/: body.npz (the person, a body model without betas), poses.npz,
+    cameras.npz, masks/, exposure.npz (gains of red, green and blue a frame), and novel/ (poses
+    never filmed with sharp, neutrally exposed images, masks and cameras.npz).
+    """
+    actor = Actor.of(config.subject, config.seed, SUBJECT_PROPORTIONS[config.subject])
+    camera = portrait_camera(actor, config.size, dances=config.motion == "dance")
+    backdrop = painted_backdrop.paint_backdrop(
+        "plain" if config.background == "plain" else "clutter",
+        camera,
+        np.random.default_rng([config.seed, 4]),
+    )
+    scene = PhoneScene(
+        actor=actor,
+        camera=camera,
+        background=backdrop,
+        light=RoomLight(actor),
+        cloth=MovingCloth(actor, config.seed),
+        fps=config.fps,
+    )
+    truth = _choose_motion(actor, config)
+    novel = actor_motions.novel_poses(actor)
+    total = len(truth) + len(novel)
+    _film(folder, scene, truth, config, lambda done: progress(done, total))
+    stills = draw_ahead(lambda row: scene.still(novel[row]), len(novel))
+    _write_novel(
+        folder / "truth" / "novel", novel, stills, camera,
+        lambda done: progress(len(truth) + done, total),
+    )  # fmt: skip
+    _write_body(folder / "truth" / "body.npz", actor.shaped)
+    write_motion(folder / "truth" / "poses.npz", truth)
+    _write_track(folder / "truth" / "cameras.npz", camera)
+    write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
+    _write_inputs(folder, scene, truth, config)
+
+
+def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
+    if config.track is not None:
+        track = read_poses(config.track)
+        return actor_motions.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
+    turns = WALK_TURNS if config.camera_moves else TURNS
+    acts = {
+        "turn": actor_motions.turning_motion,
+        "dance": actor_motions.dancing_motion,
+        "walkaround": actor_motions.gesturing_motion,
+    }
+    if config.like_a_phone:
+        turns = PHONE_TURNS
+        acts["turn"] = partial(acts["turn"], arm_lift_deg=PHONE_ARM_LIFT_DEG)
+    return acts[config.motion](
+        actor,
+        frames=config.frames,
+        fps=config.fps,
+        turns=turns if config.turns is None else config.turns,
+        seed=config.seed,
+    )
+
+
+def _film(
+    folder: Path,
+    scene: PhoneScene,
+    truth: Motion,
+    config: ShootConfig,
+    done: Callable[[int], None],
+) -> None:
+    """video.mp4, masks/, and what is exact of them in truth/."""
+    (folder / "masks").mkdir()
+    (folder / "truth" / "masks").mkdir(parents=True)
+    frames = len(truth)
+    gains = drifting_exposure(frames, config.fps, config.seed)
+    np.savez(folder / "truth" / "exposure.npz", gains=gains)
+    segmenter = SegmenterErrors(frames, config.fps, config.seed)
+    generator = np.random.default_rng([config.seed, 26])
+    camera, body = scene.camera, scene.actor.shaped
+    pictures = draw_ahead(lambda row: scene.frame(truth, row), frames)
+    with lossless_video(folder / "video.mp4", camera.size_px, config.fps, frames) as writer:
+        for row, (rgb, alpha) in enumerate(pictures):
+            stored = expose(rgb, gains[row], generator)
+            writer.write(np.ascontiguousarray(stored[..., ::-1]))
+            joints = body.with_pose(truth[row]).joints()
+            away = float(np.linalg.norm(joints[0] - camera.center_world))
+            mask = segmenter.apply(
+                alpha, row, camera.project(joints[[22, 23]]), camera.focal_px[1] / away
+            )
+            write_png(folder / "masks" / f"{row:04d}.png", _to_uint8(mask))
+            write_png(folder / "truth" / "masks" / f"{row:04d}.png", _to_uint8(alpha))
+            done(row + 1)
+
+
+def _write_novel(
+    folder: Path,
+    motion: Motion,
+    pictures: Iterator[RenderedFrame],
+    camera: Camera | None,
+    done: Callable[[int], None],
+) -> None:
+    """Poses never filmed with their true images, masks and, if given here, camera."""
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    for index, (rgb, alpha) in enumerate(pictures):
+        write_png(folder / "images" / f"{index:04d}.png", rgb)
+        write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(alpha))
+        done(index + 1)
+    write_motion(folder / "poses.npz", motion)
+    if camera is not None:
+        _write_track(folder / "cameras.npz", camera)
+
+
+def _write_inputs(folder: Path, scene: PhoneScene, truth: Motion, config: ShootConfig) -> None:
+    """poses.npz and cameras.npz as the user has them."""
+    amount = config.tracker_error
+    assumed = mistake_focal_length(scene.camera, amount, config.seed + config.subject)
+    body = load_body_model().with_shape()
+    tracked = track_poses(
+        truth,
+        scene.actor.shaped,
+        body,
+        (scene.camera, assumed),
+        amount=amount,
+        fps=config.fps,
+        seed=config.seed + config.subject,
+    )
+    write_motion(folder / "poses.npz", replace(tracked, betas=np.zeros(10)))
+    _write_track(folder / "cameras.npz", assumed)
+
+
+def _write_body(path: Path, shaped: ShapedBody) -> None:
+    """The person as a body model whose betas do nothing."""
+    body = shaped.body
+    np.savez_compressed(
+        path,
+        v_template=shaped.vertices.astype(np.float32),
+        shapedirs=np.zeros((*shaped.vertices.shape, 1), dtype=np.float32),
+        weights=body.weights.astype(np.float32),
+        kintree_table=np.stack([body.parents, np.arange(24)]),
+        f=body.faces.astype(np.int32),
+        J=shaped.joints,
+        J_shapedirs=np.zeros((24, 3, 1)),
+    )
 
 
 @final
@@ -76,7 +269,7 @@ def film_capture(
 
     Args:
         out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
-            in truth/), poses.npz, dance.npz and truth/; see `write_phone_capture` for a phone's.
+            in truth/), poses.npz, dance.npz and truth/; see `_write_phone_capture` for a phone's.
         config: What is filmed.
         progress: Told after each picture; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
@@ -88,7 +281,7 @@ def film_capture(
     config.validate()
     _check_output(out, overwrite=overwrite)
     with atomic_folder(out) as unfinished:
-        write = write_phone_capture if config.like_a_phone else _write_capture
+        write = _write_phone_capture if config.like_a_phone else _write_capture
         write(unfinished, config, progress or (lambda done, total: None))
 
 
@@ -106,11 +299,11 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     total = len(truth) + len(novel)
     _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
     _write_preview(folder, config.fps)
-    _write_novel_poses(
-        folder / "truth" / "novel", stages[1], novel,
-        lambda done: progress(len(truth) + done, total),
+    cameras, apart = stages[0].cameras, stages[1].cameras[0]
+    _write_novel(
+        folder / "truth" / "novel", novel, stages[1].render_all(novel),
+        apart if config.camera_moves else None, lambda done: progress(len(truth) + done, total),
     )  # fmt: skip
-    cameras = stages[0].cameras
     given = (
         truth
         if not config.camera_moves
@@ -124,27 +317,9 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
     if config.camera_moves:
         # A phone does not know where it is: the cameras are ground truth, where no command looks.
-        write_cameras(folder / "truth" / "cameras.npz", cameras)
-        write_cameras(folder / "truth" / "novel" / "cameras.npz", stages[1].cameras)
+        _write_track(folder / "truth" / "cameras.npz", *cameras)
     else:
-        write_cameras(folder / "cameras.npz", cameras)
-
-
-def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
-    if config.track is not None:
-        track = read_poses(config.track)
-        return actor_motions.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
-    acts = {
-        "turn": actor_motions.turning_motion,
-        "dance": actor_motions.dancing_motion,
-        "walkaround": actor_motions.gesturing_motion,
-    }
-    turns = config.turns
-    if turns is None:
-        turns = -0.75 if config.camera_moves else 2.0
-    return acts[config.motion](
-        actor, frames=config.frames, fps=config.fps, turns=turns, seed=config.seed
-    )
+        _write_track(folder / "cameras.npz", *cameras)
 
 
 def _build_scenes(
@@ -185,7 +360,7 @@ def _write_video(
         for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
             writer.write(np.ascontiguousarray(rgb[..., ::-1]))
             mask = add_mask_noise(alpha, config.mask_noise_px, generator)
-            write_png(folder / "masks" / f"{index:04d}.png", to_uint8(mask))
+            write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
             done(index + 1)
 
 
@@ -199,16 +374,3 @@ def _write_preview(folder: Path, fps: float) -> None:
         video.release()
 
     video_encoder(".webm", transparent=False).write(folder / "preview.webm", frames(), fps)
-
-
-def _write_novel_poses(
-    folder: Path, stage: StudioScene, motion: Motion, done: Callable[[int], None]
-) -> None:
-    """Never-seen poses with their true images and masks."""
-    for name in ("images", "masks"):
-        (folder / name).mkdir(parents=True)
-    for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
-        write_png(folder / "images" / f"{index:04d}.png", np.ascontiguousarray(rgb[..., ::-1]))
-        write_png(folder / "masks" / f"{index:04d}.png", to_uint8(alpha))
-        done(index + 1)
-    write_motion(folder / "poses.npz", motion)

@@ -30,12 +30,14 @@ from benchmarks.tracking_scores import (
     score_joints,
 )
 from capture.camera import Camera
+from capture.image_folder import write_png
 from capture.source_opening import open_source
+from capture.video_encoder import lossless_video
 from preprocess.body.body_pose import Motion
 from preprocess.body.silhouette import MeshSilhouette
+from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.capture_paths import find_own_masks, find_own_poses
 from preprocess.poses.pose_file import write_motion
-from studio.capture_files import lossless_video, write_cameras, write_png
 
 FRAMES = 4
 CAMERA = Camera(
@@ -72,7 +74,7 @@ def capture(tmp_path, shaped) -> Path:
         write_png(folder / "truth" / "masks" / f"{row:04d}.png", mask)
     write_motion(folder / "poses.npz", motion)
     write_motion(folder / "truth" / "poses.npz", motion)
-    write_cameras(folder / "truth" / "cameras.npz", (CAMERA,))
+    write_cameras(folder / "truth" / "cameras.npz", CameraTrack(cameras=(CAMERA,), source=""))
     shutil.copy(str(files("preprocess") / "data" / "body24.npz"), folder / "truth" / "body.npz")
     return folder
 

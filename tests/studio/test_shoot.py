@@ -6,17 +6,16 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
-from capture.output_file_list import LIST_NAME as LIST
 from capture.source_opening import open_source
 from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.poses.pose_file import read_motion, write_motion
 from studio import actor_motions
-from studio.actor import A_POSE, Actor
-from studio.clothing_layers import build_layers
+from studio.actor import A_POSE, Actor, build_layers
 from studio.gestures import Arm, Gesture
-from studio.input_noise import add_mask_noise, add_pose_noise
+from studio.input_errors import add_mask_noise, add_pose_noise
 from studio.outfit import EYE, HAIR, OUTFITS, SHIRT, SHOE, SKIN, TROUSERS
 from studio.procedural_albedo import STRIPE_M, albedo_at
 from studio.shoot import ShootConfig, film_capture

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from capture.camera import Camera
-from studio.zbuffer import NO_FACE, rasterize
+from studio.lighting import NO_FACE, rasterize
 
 SIZE = 40
 

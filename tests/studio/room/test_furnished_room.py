@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
-from capture.output_file_list import LIST_NAME as LIST
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from preprocess.body.kinematics import PARENTS
-from studio.phone.proportions import SUBJECT_PROPORTIONS, BodyProportions
+from studio.outfit import SUBJECT_PROPORTIONS, BodyProportions
 
 
 def bone_m(joints, joint):

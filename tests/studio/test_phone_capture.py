@@ -8,14 +8,15 @@ import pytest
 
 from capture.input_error import InputError
 from preprocess.body.body_file import load_body_model
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.body.silhouette import MeshSilhouette, soft_iou
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from studio.phone.phone_pictures import drifting_exposure
-from studio.phone.tracker_errors import mean_joint_error_deg
+from studio.phone_pictures import drifting_exposure
 from studio.shoot import ShootConfig, film_capture
 
 FRAMES = 24
@@ -51,6 +52,14 @@ def body_mask_iou(folder, capture, body):
     return np.mean(
         [soft_iou(silhouette.draw_pose(motion[i], camera), exact[i]) for i in range(len(motion))]
     )
+
+
+def mean_joint_error_deg(one, other):
+    """Mean angle between the local rotations of joints 1 … 21 of two poses, degrees."""
+    a = rotation_matrices(one.joint_rotations[:21])
+    b = rotation_matrices(other.joint_rotations[:21])
+    vectors = axis_angles_from_matrices(np.swapaxes(a, -1, -2) @ b)
+    return float(np.rad2deg(np.linalg.norm(vectors, axis=-1)).mean())
 
 
 def test_the_picture_is_a_portrait_full_of_the_person(capture):

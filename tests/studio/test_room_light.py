@@ -7,8 +7,7 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
 from studio.actor import A_POSE, Actor
 from studio.outfit import SHIRT, SKIN
-from studio.phone.moving_cloth import SHIRT_M, MovingCloth
-from studio.phone.room_light import WINDOW_FROM, RoomLight
+from studio.phone_pictures import SHIRT_M, WINDOW_FROM, MovingCloth, RoomLight
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,7 @@
-"""Pictures as a phone takes them: portrait, with motion blur, drifting exposure, noise, loss."""
+"""Pictures as a phone takes them: portrait, with motion blur, drifting exposure, noise, loss.
+
+Garments move a little, and light stays in the room while the actor turns.
+"""
 
 from dataclasses import dataclass, replace
 from typing import final
@@ -9,14 +12,97 @@ from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.rotations import slerp
 from studio.actor import Actor
-from studio.draw_ahead import RenderedFrame
-from studio.input_noise import smooth_noise
-from studio.lighting import composite_over
-from studio.phone.moving_cloth import MovingCloth
-from studio.phone.room_light import RoomLight
+from studio.input_errors import smooth_noise
+from studio.lighting import LAMP_RGB, RenderedFrame, composite_over, lamp_visibility
+from studio.outfit import SHIRT, TROUSERS
 from studio.room import painted_backdrop
+
+WAVES = 4
+SHIRT_M, TROUSERS_M = 0.010, 0.006
+"""Largest displacement of each garment, metres, at its loose end."""
+
+
+@final
+class MovingCloth:
+    """The displacement of one actor's garments over time."""
+
+    def __init__(self, actor: Actor, seed: int) -> None:
+        """Chooses the waves.
+
+        Args:
+            actor: Who wears the garments.
+            seed: Of the waves.
+        """
+        generator = np.random.default_rng([seed, 21])
+        self._normals = vertex_normals(actor.rest_vertices, actor.faces)
+        self._reach = _looseness_m(actor)
+        place = actor.template_points.astype(np.float64)
+        wave_vectors = generator.normal(0.0, 2.0 * np.pi / 0.45, (3, WAVES)) / np.sqrt(3.0)
+        self._phases = place @ wave_vectors + generator.uniform(0.0, 2.0 * np.pi, WAVES)
+        self._turns_per_s = generator.uniform(0.3, 0.9, WAVES)
+
+    def displacement_m(self, time_s: float) -> Float[np.ndarray, "vertices 3"]:
+        """Of each rest vertex, metres: along its normal; zero for skin, hair and shoes."""
+        waves = np.sin(self._phases + 2.0 * np.pi * self._turns_per_s * time_s).mean(axis=1)
+        return (self._reach * np.clip(1.6 * waves, -1.0, 1.0))[:, None] * self._normals
+
+
+def _looseness_m(actor: Actor) -> Float[np.ndarray, "vertices"]:
+    """How far each vertex may move: nothing where a garment is held, most at its loose end."""
+    x, y, _ = actor.template_points.T.astype(np.float64)
+    down = np.clip((0.25 - y) / 0.45, 0.0, 1.0)
+    sleeve = np.clip((np.abs(x) - 0.18) / 0.20, 0.0, 1.0)
+    leg = np.clip((-0.15 - y) / 0.9, 0.0, 1.0)
+    reach = np.zeros(len(x))
+    for material, loose in (
+        (SHIRT, SHIRT_M * np.maximum(down, 0.8 * sleeve)),
+        (TROUSERS, TROUSERS_M * leg),
+    ):
+        worn = np.unique(actor.faces[actor.materials == material])
+        reach[worn] = loose[worn]
+    return min(1.0, 1.5 * actor.outfit.looseness) * reach
+
+
+WINDOW_FROM = np.array([-0.75, 0.50, 0.45]) / np.linalg.norm([-0.75, 0.50, 0.45])
+"""Direction of the window, from the actor, in the world (the camera is on +z)."""
+WINDOW_STRENGTH = 0.40
+"""As a factor of color. An avatar whose light turns with it comes to 31 dB of the film at best."""
+AMBIENT_STRENGTH = 0.92
+WRAP = 0.4
+"""A window is wide: it still lights surfaces this far (cosine) beyond the right angle."""
+
+
+@final
+class RoomLight:
+    """The light of a window and of the room's walls on one actor."""
+
+    def __init__(self, actor: Actor) -> None:
+        """Bakes what the walls give in the A-pose: it is the only part that turns with the actor.
+
+        Args:
+            actor: As its pictures will be drawn, but for the light.
+        """
+        self._ambient = AMBIENT_STRENGTH * actor.with_baked_light(lamp_strength=0.0).baked_light
+
+    def on(self, actor: Actor, pose: BodyPose) -> Float32[np.ndarray, "vertices 3"]:
+        """Light on each vertex of an actor in a pose, as a factor of its color."""
+        points = actor.vertices(pose)
+        cosine = vertex_normals(points, actor.faces) @ WINDOW_FROM
+        facing = np.maximum((cosine + WRAP) / (1.0 + WRAP), 0.0)
+        free = lamp_visibility(
+            points,
+            actor.faces,
+            WINDOW_FROM,
+            template_points=actor.template_points,
+            materials=actor.materials,
+            measures=actor.outfit.measures,
+        )
+        window = WINDOW_STRENGTH * (facing * (0.25 + 0.75 * free))[:, None] * LAMP_RGB
+        return (self._ambient + window).astype(np.float32)
+
 
 SHUTTER_FRAMES = 0.5
 """How long a picture is exposed, in frames."""

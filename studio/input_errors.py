@@ -1,21 +1,193 @@
-"""Poses as a monocular tracker gives them: another body, another focal length, slow errors.
+"""Masks as a segmenter gives them, and poses as a tracker does: everything a little wrong.
 
-Errors of rotation are of the world: a tracker sees a limb's direction in the picture well, and
-errs in depth. They are constant for a part, wander for another, and jitter a little.
+A mask's border wanders in and out and has halos, holes and missing hands. Poses are the truth with
+an error that wanders; like a tracker's, they are those of another body under another focal length.
+Their errors of rotation are of the world: a tracker sees a limb's direction in the picture well,
+and errs in depth. They are constant for a part, wander for another, and jitter a little.
 """
 
 from dataclasses import replace
+from typing import final
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from scipy.ndimage import gaussian_filter1d
 
 from capture.camera import Camera
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.rotations import axis_angles_from_matrices
-from preprocess.poses.root_placement import place_by_pixels
-from studio.input_noise import smooth_noise
+from preprocess.body.silhouette import signed_distance_px
+from preprocess.poses.root_placement import place_by_pixels, transform_motion
+
+BORDER_NOISE_SCALE_PX = 6.0
+"""How smooth the wandering is along the border."""
+
+
+def add_mask_noise(
+    alpha: Float32[np.ndarray, "height width"],
+    noise_px: float,
+    generator: np.random.Generator,
+    *,
+    grown_px: float = 0.0,
+    soft_px: float = 1.0,
+) -> Float32[np.ndarray, "height width"]:
+    """The mask with its border moved in and out by smooth noise.
+
+    Args:
+        alpha: The exact mask; returned as it is if there is no noise.
+        noise_px: Standard deviation of the border.
+        generator: Where the noise comes from.
+        grown_px: How far the whole border is moved outwards.
+        soft_px: Width of the border's ramp from 0 to 1.
+    """
+    if noise_px == 0.0:
+        return alpha
+    inside_px = -signed_distance_px(alpha >= 0.5)
+    white = generator.standard_normal(alpha.shape).astype(np.float32)
+    wander = cv2.GaussianBlur(
+        white, (0, 0), BORDER_NOISE_SCALE_PX, borderType=cv2.BORDER_REFLECT_101
+    )
+    wander *= noise_px * 2.0 * np.sqrt(np.pi) * BORDER_NOISE_SCALE_PX  # a blur leaves 1 / (2 √π σ)
+    moved = (inside_px + grown_px + wander) / soft_px
+    return np.clip(moved + 0.5, 0.0, 1.0).astype(np.float32)
+
+
+NOISE_FRAMES = 3.0
+"""A tracker wanders rather than flickers: its error is smooth over about this many frames."""
+
+
+def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
+    """What a tracker would have said: the motion with smooth noise on rotations and place.
+
+    Args:
+        motion: The truth.
+        degrees: Standard deviation of each component of each axis-angle.
+        centimetres: Standard deviation of each component of the root's place.
+        seed: Of the noise.
+    """
+    if degrees == 0.0 and centimetres == 0.0:
+        return motion
+    generator = np.random.default_rng([seed, 3])
+    frames = len(motion)
+    turned = smooth_noise(generator, (frames, 24, 3)) * np.deg2rad(degrees)
+    moved = smooth_noise(generator, (frames, 3)) * centimetres / 100.0
+    return replace(
+        motion,
+        root_rotations=motion.root_rotations + turned[:, 0],
+        root_translations=motion.root_translations + moved,
+        joint_rotations=motion.joint_rotations + turned[:, 1:],
+    )
+
+
+def to_camera_space(
+    motion: Motion, cameras: tuple[Camera, ...], pelvis: Float[np.ndarray, "3"]
+) -> Motion:
+    """The motion as a tracker tells it that knows no world: each row in its frame's camera, with K.
+
+    Args:
+        motion: In the world, a row a frame.
+        cameras: One for each frame.
+        pelvis: Where the person's pelvis rests.
+    """
+    views = np.stack([camera.camera_from_world for camera in cameras])
+    return replace(
+        transform_motion(motion, views, pelvis), space="camera", intrinsic=cameras[0].intrinsic
+    )
+
+
+def smooth_noise(
+    generator: np.random.Generator, shape: tuple[int, ...], over: float = NOISE_FRAMES
+) -> Float[np.ndarray, "frames *rest"]:
+    """Gaussian noise of unit variance, smooth over a number of frames (a Gaussian's width).
+
+    Args:
+        generator: Where the noise comes from.
+        shape: Frames, and what each has.
+        over: Standard deviation of the smoothing, frames.
+    """
+    margin = max(1, int(4 * over))
+    white = generator.standard_normal((shape[0] + 2 * margin, *shape[1:]))
+    smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + shape[0]]
+    # The power of a Gaussian filter: its variance falls to 1 / (2 √π σ).
+    return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * over)
+
+
+BORDER_SHARE = 0.0028
+"""Standard deviation of the border, as a share of the picture's width: 1.5 of 540 pixels."""
+HALO_SHARE = 0.0022
+"""Largest growth of the whole mask, as a share of the picture's width."""
+SOFT_PX = 2.5
+"""Width of the ramp from 0 to 1 at the border."""
+HOLE_FRAMES, HAND_GAPS_PER_S = 0.12, 0.35
+"""Share of frames with holes; how often a second a hand gets lost."""
+HAND_RADIUS_M = 0.11
+
+
+@final
+class SegmenterErrors:
+    """What a segmenter does to the exact masks of one video, frame by frame in order."""
+
+    def __init__(self, frames: int, fps: float, seed: int) -> None:
+        """Chooses when hands get lost.
+
+        Args:
+            frames: Of the video.
+            fps: Its frames per second.
+            seed: Of all that is random.
+        """
+        self._generator = np.random.default_rng([seed, 22])
+        self._halo = np.tanh(smooth_noise(self._generator, (frames,), over=0.5 * fps))
+        self._lost = np.zeros((frames, 2), dtype=bool)
+        for _ in range(max(1, round(HAND_GAPS_PER_S * frames / fps))):
+            start, side = self._generator.integers(frames), self._generator.integers(2)
+            self._lost[start : start + int(self._generator.integers(2, 8)), side] = True
+
+    def apply(
+        self,
+        alpha: Float32[np.ndarray, "height width"],
+        row: int,
+        hands_px: Float[np.ndarray, "2 2"],
+        px_per_m: float,
+    ) -> Float32[np.ndarray, "height width"]:
+        """The mask of one frame.
+
+        Args:
+            alpha: The exact mask.
+            row: Which frame.
+            hands_px: Where the left and the right hand are in the picture.
+            px_per_m: Pixels per metre at the actor.
+        """
+        width = alpha.shape[1]
+        wrong = add_mask_noise(
+            alpha,
+            BORDER_SHARE * width,
+            self._generator,
+            grown_px=HALO_SHARE * width * (0.4 + float(self._halo[row])),
+            soft_px=SOFT_PX,
+        )
+        for side in (0, 1):
+            if self._lost[row, side]:
+                wrong *= 1.0 - _disc(alpha.shape, hands_px[side], HAND_RADIUS_M * px_per_m)
+        inside = np.argwhere(alpha > 0.99)
+        if self._generator.random() < HOLE_FRAMES and len(inside):
+            for _ in range(int(self._generator.integers(1, 4))):
+                row_column = inside[self._generator.integers(len(inside))]
+                radius = float(self._generator.uniform(0.01, 0.035)) * px_per_m
+                wrong *= 1.0 - _disc(alpha.shape, row_column[::-1].astype(np.float64), radius)
+        return wrong.astype(np.float32)
+
+
+def _disc(
+    shape: tuple[int, int], middle_px: Float[np.ndarray, "2"], radius_px: float
+) -> Float32[np.ndarray, "height width"]:
+    """1 inside a circle, 0 outside, a pixel soft."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
+    away = np.hypot(x - middle_px[0], y - middle_px[1])
+    return np.clip(radius_px - away + 0.5, 0.0, 1.0).astype(np.float32)
+
 
 TRUNK_DEG, LIMBS_DEG, ENDS_DEG = 1.3, 2.5, 3.5
 """Errors of direction: standard deviation of the wandering part and, each, of the constant one."""
@@ -204,11 +376,3 @@ def _shift_in_depth(
     rays = pelvis - camera.center_world
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return replace(motion, root_translations=motion.root_translations + depth_m[:, None] * rays)
-
-
-def mean_joint_error_deg(one: BodyPose, other: BodyPose) -> float:
-    """Mean angle between the local rotations of joints 1 … 21 of two poses, degrees."""
-    a = rotation_matrices(one.joint_rotations[:21])
-    b = rotation_matrices(other.joint_rotations[:21])
-    vectors = axis_angles_from_matrices(np.swapaxes(a, -1, -2) @ b)
-    return float(np.rad2deg(np.linalg.norm(vectors, axis=-1)).mean())

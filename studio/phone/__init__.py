@@ -1,1 +1,0 @@
-"""Captures as a phone, a tracker and a segmenter give them: everything a little wrong."""
